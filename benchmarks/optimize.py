@@ -21,11 +21,11 @@ from vvgt_cli.gaussians.ply import read_ply
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.refine.loss import loss_gradient
 from vvgt_cli.refine.ssim import add_ssim_gradient
-from vvgt_cli.refine.states import OwnFrame
-from vvgt_cli.refine.steps import own_frame
+from vvgt_cli.refine.states import OwnAxes
+from vvgt_cli.refine.steps import own_axes
 from vvgt_cli.splat import blend, render
 from vvgt_cli.splat.kernel import project_factors, tile_lists
-from vvgt_cli.splat.render import depth_order, moments, own_frame_backward, pose
+from vvgt_cli.splat.render import depth_order, moments, own_axes_backward, pose
 from vvgt_cli.synth import open_volume
 
 REPEATS = 9
@@ -35,7 +35,7 @@ BACKWARD_FLOPS = 60  # a pixel: the forward's 30, colour against gradient 8, wha
 def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[], object]]:
     """The parts of a step, each as a call of its own on fixed input."""
     camera = default_views("train")[3]
-    state = OwnFrame(gaussians, [camera])
+    state = OwnAxes(gaussians, [camera])
     means, factors, logits, colors = state.arrays
     p = state.project(camera)
     depth = np.linalg.norm(means - camera.position, axis=1).astype(np.float32)
@@ -47,7 +47,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     squares = np.empty(camera.height)
     loss_gradient(image, target, *weights, grad, squares)
     pairs = moments(p, colors, image, grad)
-    slopes = own_frame_backward(means, factors, colors, camera, p, pairs)
+    slopes = own_axes_backward(means, factors, colors, camera, p, pairs)
     state.step = 1
     still = np.zeros(5), state.CLIPS, state.spread, *state.BETAS, 1  # rates 0: the scene stays as it is
     tiles_y = -(-camera.height // 16)
@@ -59,8 +59,8 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
         "loss": lambda: loss_gradient(image, target, *weights, grad, squares),
         "(ssim)": lambda: add_ssim_gradient(image, target, 0.2, np.zeros_like(grad)),
         "moments": lambda: moments(p, colors, image, grad),
-        "gradients": lambda: own_frame_backward(means, factors, colors, camera, p, pairs),
-        "update": lambda: own_frame(
+        "gradients": lambda: own_axes_backward(means, factors, colors, camera, p, pairs),
+        "update": lambda: own_axes(
             slopes.rows, *still, *state.arrays, state.darkest, state.first, state.second, *state.common(slopes.rows)
         ),
     }
@@ -106,7 +106,7 @@ def main(files: tuple[str, ...], count: int) -> None:
         ):
             for n in (1, most):
                 times[label, n] = sum(times[part, n] for part in chosen)  # type: ignore[index]
-        pixels = covered_pixels(OwnFrame(gaussians, [camera]).project(camera))
+        pixels = covered_pixels(OwnAxes(gaussians, [camera]).project(camera))
         print(f"{name}: {len(gaussians)} Gaussians, {pixels / 1e6:.0f} million pixels; 1 thread, {most} threads")
         for part in (*calls, "forward", "step"):
             one, all_of_them = times[part, 1], times[part, most]  # type: ignore[index]

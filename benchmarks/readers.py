@@ -156,13 +156,14 @@ def measured(row: Row, edge: int) -> dict[str, Any]:
         alone = row.alone
         if alone is not None:
             alone(path)
+        takes = next(r for r in READERS if r.name == row.reader).takes
         return {
             "format": row.name,
             "written by": row.by,
             "edge": edge,
             "whole": "yes" if whole else "resampled" if "resampled" in volume.name else "no",
             "blocks": "yes" if blocks else "no",
-            "series": "yes" if row.steps and next(r for r in READERS if r.name == row.reader).times else "files",
+            "series": "yes" if row.steps and "time" in takes else "files",
             "place": f"{off(volume, row, edge):.4f}" if row.placed else "",
             "seconds": f"{seconds(lambda: read_all(path, row)):.2f}",
             "library": "" if alone is None else f"{seconds(lambda: alone(path)):.2f}",

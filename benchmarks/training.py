@@ -49,7 +49,7 @@ from vvgt_cli.splat.half import halved
 from vvgt_cli.synth.analytic import volume_of
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.synth.turbulence import TURNOVER, Solver, fields, flow_of, run
-from vvgt_cli.volume.nrrd_write import write_nrrd
+from vvgt_cli.volume.medical.nrrd import write_nrrd
 
 GRID, SIZES = 64, (96, 128, 160)
 KINDS = ("shells", "tubes", "plates", "noise", "wells", "bodies", "bodies")  # the last twice, other seeds

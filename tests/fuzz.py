@@ -126,8 +126,10 @@ CHANGES = (_flip, _byte, _number, _number, _float, _word, _word, _word, _delete,
 
 def limits() -> None:
     """Bound this process: memory that may be added, and a signal for inputs that take too long."""
-    from vvgt_cli.volume import blocks, vtk_child, vtk_pieces
+    from vvgt_cli.volume import blocks
     from vvgt_cli.volume.openvdb import tree
+    from vvgt_cli.volume.vtk import child as vtk_child
+    from vvgt_cli.volume.vtk import pieces as vtk_pieces
 
     blocks.free_memory = tree.free_memory = vtk_child.free_memory = vtk_pieces.free_memory = lambda: FREE  # type: ignore[assignment]
     pages = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

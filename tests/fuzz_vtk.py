@@ -28,7 +28,8 @@ from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from tests import vtk_files as files
-from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
+from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.vtk import child as vtk_child
 
 Make = Callable[[Path], Path]
 DIMS = (8, 6, 4)

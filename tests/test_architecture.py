@@ -16,7 +16,7 @@ from vvgt_cli.cli.main import COMMANDS
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
-    *("version", "errors", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
+    *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "synth", "dvr", "splat", "closed_form", "refine", "network", "score", "field"),
     *("conversion", "checks", "commands", "library", "cli"),
 )
@@ -193,7 +193,7 @@ PROGRAMS = {
     "field/runners.py": {"os._exit", "signal.signal"},
     "jit/worker.py": {"print", "sys.exit", "os._exit"},
     "progress.py": {"print"},
-    "volume/vtk_child.py": {"os._exit"},
+    "volume/vtk/child.py": {"os._exit"},
 }
 ENDINGS = {"print", "sys.exit", "os._exit", "exit", "quit", "signal.signal", "click.echo"}
 

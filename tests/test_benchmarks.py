@@ -19,7 +19,7 @@ from vvgt_cli.cli.main import run
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.images import read_png, write_png
 from vvgt_cli.synth import open_volume
-from vvgt_cli.volume.nrrd_write import write_nrrd
+from vvgt_cli.volume.medical.nrrd import write_nrrd
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks"

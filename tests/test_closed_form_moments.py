@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
+from vvgt_cli.closed_form import linear_ranges as ranges_module
 from vvgt_cli.closed_form import moments as moments_module
-from vvgt_cli.closed_form import straight as straight_module
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
-from vvgt_cli.closed_form.ranges import ranges_of
 from vvgt_cli.dvr import Scene
+from vvgt_cli.dvr.bricks import ranges_of
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.look.tables import Optics, extinction
 from vvgt_cli.synth import analytic
@@ -23,7 +23,7 @@ def test_ranges_of_blocks_are_those_of_their_voxels_and_the_next() -> None:
     values = np.random.default_rng(0).permutation(7 * 9 * 21).reshape(7, 9, 21).astype(np.float32)
     values[3, 4, 5] = np.nan
     first, edge, shape = np.array([4, 0, 2]), np.array([4, 3, 2]), np.array([4, 2, 2])
-    found = ranges_of(values, first, edge, shape)
+    found = ranges_of(values, first, edge, shape, 1)
     for x, y, z in np.ndindex(*shape):
         lo = first + edge * (x, y, z)
         a, b = np.maximum(lo - 1, 0), lo + edge + 1
@@ -94,9 +94,9 @@ def rough(dims: tuple[int, int, int], spacing=(1.0, 1.0, 1.0), dtype=np.float32)
 
 @pytest.mark.parametrize("exponent", [(0, 0, 0), (-1, -1, -1), (-2, -1, 0), (1, 1, 1), (2, 0, -1), (4, 3, 2)])
 @pytest.mark.parametrize("tf", [Ramp(2.0), Tent()], ids=lambda tf: tf.name)
-@pytest.mark.parametrize("bend", [0.0, straight_module.BEND])
+@pytest.mark.parametrize("bend", [0.0, ranges_module.BEND])
 def test_twin(exponent: tuple[int, int, int], tf, bend: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(straight_module, "BEND", bend)
+    monkeypatch.setattr(ranges_module, "BEND", bend)
     volume = rough((19, 9, 13), (1.0, 2.5, 0.7))
     scene = scene_of(volume, tf, 2.0)
     cells = base_cells(scene, np.array(exponent))
@@ -117,7 +117,7 @@ class White(Ramp):
 @pytest.mark.parametrize("exponent", [(1, 1, 1), (3, 2, 1)])
 def test_one_point_gives_what_eight_do_under_a_straight_function(exponent: tuple[int, int, int]) -> None:
     scene = scene_of(rough((19, 9, 13), (1.0, 2.5, 0.7)), White(2.0), 2.0)
-    assert straight_module.straight_until(scene.optics)[0] == scene.optics.bins
+    assert ranges_module.linear_ranges(scene.optics)[0] == scene.optics.bins
     expected = twin(scene, White(2.0), 2.0, np.array(exponent))
     off = np.abs(dense(base_cells(scene, np.array(exponent)), expected) - expected).max(axis=(0, 1, 2))
     assert (off / np.abs(expected).max(axis=(0, 1, 2))).max() < 1e-4
@@ -268,13 +268,13 @@ def test_windows_of_bins_are_straight_up_to_a_bend() -> None:
     tau = np.concatenate([np.zeros(5), np.arange(11.0), 10 + 3 * np.arange(1, 7.0), np.full(4, 28.0)])
     nodes = np.stack([tau, 0.5 * tau, 0 * tau, tau], axis=1)
     optics = Optics.of(0.0, 1.0, nodes, np.cumsum(nodes, axis=0))
-    found = straight_module.straight_until(optics)
+    found = ranges_module.linear_ranges(optics)
     assert set(found[:5]) == {5}
     assert set(found[5:15]) == {15}
     assert set(found[15:21]) == {21}
     assert set(found[21:25]) == {25}
     bent = optics._replace(nodes=nodes + [[0, 0, 1, 0]] * (np.arange(26) == 9)[:, None])  # a colour's bend, too
-    assert straight_module.straight_until(bent)[5] < 10
+    assert ranges_module.linear_ranges(bent)[5] < 10
 
 
 @pytest.mark.parametrize("level", [1, 2])

@@ -1,4 +1,4 @@
-"""From moments to splats: opacity, rotation, shape, and the inset of opaque surfaces."""
+"""From moments to splats: opacity, rotation, shape, and the offset of opaque surfaces."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form.closed_form import closed_form
-from vvgt_cli.closed_form.inset import inset, opaque_field, pressed
 from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.shape import ROUND, make_gaussians, quaternions, widened
+from vvgt_cli.closed_form.surface_offset import flattened, opaque_field, surface_offset
 from vvgt_cli.closed_form.wavelet import box_surrogate
 from vvgt_cli.dvr import render_view
 from vvgt_cli.errors import DataError
@@ -172,7 +172,7 @@ def surfaces(volume: Volume, tf=None):
 
 def test_a_field_of_wider_cells_holds_their_means(monkeypatch: pytest.MonkeyPatch) -> None:
     _, fine = surfaces(analytic.sphere(16, 0.6))
-    monkeypatch.setattr("vvgt_cli.closed_form.inset.MAX_FIELD", fine.field.size // 8)
+    monkeypatch.setattr("vvgt_cli.closed_form.surface_offset.MAX_FIELD", fine.field.size // 8)
     _, wide = surfaces(analytic.sphere(16, 0.6))
     nz, ny, nx = wide.field.shape
     assert 2 * np.array(wide.field.shape) == pytest.approx(fine.field.shape)
@@ -184,7 +184,9 @@ def test_a_field_of_wider_cells_holds_their_means(monkeypatch: pytest.MonkeyPatc
 def moved(opaque, points: np.ndarray, sigma: float, reach: float = 2.0, pixel: float = 0.02) -> np.ndarray:
     count = len(points)
     axes = np.broadcast_to(np.eye(3), (count, 3, 3))
-    return inset(opaque, points, np.full((count, 3), sigma**2), axes, np.full(count, reach), 0.3 * pixel**2, 6 * pixel)
+    return surface_offset(
+        opaque, points, np.full((count, 3), sigma**2), axes, np.full(count, reach), 0.3 * pixel**2, 6 * pixel
+    )
 
 
 def test_inset_of_a_ball_is_radial() -> None:
@@ -235,16 +237,16 @@ def test_inset_stops_in_the_middle_of_a_plate(voxels: int) -> None:
     np.testing.assert_allclose(shift[:, :2], 0, atol=1e-9)
 
 
-def test_covariances_are_pressed_along_the_normal_of_a_surface() -> None:
+def test_covariances_are_flattened_along_the_normal_of_a_surface() -> None:
     _, opaque = surfaces(analytic.sphere(40, 0.6))
     ray = np.random.default_rng(0).standard_normal((400, 3))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     cov = np.broadcast_to(np.eye(3), (400, 3, 3)).copy()
     by = np.linspace(0.1, 0.9, 400)
-    taken = cov - pressed(opaque, 0.6 * ray, cov, by)
+    taken = cov - flattened(opaque, 0.6 * ray, cov, by)
     np.testing.assert_allclose(np.trace(taken, axis1=1, axis2=2), by)
     np.testing.assert_allclose(np.einsum("ki,kij,kj->k", ray, taken, ray), by, rtol=0.01)
-    np.testing.assert_array_equal(pressed(opaque, 0.2 * ray, cov, by), cov)  # deep inside there is no surface
+    np.testing.assert_array_equal(flattened(opaque, 0.2 * ray, cov, by), cov)  # deep inside there is no surface
 
 
 def test_filled_cells_lie_flat_under_a_surface() -> None:

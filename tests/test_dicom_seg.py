@@ -22,7 +22,7 @@ from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.dicom_seg import is_segmentation_file
+from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
 
 SHAPE = (6, 8, 10)
 TILT = np.radians(20)

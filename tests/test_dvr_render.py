@@ -331,7 +331,7 @@ def test_views_are_the_same_bytes_every_time_and_report_progress():
 
 
 def test_a_step_of_1_is_a_step_of_one_point_zero_to_the_compiler():
-    from vvgt_cli.dvr.kernel import render_tiles
+    from vvgt_cli.dvr.march import render_tiles
 
     scene = Scene.build(Volume(smooth(10)), RAINBOW, 1.0)
     first = render_view(scene, camera(), RenderSettings(step=1.0, samples=1))

@@ -6,9 +6,9 @@ from tests.test_dvr_render import Function
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.march import cast_segments
 from vvgt_cli.dvr.place import place
 from vvgt_cli.dvr.render import camera_arrays
-from vvgt_cli.dvr.segments import cast_segments
 from vvgt_cli.volume import Volume
 
 
@@ -28,7 +28,9 @@ def test_rays_along_an_axis_belong_to_one_block():
 
         def cast(lower, upper, camera=camera):
             faces, seen = np.array([lower, upper, [8.0, 8.0, 8.0]]), np.zeros((1, 1, 4), np.float32)
-            cast_segments(scene.voxels, optics, empty, faces, np.zeros(3), *camera, 0.5, pixels, middle, seen)
+            cast_segments(
+                scene.voxels, optics, None, empty, None, faces, np.zeros(3), *camera, 0.5, pixels, middle, seen
+            )
             return seen[0, 0]
 
         whole = cast([-np.inf] * 3, [np.inf] * 3)

@@ -105,7 +105,7 @@ def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache)
 
 
 def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
-    some = ("vvgt_cli.closed_form.inset._shift", "vvgt_cli.splat.kernel.project-")
+    some = ("vvgt_cli.closed_form.surface_offset._shift", "vvgt_cli.splat.kernel.project-")
     gone = {name for name in kernels(cache) if name.startswith(some)}
     for name in gone:
         (cache / name).unlink()
@@ -162,7 +162,9 @@ def one_by_one(tmp_path, *args):
 
 
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
-    rare = {f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")}  # of opaque scenes
+    rare = {
+        f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")
+    }  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     rare |= set(ahead.REGRESS)  # and of more than a few Gaussians
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
@@ -272,7 +274,7 @@ def stepped(tmp_path_factory):
 def test_files_hold_machine_code_and_the_names_of_symbols():
     import llvmlite.binding as llvm
 
-    from vvgt_cli.jit.cache import _unlinked
+    from vvgt_cli.jit.numba_internals import symbols_of
 
     text = """
     declare double @outside(double)
@@ -283,9 +285,7 @@ def test_files_hold_machine_code_and_the_names_of_symbols():
       ret double %z
     }"""
     whole = llvm.parse_assembly(text).as_bitcode()
-    name, kind, (code, kept) = _unlinked(("k", "object", (b"code", whole)))
-    assert (name, kind, code) == ("k", "object", b"code")
-    left = llvm.parse_bitcode(kept)
+    left = llvm.parse_bitcode(symbols_of(whole))
     assert [f.name for f in left.functions if not f.is_declaration] == ["f$2"]
     assert [v.name for v in left.global_variables if not v.is_declaration] == ["env.<1>"]
     assert "fadd" not in str(left)
@@ -314,14 +314,12 @@ def test_no_kernel_calls_another():
 
 def test_the_order_of_fields_is_part_of_what_a_kernel_is_kept_under():
     from numba import types
-    from numba.core.registry import cpu_target
 
     from vvgt_cli.splat.tiles import reduce_pairs
 
     pairs = [types.BaseTuple.from_types((types.f8, types.f8), namedtuple("Pair", fields)) for fields in ("a b", "b a")]
-    codegen = cpu_target.target_context.codegen()
     assert len({repr(pair) for pair in pairs}) == 1
-    assert len({reduce_pairs._cache.file((pair,), codegen) for pair in pairs}) == 2
+    assert len({reduce_pairs.kernel_cache.file((pair,)) for pair in pairs}) == 2
 
 
 @pytest.mark.parametrize(

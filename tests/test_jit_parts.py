@@ -13,33 +13,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, take_turn, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 from vvgt_cli.refine.steps import adam
 
 
 @parallel_kernel("f8:1 f8:1")
-def roots(part: Part, values: np.ndarray, out: np.ndarray) -> None:
+def roots(thread: ThreadSlice, values: np.ndarray, out: np.ndarray) -> None:
     """Square roots; of a negative number there is none."""
-    for i in turns_of(part, values.shape[0]):
+    for i in iterations(thread, values.shape[0]):
         if values[i] < 0.0:
             raise ValueError("negative")
         out[i] += np.sqrt(values[i])
 
 
 @parallel_kernel("f8:1 f8:1")
-def roots_one_by_one(part: Part, values: np.ndarray, out: np.ndarray) -> None:
+def roots_one_by_one(thread: ThreadSlice, values: np.ndarray, out: np.ndarray) -> None:
     """Square roots, as whoever is free takes them."""
-    i = take_turn(part)
+    i = next_iteration(thread)
     while i < values.shape[0]:
         if values[i] < 0.0:
             raise ValueError("negative")
         out[i] += np.sqrt(values[i])
-        i = take_turn(part)
+        i = next_iteration(thread)
 
 
 @given(st.integers(1, 70), st.integers(0, 200))
 def test_parts_take_every_turn_once(parts, count):
-    taken = [i for part in range(parts) for i in turns_of.py_func((part, parts, None), count)]
+    taken = [i for part in range(parts) for i in iterations.py_func((part, parts, None), count)]
     assert taken == list(range(count))
 
 
@@ -90,11 +90,11 @@ def test_it_takes_its_arguments_by_name_and_place_and_keeps_its_words():
 
 
 def test_code_is_kept_under_the_options_of_a_body():
-    def twice(part: Part, out: np.ndarray) -> None:
-        for i in turns_of(part, out.shape[0]):
+    def twice(thread: ThreadSlice, out: np.ndarray) -> None:
+        for i in iterations(thread, out.shape[0]):
             out[i] *= 2.0
 
-    keys = [parallel_kernel("f8:1", fastmath=fast)(twice)._cache.key for fast in (False, True, False)]
+    keys = [parallel_kernel("f8:1", fastmath=fast)(twice).kernel_cache.key for fast in (False, True, False)]
     assert keys[0] == keys[2] != keys[1]
 
 

@@ -9,7 +9,7 @@ import sys
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.splat.buffer import prefetch
 
 
 @nb.njit
@@ -30,7 +30,7 @@ def test_a_line_is_asked_for_and_nothing_else_changes():
 
 
 def test_in_plain_python_nothing_is_asked_for():
-    call = "from vvgt_cli.jit.prefetch import prefetch; print(prefetch(None, 0, 0))"
+    call = "from vvgt_cli.splat.buffer import prefetch; print(prefetch(None, 0, 0))"
     done = subprocess.run(
         [sys.executable, "-c", call], env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True
     )

@@ -20,9 +20,7 @@ def test_helpers_are_not_called_from_python():
 
 
 def test_vectors_are_wide_where_that_costs_no_clock(monkeypatch):
-    from numba.core import config
-
-    from vvgt_cli.jit.target import features
+    from vvgt_cli.jit.numba_internals import config, features
 
     monkeypatch.setattr(config, "CPU_FEATURES", None)
     assert features("+avx512f,+avx512vbmi2") == "+avx512f,+avx512vbmi2,-prefer-256-bit"
@@ -37,8 +35,8 @@ def test_a_worker_compiles_by_those_features(tmp_path):
         "import llvmlite.binding as llvm; usual = llvm.Target.create_target_machine; asked = []\n"
         "def spy(self, **options): asked.append(options['features']); return usual(self, **options)\n"
         "llvm.Target.create_target_machine = spy\n"
-        "from pathlib import Path; from vvgt_cli.jit import target, worker\n"
-        "target.features = lambda found: found + ',-avx512vbmi2'; worker.run(Path('.'), [])\n"
+        "from pathlib import Path; from vvgt_cli.jit import numba_internals, worker\n"
+        "numba_internals.features = lambda found: found + ',-avx512vbmi2'; worker.run(Path('.'), [])\n"
         "from numba.core.registry import cpu_target; cpu_target.target_context.codegen()\n"
         "print(*(found.count(',-avx512vbmi2') for found in asked))"
     )

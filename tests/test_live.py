@@ -14,7 +14,7 @@ import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
-from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -313,9 +313,9 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
         assert done.code == 2
         assert option[0] in done.error
-    for other in (("--dry-run",), ("--tf", "viridis", "--tf", "magma")):
+    for other, line in ((("--dry-run",), "--dry-run with --live"), (("--tf", "viridis", "--tf", "magma"), "one --tf")):
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
-        assert (done.code, "one file of one volume" in done.error) == (2, True)
+        assert (done.code, line in done.error) == (2, True)
     np.save(tmp_path / "four.npy", np.random.default_rng(0).random((2, 6, 7, 8)))
     for source in (tmp_path / "four.npy", tmp_path / "*.npy"):
         done = vvgt("convert", source, "--live", "-o", tmp_path / "a.html", *SMALL)

@@ -12,7 +12,7 @@ import pytest
 import vvgt_cli as vvgt_library
 from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
 from tests.test_page_live import options, page_of
-from vvgt_cli.closed_form.relit import relit
+from vvgt_cli.closed_form.relight import relight
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
@@ -45,7 +45,7 @@ def exact(color: np.ndarray, n: np.ndarray, d: np.ndarray, light: Lighting) -> n
 def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lighting) -> None:
     rng = np.random.default_rng(2)
     gradient = rng.normal(size=(5, 3)) * rng.uniform(0.1, 1, (5, 1))
-    shaded = relit(grey(gradient), gradient, light)
+    shaded = relight(grey(gradient), gradient, light)
     assert shaded.degree == (2 if light.depends_on_view else 0)
     eyes = sphere(400)
     for k in range(5):
@@ -60,7 +60,7 @@ def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lig
 
 def test_where_there_is_no_gradient_there_is_ambient_light_alone() -> None:
     for light in (HEAD, SIDE):
-        shaded = relit(grey(np.zeros((2, 3))), np.zeros((2, 3)), light)
+        shaded = relight(grey(np.zeros((2, 3))), np.zeros((2, 3)), light)
         np.testing.assert_allclose(
             view_colors(shaded, np.array([3.0, 1, 0])), np.tile([0.5, 0.3, 0.1], (2, 1)) * light.ambient, atol=1e-6
         )
@@ -71,7 +71,7 @@ def test_a_light_turns_with_its_gaussians() -> None:
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
-        return relit(shown_by(gaussians, table), gaussians.live[:, 3:], light)
+        return relight(shown_by(gaussians, table), gaussians.live[:, 3:], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
     for light, other in ((SIDE, turned), (HEAD, HEAD)):

@@ -17,7 +17,7 @@ from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.judge import FALLEN, Judge
 from vvgt_cli.refine.loop import spread_views
 from vvgt_cli.refine.shared import NONE
-from vvgt_cli.refine.states import Fields, OwnFrame
+from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.splat import render
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
@@ -100,7 +100,7 @@ def test_alpha_is_fitted_where_colour_says_nothing(scene):
 def test_colours_are_negative_only_where_harmonics_may_lighten_them(degree):
     start = truth()
     start = replace(start, harmonics=None if degree is None else np.zeros((len(start), 3, 3), np.float32))
-    state = OwnFrame(start, CAMERAS)
+    state = OwnAxes(start, CAMERAS)
     for _ in range(20):  # towards a picture darker than black
         image = render(state.gaussians(), CAMERAS[0])
         state.descend(CAMERAS[0], state.project(CAMERAS[0]), image, np.full_like(image, 1e-3), 0.05, 0.0, 20.0)
@@ -133,7 +133,7 @@ def test_a_run_that_ends_worse_than_it_was_returns_its_best(scene):
     assert record.psnr_after == looks[best]
 
 
-@pytest.mark.parametrize("kind", [OwnFrame, Fields])
+@pytest.mark.parametrize("kind", [OwnAxes, Fields])
 def test_the_best_state_is_returned_not_the_last(scene, kind):
     start, _, check = scene
     state, record = kind(start, CAMERAS), OptimizeRecord()
@@ -169,14 +169,14 @@ def exact_steps(state, frames, rates, clip):
 def test_a_step_is_the_exponential_of_e_to_second_order():
     from vvgt_cli.refine import steps
 
-    state, rng = OwnFrame(truth(200), CAMERAS), np.random.default_rng(2)
+    state, rng = OwnAxes(truth(200), CAMERAS), np.random.default_rng(2)
     frames = rng.normal(size=(200, 9)).astype(np.float32)
     rates = np.array([0.05, 0.2, 0.15, 0.03, 0.008])  # E^2 / 2 is a tenth of E
     expected = exact_steps(state, frames, rates, 0.3)
     means, factors, logits, colors = state.arrays
     slopes = np.zeros((13, 200), np.float32)
     slopes[:9] = frames.T
-    steps.own_frame(
+    steps.own_axes(
         slopes, rates, np.array([0.5, 1.0, 0.3]), state.spread, *state.BETAS, 1,
         means, factors, logits, colors, state.darkest, state.first, state.second, NO_FLOORS, *NONE,
     )  # fmt: skip
@@ -235,7 +235,7 @@ def test_the_same_run_gives_the_same_bytes(scene):
 
 def test_a_fall_is_taken_back_and_rates_halved(scene, monkeypatch):
     start, images, check = scene
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * 100)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * 100)
     result, record = optimize(start, CAMERAS, images, OptimizeOptions(steps=200, check_every=5, patience=50), check)
     looks = [db for _, _, db in record.checks]
     assert min(looks) < looks[0] - 3
@@ -253,12 +253,12 @@ def test_steps_leave_the_input_alone(scene):
 
 def test_factors_and_back_keep_the_covariance():
     g = truth(200)
-    back = OwnFrame(g, CAMERAS).gaussians()
+    back = OwnAxes(g, CAMERAS).gaussians()
     np.testing.assert_allclose(covariances(back), covariances(g), atol=1e-6)
     flat = Gaussians(
         g.means, np.where([True, True, False], g.log_scales, -11), g.quaternions, g.opacity_logits, g.colors
     )
-    np.testing.assert_allclose(covariances(OwnFrame(flat, CAMERAS).gaussians()), covariances(flat), atol=1e-6)
+    np.testing.assert_allclose(covariances(OwnAxes(flat, CAMERAS).gaussians()), covariances(flat), atol=1e-6)
 
 
 def test_no_gaussians_stay_none(scene):

@@ -15,7 +15,7 @@ from random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import OptimizeOptions, optimize, shared, steps
-from vvgt_cli.refine.states import OwnFrame
+from vvgt_cli.refine.states import OwnAxes
 from vvgt_cli.splat import render
 
 CAMERAS = default_views("train", 6, size=64)
@@ -35,7 +35,7 @@ def unshared(g):
     """The state as the file has it, axes as they are."""
     few, shared.LEAST = shared.LEAST, len(g) + 1
     try:
-        return OwnFrame(g, CAMERAS)
+        return OwnAxes(g, CAMERAS)
     finally:
         shared.LEAST = few
 
@@ -101,7 +101,7 @@ def test_what_is_linear_in_the_features_is_foretold(count):
 
 def test_a_step_with_shares_and_floors_is_that_of_the_twin():
     """Opacity, colours and places after two steps, float64: Adam's directions with floors, and the features' shares."""
-    state, rng = OwnFrame(many(), CAMERAS), np.random.default_rng(2)
+    state, rng = OwnAxes(many(), CAMERAS), np.random.default_rng(2)
     assert state.shared is not None
     means, factors, logits, colors = state.arrays
     exact = [array.astype(np.float64) for array in (means, logits, colors)]
@@ -114,7 +114,7 @@ def test_a_step_with_shares_and_floors_is_that_of_the_twin():
     reach = np.sqrt(np.minimum(1 + state.spread / length, 9))
     for n in (1, 2):
         slopes = rng.normal(size=(13, MANY)).astype(np.float32)
-        steps.own_frame(
+        steps.own_axes(
             slopes, rates, clips, state.spread, 0.6, 0.999, n, means, factors, logits, colors, 0.0,
             state.first, state.second, floors, state.shared.features, weights,
         )  # fmt: skip
@@ -152,7 +152,7 @@ def test_errors_in_common_are_undone_in_fewer_steps(monkeypatch):
 @pytest.mark.parametrize("count", [MANY, 30_011])
 def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
     """At step 3, float64: what is added to divisors, and the regression of Adam's directions, ridge and all."""
-    state, rng = OwnFrame(many(count), CAMERAS), np.random.default_rng(3)
+    state, rng = OwnAxes(many(count), CAMERAS), np.random.default_rng(3)
     assert state.shared is not None
     size = np.exp(rng.normal(0, 2, count))
     size[7] = 1e8  # which counts as a hundred times the median
@@ -209,7 +209,7 @@ def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():
     code = (
-        "import hashlib; from test_optimize_shared import *; s = OwnFrame(many(12_500), CAMERAS); s.step = 1\n"
+        "import hashlib; from test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.step = 1\n"
         "w = s.common(np.random.default_rng(0).normal(size=(13, 12_500)).astype(np.float32))\n"
         "print(hashlib.sha256(b''.join(a.tobytes() for a in w)).hexdigest())"
     )
@@ -229,7 +229,7 @@ def test_weights_are_the_same_bytes_for_any_number_of_threads():
 
 
 def test_few_gaussians_share_nothing_and_have_the_whole_rate():
-    state = OwnFrame(many(shared.LEAST - 1), CAMERAS)
+    state = OwnAxes(many(shared.LEAST - 1), CAMERAS)
     assert state.shared is None
     state.step = 1
     floors, given, _ = state.common(np.ones((13, shared.LEAST - 1), np.float32))
@@ -246,7 +246,7 @@ def test_steps_stay_finite_where_gaussians_are_extreme(kind):
         g = replace(g, means=np.zeros_like(g.means))
     elif kind == "wide and narrow":
         g = replace(g, log_scales=np.where(np.arange(3 * MANY).reshape(-1, 3) % 7 == 0, -16, 2).astype(np.float32))
-    state = OwnFrame(g, CAMERAS)
+    state = OwnAxes(g, CAMERAS)
     rows = np.random.default_rng(0).normal(size=(13, MANY)).astype(np.float32)
     if kind in ("infinite", "1e25", "1e10"):
         rows[:, 5] = np.inf if kind == "infinite" else float(kind)
@@ -256,7 +256,7 @@ def test_steps_stay_finite_where_gaussians_are_extreme(kind):
         common = state.common(rows)
         assert all(np.isfinite(part).all() for part in common)
         assert np.abs(common[2]).max() < 1
-        steps.own_frame(
+        steps.own_axes(
             rows, state.RATES, state.CLIPS, state.spread, *state.BETAS, step, *state.arrays, 0.0,
             state.first, state.second, *common,
         )  # fmt: skip

@@ -13,7 +13,7 @@ from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.refine import METHODS, OptimizeOptions, optimize
-from vvgt_cli.refine.states import Fields, OwnFrame
+from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.refine.steps import adam
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
@@ -50,7 +50,7 @@ def assert_sound(gaussians, cameras):
 @pytest.mark.parametrize("method", METHODS)
 def test_stiff_scenes_stay_finite(stiff, method, rates, count, monkeypatch):
     start, cameras, views = stiff
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * rates)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * rates)
     monkeypatch.setattr(Fields, "RATES", tuple(rates * rate for rate in Fields.RATES))
     options = OptimizeOptions.of(method, steps=count, max_gaussians=300)
     result, record = optimize(start, cameras, views, options)
@@ -69,7 +69,7 @@ def test_extreme_gaussians_stay_finite(stiff, kind, method, count, monkeypatch):
         start = replace(start, log_scales=np.log(np.tile([0.8, 1e-4, 1e-4], (700, 1))))
     elif kind == "alike":
         start = start.take(np.zeros(700, np.int64))
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * 100)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * 100)
     result, _ = optimize(start, cameras, views, OptimizeOptions.of(method, steps=count, max_gaussians=700))
     assert_sound(result, cameras)
 
@@ -100,7 +100,7 @@ def test_the_kernel_of_adam_is_adam_in_float64(size):
 def test_what_decides_never_gets_worse(stiff, count, monkeypatch):
     """Rates 100 times too large, and check views: the run ends by itself, with no less than it began with."""
     start, cameras, views = stiff
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * 100)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * 100)
     judges = default_views("check", 2, size=SIZE)
     check = judges, np.stack([render(start, camera) for camera in judges])
     result, record = optimize(start, cameras, views, OptimizeOptions(steps=count, check_every=5), check)

@@ -60,7 +60,7 @@ def earlier(session):
     return session.convert(SHELL, GOAL)
 
 
-def went_on(result):
+def started_warm(result):
     return not [why for name, why in result.report.left_out if name == WARM_START]
 
 
@@ -73,29 +73,29 @@ def names(result):
 )  # so few Gaussians are too wide for colours of their own
 def test_another_function_is_as_near_as_by_itself(session, earlier, changes, less):
     tf = shell(**changes)
-    alone, onward = session.convert(tf, GOAL), session.convert(tf, GOAL, after=earlier)
-    assert went_on(onward)
-    assert onward.scores["psnr"] > alone.scores["psnr"] - less
+    alone, later = session.convert(tf, GOAL), session.convert(tf, GOAL, after=earlier)
+    assert started_warm(later)
+    assert later.scores["psnr"] > alone.scores["psnr"] - less
     assert "closed form" in names(alone)
-    assert names(onward)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
-    assert onward.report.refinement["steps"] == 24
-    assert onward.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
+    assert names(later)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
+    assert later.report.refinement["steps"] == 24
+    assert later.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
     again = session.convert(tf, GOAL, after=earlier)
-    assert np.array_equal(again.gaussians.means, onward.gaussians.means)
+    assert np.array_equal(again.gaussians.means, later.gaussians.means)
 
 
 def test_another_light_and_another_size(session, earlier):
     lit = vvgt.Look(SHELL, light="headlight")
-    alone, onward = session.convert(lit, GOAL), session.convert(lit, GOAL, after=earlier)
-    assert went_on(onward)
-    assert onward.gaussians.degree == 2
-    assert onward.scores["psnr"] > alone.scores["psnr"] - 0.5
-    unlit = session.convert(SHELL, GOAL, after=onward)
-    assert went_on(unlit)
+    alone, later = session.convert(lit, GOAL), session.convert(lit, GOAL, after=earlier)
+    assert started_warm(later)
+    assert later.gaussians.degree == 2
+    assert later.scores["psnr"] > alone.scores["psnr"] - 0.5
+    unlit = session.convert(SHELL, GOAL, after=later)
+    assert started_warm(unlit)
     assert unlit.gaussians.degree == 0
     assert unlit.report.refinement["standard"] == earlier.report.refinement["psnr_after"]  # by itself, not the last
     small = {**GOAL, "size": 64}
-    assert went_on(other := session.convert(SHELL, small, after=earlier))
+    assert started_warm(other := session.convert(SHELL, small, after=earlier))
     assert other.ply.made_for == 64
 
 
@@ -110,19 +110,20 @@ def test_another_light_and_another_size(session, earlier):
 )
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
-    onward, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
-    assert why in dict(onward.report.left_out)[WARM_START]
-    assert np.array_equal(onward.gaussians.means, alone.gaussians.means)
-    assert np.array_equal(onward.gaussians.colors, alone.gaussians.colors)
-    assert names(onward)[-1] == "conditions"
+    later, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
+    assert why in dict(later.report.left_out)[WARM_START]
+    assert np.array_equal(later.gaussians.means, alone.gaussians.means)
+    assert np.array_equal(later.gaussians.colors, alone.gaussians.colors)
+    assert names(later)[-1] == "conditions"
 
 
 def test_refused(session, earlier):
     with pytest.raises(vvgt.UsageError, match="same volume"):
         vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
-    for kind in ("live", "split_labels"):
-        with pytest.raises(vvgt.UsageError, match=r"after with .*leave it out"):
-            session.convert(SHELL, GOAL, after=earlier, **{kind: True})
+    with pytest.raises(vvgt.UsageError, match=r"after with --live: .*leave it out"):
+        session.convert(SHELL, GOAL, after=earlier, live=True)
+    with pytest.raises(vvgt.UsageError, match=r"after with labels: .*leave it out"):
+        vvgt.convert("example:blob:16", goal=GOAL, after=earlier, split_labels=True)
     with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
         session.convert([SHELL, "gray"], GOAL, after=earlier)
 
@@ -155,8 +156,8 @@ def test_in_blocks_too(values):
     )
     tf = shell(times=0.5)
     blocked = vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
-    assert went_on(blocked)
-    assert went_on(vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING, blocks=16))
+    assert started_warm(blocked)
+    assert started_warm(vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING, blocks=16))
     whole = vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING)
     assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     values = values.copy()

@@ -9,7 +9,7 @@ from tests.test_scale import FIT, bodies, sorted_rows
 from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.tiff import read_tiff
+from vvgt_cli.volume.tiff.reader import read_tiff
 
 
 @pytest.mark.parametrize("coding", [None, "zlib"])

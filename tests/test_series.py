@@ -48,7 +48,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
             Path(name).write_text(text)
         return ConversionReport("convert")
 
-    monkeypatch.setattr("vvgt_cli.conversion.batch.convert", write)
+    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", write)
     return calls
 
 
@@ -132,7 +132,7 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
         Path(request.output).write_text("short")
         return ConversionReport("convert", refinement={"reason": "interrupted"})
 
-    monkeypatch.setattr("vvgt_cli.conversion.batch.convert", interrupted)
+    monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", interrupted)
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     assert vvgt(*run).code == 130
     assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]

@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.constants import MAX_ALPHA
 from vvgt_cli.gaussians.rules import INRIA, RULES
 from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
 from vvgt_cli.splat.reference import covariances, image_gradients, layers, rotations, space_gradients
-from vvgt_cli.splat.render import moments, own_frame_backward, project_factors
+from vvgt_cli.splat.render import moments, own_axes_backward, project_factors
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 EYE = (2.0, -1.7, 1.1)
@@ -194,14 +194,14 @@ def test_the_same_call_gives_the_same_bytes():
 
 @pytest.mark.parametrize("rule", [RULES["inria"], RULES["compensated"]], ids=lambda rule: rule.name)
 @pytest.mark.parametrize("axes", [(0.1, 0.05, 0.02), (0.6, 0.6, 1e-5)])
-def test_own_frame_gradients_match_the_twin(axes, rule):
+def test_own_axes_gradients_match_the_twin(axes, rule):
     g, c = cloud(200, 8), camera(48, 40)
     g = Gaussians(g.means, np.log(np.tile(axes, (200, 1))), g.quaternions, g.opacity_logits, g.colors)
     factors = np.float32(rotations(g.quaternions) * np.exp(g.log_scales.astype(np.float64))[:, None, :])
     np.testing.assert_allclose(factors @ factors.transpose(0, 2, 1), covariances(g), atol=1e-7)
     grad = np.random.default_rng(0).normal(size=(c.height, c.width, 4)).astype(np.float32)
     p = project_factors(g.means, factors, g.opacity_logits, c, rule)
-    ours = own_frame_backward(g.means, factors, g.colors, c, p, moments(p, g.colors, render(g, c, projection=p), grad))
+    ours = own_axes_backward(g.means, factors, g.colors, c, p, moments(p, g.colors, render(g, c, projection=p), grad))
     centres, inverses, logits, colors = image_gradients(g, c, grad.astype(np.float64), rule)
     means, spatial = space_gradients(g, c, centres, inverses, rule)
     steps = np.einsum("kji,kj->ki", factors, means)

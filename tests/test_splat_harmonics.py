@@ -13,7 +13,7 @@ from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
 from vvgt_cli.splat.reference import layers, rotations
-from vvgt_cli.splat.render import moments, own_frame_backward, project_factors, seen_colors, seen_slopes
+from vvgt_cli.splat.render import moments, own_axes_backward, project_factors, seen_colors, seen_slopes
 
 EYE = (2.0, -1.7, 1.1)
 DEGREES = (1, 2, 3)
@@ -113,14 +113,14 @@ def test_gradients_match_the_twin(degree):
     assert not ours.harmonics.transpose(0, 2, 1)[dark].any()
 
 
-def test_own_frame_gradients_match_the_twin():
+def test_own_axes_gradients_match_the_twin():
     g, c = cloud(200, 3), camera(48, 40)
     factors = np.float32(rotations(g.quaternions) * np.exp(g.log_scales.astype(np.float64))[:, None, :])
     grad = np.random.default_rng(0).normal(size=(c.height, c.width, 4)).astype(np.float32)
     p = project_factors(g.means, factors, g.opacity_logits, c)
     seen = seen_colors(g.means, g.colors, g.harmonics, c.position)
     pairs = moments(p, seen, render(g, c, projection=p), grad)
-    ours = own_frame_backward(g.means, factors, seen, c, p, pairs, g.harmonics)
+    ours = own_axes_backward(g.means, factors, seen, c, p, pairs, g.harmonics)
     twin = render_backward_reference(g, c, grad.astype(np.float64))
     steps = np.einsum("kji,kj->ki", factors, twin["means"])
     for a, b in ((ours.rows[:3].T, steps), (ours.harmonics, twin["harmonics"])):

@@ -111,7 +111,7 @@ def test_standard_input_is_read_once(tmp_path: Path) -> None:
 
 def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatch) -> None:
     """The closed form of a solid ball, nearer than with the surface where a cell is half opaque."""
-    from vvgt_cli.closed_form import VbmOptions, initialise, inset
+    from vvgt_cli.closed_form import VbmOptions, initialise, surface_offset
 
     source = load(SourceRequest(Volume(np.where(nested() > 0, 1, 0).astype(np.uint8)), labels=distinct([1])))
     assert source.scene().labels
@@ -121,7 +121,7 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
         return score_test_views(source.scene(), gaussians, 256, RenderSettings(), perceptual=False).psnr
 
     ours = score()
-    monkeypatch.setattr(inset, "LABEL_DEPTH", inset.OPAQUE_DEPTH)
+    monkeypatch.setattr(surface_offset, "LABEL_DEPTH", surface_offset.OPAQUE_DEPTH)
     assert ours > score() + 1
 
 

@@ -8,7 +8,7 @@ import pytest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.synth import open_volume
 from vvgt_cli.synth.shapes import SHAPES, make_shape
-from vvgt_cli.volume.nrrd_write import write_nrrd
+from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.types import Volume
 
 

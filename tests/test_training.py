@@ -29,7 +29,7 @@ from vvgt_cli.network.training.scenes import make_scenes, prepare_scenes, recipe
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_backward_reference, render_reference
 from vvgt_cli.synth.shapes import make_shape
-from vvgt_cli.volume.nrrd_write import write_nrrd
+from vvgt_cli.volume.medical.nrrd import write_nrrd
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("yaml")

@@ -132,7 +132,7 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
         ({"sizes": "5 4 many"}, "whole numbers of at least 1"),
         ({"sizes": "5 4"}, "dimension 3 but sizes"),
         ({"dimension": 5, "sizes": "1 2 2 3 5"}, "spatial axes"),
-        ({"type": "block"}, "type 'block'"),
+        ({"type": "block"}, "type is 'block'"),
         ({"endian": None}, "no field 'endian'"),
         ({"endian": "middle"}, "expected little or big"),
         ({"encoding": "hex"}, "encoding 'hex'"),

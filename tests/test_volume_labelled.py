@@ -16,8 +16,8 @@ import zarr
 from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.arrays.netcdf3 import check_header
 from vvgt_cli.volume.labelled import even
-from vvgt_cli.volume.netcdf3 import check_header
 
 VALUES = ramp(X, Y, Z)
 AXES = {"x": X, "y": Y, "z": Z}
@@ -121,7 +121,7 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(volume.data[1:], VALUES[1:], rtol=1e-6)
     with pytest.raises(UsageError, match=r"several variables: packed \(z, y, x: 3 x 4 x 5\); holed"):
         read_volume(str(path))
-    with pytest.raises(UsageError, match="no variable none; it has packed"):
+    with pytest.raises(UsageError, match="no variable 'none'; it has packed"):
         read_volume(str(path), ReadOptions(array="none"))
 
 
@@ -182,7 +182,7 @@ def test_hdf5_choices(tmp_path: Path) -> None:
         file["a/one"], file["b/two"] = VALUES, VALUES + 1
     with pytest.raises(UsageError, match=r"several datasets: /a/one \(3, 4, 5\) float64; /b/two .*choose one as"):
         read_volume(str(path))
-    with pytest.raises(UsageError, match=r"no dataset /c; it has /a/one"):
+    with pytest.raises(UsageError, match=r"no dataset '/c'; it has /a/one"):
         read_volume(f"{path}:/c")
     with pytest.raises(UsageError, match="choose both"):
         read_volume(f"{path}:/a/one", ReadOptions(array="/a/one"))
@@ -313,7 +313,7 @@ def test_npz(tmp_path: Path, save) -> None:
     assert volume.name == "v:field"
     np.testing.assert_array_equal(volume.data, VALUES)
     save(path, field=VALUES, other=VALUES + 1)
-    with pytest.raises(UsageError, match="several arrays: field, other; choose one with --array"):
+    with pytest.raises(UsageError, match="several arrays: field; other; choose one with --array"):
         read_volume(str(path))
     np.testing.assert_array_equal(read_volume(str(path), ReadOptions(array="other")).data, VALUES + 1)
 

@@ -16,7 +16,7 @@ import pytest
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, blocks, read_volume
-from vvgt_cli.volume.grid_text import BOHR
+from vvgt_cli.volume.maps.text import BOHR
 
 VALUES = np.random.default_rng(5).integers(0, 100, (3, 4, 5))  # z, y, x
 

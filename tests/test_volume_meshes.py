@@ -12,8 +12,9 @@ from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
 from tests.ramps import X, Y, Z, axes_of, check_ramp
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
+from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import contents
+from vvgt_cli.volume.vtk import child as vtk_child
 
 BOUNDS = [(X[0], X[-1]), (Y[0], Y[-1]), (Z[0], Z[-1])]
 
@@ -124,7 +125,7 @@ def test_components_and_choices(tmp_path: Path) -> None:
 def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     path = tmp_path / f"v.{suffix}"
     {"vtr": rectilinear, "vts": structured, "vtu": tetrahedra, "vtk": tetrahedra}[suffix]().save(path)
-    code = "import os, vvgt_cli.volume.vtk_child as c; c.answer = lambda request: os.kill(os.getpid(), 11); c.main()"
+    code = "import os, vvgt_cli.volume.vtk.child as c; c.answer = lambda request: os.kill(os.getpid(), 11); c.main()"
     monkeypatch.setattr(vtk_child, "START", code)
     with pytest.raises(DataError, match=r"VTK's reader of VTK files broke down \(SIGSEGV\)"):
         read_volume(str(path))

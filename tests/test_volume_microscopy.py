@@ -19,7 +19,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, Several
 from vvgt_cli.field.layered import open_parts
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.levels import level_shapes
+from vvgt_cli.volume.registry import level_shapes
 from vvgt_cli.volume.stored import Stored
 
 FIXTURES = Path(__file__).parent / "fixtures"
@@ -243,7 +243,7 @@ def test_lz4_of_java() -> None:
 
     import lz4.block
 
-    from vvgt_cli.volume.n5 import unpack
+    from vvgt_cli.volume.arrays.n5 import unpack
 
     first, second = bytes(range(256)) * 4, b"abcd"
     packed = lz4.block.compress(first, store_size=False)

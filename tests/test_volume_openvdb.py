@@ -15,9 +15,9 @@ import pytest
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume, statistics
-from vvgt_cli.volume.bricks import BrickArray
 from vvgt_cli.volume.components import magnitude
 from vvgt_cli.volume.openvdb import codec
+from vvgt_cli.volume.openvdb.bricks import BrickArray
 from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.openvdb.layout import brick_array
 from vvgt_cli.volume.openvdb.tree import Tree

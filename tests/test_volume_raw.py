@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume import raw as raw_module
-from vvgt_cli.volume.options import DTYPES, parse_dtype
+from vvgt_cli.volume.headers import DTYPES
+from vvgt_cli.volume.options import parse_dtype
+from vvgt_cli.volume.plain import raw as raw_module
 
 
 def sample(shape: tuple[int, int, int], dtype: np.dtype, seed: int = 0) -> np.ndarray:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gzip
 import subprocess
 import sys
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.synth import open_volume
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.blocks import parse_numbers
-from vvgt_cli.volume.readers import Reader, known_suffixes, register, volume_name
+from vvgt_cli.volume.readers import READERS, Reader, known_suffixes, register, volume_name
 
 NRRD = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n" + bytes(range(8))
 HEADS = (
@@ -145,9 +147,17 @@ def test_names() -> None:
 
 def test_the_registry_checks_itself() -> None:
     with pytest.raises(ValueError, match="registered twice"):
-        register(Reader("NRRD", (".x",), lambda head: False, lambda path, options: None))  # type: ignore[arg-type,return-value]
+        register(Reader("NRRD", (".x",), lambda path, options: None))  # type: ignore[arg-type,return-value]
     with pytest.raises(ValueError, match="lower case"):
-        register(Reader("new", ("X",), lambda head: False, lambda path, options: None))  # type: ignore[arg-type,return-value]
+        register(Reader("new", ("X",), lambda path, options: None))  # type: ignore[arg-type,return-value]
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_the_functions_of_a_reader_are_there(reader: Reader) -> None:
+    for made in (reader.read, reader.holds, reader.levels, reader.contents):
+        if isinstance(made, partial):
+            module, _, function = made.args[0].rpartition(".")
+            assert callable(getattr(import_module(f"vvgt_cli.volume.{module}"), function))
 
 
 def test_numbers_across_windows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.levels import level_shapes
-from vvgt_cli.volume.remote import Remote
+from vvgt_cli.volume.arrays.remote import Remote
+from vvgt_cli.volume.registry import level_shapes
 
 zarr = pytest.importorskip("zarr")
 FIT = ("--max-gaussians", "2000", "--size", "100", "-q")
@@ -140,7 +140,7 @@ def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> Non
 def test_what_cannot_be_is_a_line(vvgt, address: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for place, text in (
         (f"{address}/none.zarr", "no Zarr there"),
-        (f"{address}/x.ome.zarr:/7", "no array 7"),
+        (f"{address}/x.ome.zarr:/7", "no array '7'"),
         ("http://127.0.0.1:9/x.zarr", "or no answer"),
     ):
         done = vvgt("convert", place, "-o", tmp_path / "a.ply")
@@ -157,7 +157,7 @@ def test_other_codecs_than_were_checked_are_refused(
     real = Remote.read_text
     told_of = lambda self, encoding: json.dumps(told) if self.name == ".zarray" else real(self, encoding)  # noqa: E731
     monkeypatch.setattr(Remote, "read_text", told_of)
-    monkeypatch.setattr("vvgt_cli.volume.zarr_store._CODECS", {"zlib"})  # the array itself has another one
+    monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", {"zlib"})  # the array itself has another one
     with pytest.raises(DataError, match="codec"):
         read_volume(f"{address}/t.zarr", ReadOptions(time=0))
 
@@ -172,7 +172,7 @@ def test_other_codecs_of_coordinates_are_refused(address: str, folder: Path, mon
     told_of = lambda self, encoding: told if str(self).endswith("x/.zarray") else real(self, encoding)  # noqa: E731
     assert read_volume(f"{address}/c.zarr:/v").dims == (10, 9, 8)
     monkeypatch.setattr(Remote, "read_text", told_of)
-    monkeypatch.setattr("vvgt_cli.volume.zarr_store._CODECS", set[str]())  # the array itself has one
+    monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", set[str]())  # the array itself has one
     with pytest.raises(DataError, match="codec"):
         read_volume(f"{address}/c.zarr:/v")
 

@@ -11,7 +11,7 @@ import pytest
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, slabs, statistics
 from vvgt_cli.volume import stats as stats_module
-from vvgt_cli.volume.options import DTYPES
+from vvgt_cli.volume.headers import DTYPES
 
 
 def values_of(dtype: np.dtype, seed: int = 5) -> np.ndarray:

@@ -216,7 +216,7 @@ def test_legacy_sections_written_by_hand(tmp_path: Path) -> None:
         (legacy(b"POINT_DATA 60\nNONSENSE\n"), "unknown section"),
         (legacy(b"POINT_DATA 60\nFIELD f 2\n"), "fewer arrays"),
         (legacy(b"POINT_DATA\n"), "damaged legacy VTK file"),
-        (legacy(b""), "no numeric point or cell array"),
+        (legacy(b""), "no array of numbers"),
         (legacy(b"POINT_DATA 60\nSCALARS a int\n1 2 3\n", "ASCII"), "holds 3 values"),
         (legacy(b"POINT_DATA 60\nSCALARS a int\n" + b"one " * 60, "ASCII"), "not a list of int32 numbers"),
         (legacy(b"", "HEX"), "expected ASCII or BINARY"),

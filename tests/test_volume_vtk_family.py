@@ -303,7 +303,7 @@ def test_case_files_name_nothing_elsewhere(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_breaks_down_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vvgt_cli.volume import vtk_child
+    from vvgt_cli.volume.vtk import child as vtk_child
 
     path = files.exodus(tmp_path)
     for code, text in (
@@ -318,7 +318,7 @@ def test_a_reader_that_breaks_down_is_one_line(tmp_path: Path, monkeypatch: pyte
 
 def test_a_reader_that_sleeps_for_good_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one does that waits for a lock of its own: no limit of processor time ends it."""
-    from vvgt_cli.volume import vtk_child
+    from vvgt_cli.volume.vtk import child as vtk_child
 
     monkeypatch.setattr(vtk_child, "IDLE", 0.4)
     monkeypatch.setattr(vtk_child, "LOOK", 0.1)
@@ -330,7 +330,7 @@ def test_a_reader_that_sleeps_for_good_is_ended(tmp_path: Path, monkeypatch: pyt
 
 
 def test_memory_and_time_of_a_reader_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vvgt_cli.volume import vtk_child
+    from vvgt_cli.volume.vtk import child as vtk_child
 
     path = files.hdf_mesh(tmp_path)
     monkeypatch.setattr(vtk_child, "free_memory", lambda: 1 << 20)
@@ -340,7 +340,7 @@ def test_memory_and_time_of_a_reader_are_bounded(tmp_path: Path, monkeypatch: py
     endless = "c.answer = lambda request: exec('while True: pass')"
     monkeypatch.setattr(vtk_child, "SECONDS", 0)
     monkeypatch.setattr(vtk_child, "A_VOXEL", 0)
-    monkeypatch.setattr(vtk_child, "START", f"import vvgt_cli.volume.vtk_child as c; {endless}; c.main()")
+    monkeypatch.setattr(vtk_child, "START", f"import vvgt_cli.volume.vtk.child as c; {endless}; c.main()")
     with pytest.raises(DataError, match="was stopped"):
         read_volume(str(path), ReadOptions(array="ramp"))
 

@@ -14,9 +14,10 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from tests import vtk_files as files
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume import ReadOptions, read_volume, vtk_pieces
+from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.stored import Stored, is_file_backed
+from vvgt_cli.volume.vtk import pieces as vtk_pieces
 
 PLAIN = {"DataMode": 2, "EncodeAppendedData": False, "CompressorType": 0}  # raw, appended
 CODINGS = {"plain": PLAIN, "packed": {"DataMode": 2, "CompressorType": 1}, "ascii": {"DataMode": 0}}

@@ -61,7 +61,7 @@ def test_zipped_folders(tmp_path: Path, version: int, name: str, inside: str, pa
     for other in (read_volume(source + ":/1", ReadOptions(time=0)), read_volume(source, ReadOptions(time=0, level=1))):
         np.testing.assert_array_equal(other.data, VALUES[0, :, ::2, ::2])
         assert other.spacing == (2, 4, 3)
-    with pytest.raises(UsageError, match="no array /nothing"):
+    with pytest.raises(UsageError, match="no array '/nothing'"):
         read_volume(source + ":/nothing", ReadOptions(time=0))
 
 

@@ -90,7 +90,7 @@ def command(
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
     from vvgt_cli.cli.fit import convert_request
-    from vvgt_cli.conversion.batch import convert_files
+    from vvgt_cli.conversion.convert_batch import convert_files
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None

@@ -178,9 +178,8 @@ def set_threads(count: int) -> None:
     """Run the kernels on ``count`` threads; set before numba is imported if that is still possible."""
     if "numba" in sys.modules:
         import numba
-        from numba.core import config
 
-        numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         return
     os.environ["NUMBA_NUM_THREADS"] = str(count)
     os.environ["OMP_NUM_THREADS"] = str(count)

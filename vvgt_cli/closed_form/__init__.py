@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class VbmOptions:
-    """What the Gaussians are made for.
+    """Options of the closed form.
 
     Attributes:
         max_gaussians: budget.
@@ -44,6 +44,11 @@ class VbmOptions:
     values: bool = False
 
     def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            UsageError: an unknown method, or a number below 1.
+        """
         if self.method not in METHODS:
             raise UsageError(f"init {self.method!r}; expected one of {', '.join(METHODS)}")
         if self.max_gaussians < 1:
@@ -54,7 +59,7 @@ class VbmOptions:
 
 @dataclass(frozen=True)
 class Start:
-    """Gaussians of the stage, and the pyramid that views may cut anew (None for the comparison methods).
+    """Gaussians of the stage, and the pyramid that views may cut again (None for the comparison methods).
 
     Attributes:
         gaussians: one a cell.
@@ -68,7 +73,7 @@ class Start:
 
 
 def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = None) -> Start:
-    """The closed form alone: no view is rendered. No Gaussians where no view sees anything."""
+    """Return Gaussians by the closed form alone, without rendering; none where no view sees anything."""
     from vvgt_cli.closed_form.closed_form import closed_form
 
     form = closed_form(
@@ -80,7 +85,7 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
 
 
 def start_of(form: ClosedForm, options: VbmOptions) -> Start:
-    """The Gaussians of the method asked for, from a closed form."""
+    """Return the Gaussians of the method asked for, from a closed form."""
     from vvgt_cli.closed_form.uniform import uniform_gaussians
     from vvgt_cli.closed_form.wavelet import wavelet_gaussians
 
@@ -99,11 +104,12 @@ def start_of(form: ClosedForm, options: VbmOptions) -> Start:
 
 
 def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> Gaussians:
-    """The closed form of other cells of the pyramid, as many: more where views of the first ones are wrong.
+    """Return as many Gaussians from other cells of the pyramid: more where views of the first ones are wrong.
 
     Args:
         start: from `initialise`, with a pyramid.
-        cameras, views: of training, (n, h, w, 4) float32 premultiplied.
+        cameras: of the training views.
+        views: (n, h, w, 4) float32 premultiplied.
         rule: by which they are drawn.
 
     Raises:
@@ -121,11 +127,12 @@ def backproject(
     progress: Progress | None = None,
     rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
-    """What views can mend without gradient descent: which cells are split, the style of surfaces, and the colours.
+    """Improve by views what needs no gradient descent: which cells are split, the style of surfaces, and colours.
 
     Args:
         start: from `initialise`.
-        cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        cameras: of the training views.
+        views: (n, h, w, 4) float32 premultiplied.
         progress: called after each part.
         rule: by which they are drawn.
 

@@ -13,12 +13,12 @@ from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.error import scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
-from vvgt_cli.closed_form.inset import Opaque, opaque_field
 from vvgt_cli.closed_form.lit import Shading, centroids
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.samples import visible_voxels
 from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
 from vvgt_cli.closed_form.sharpen import sharpened
+from vvgt_cli.closed_form.surface_offset import Opaque, opaque_field
 from vvgt_cli.closed_form.tree import (
     Leaves,
     Tree,
@@ -86,15 +86,15 @@ class ClosedForm:
     scene: Scene | None = None
 
     def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
-        """Gaussians of the cells that the moments alone choose."""
+        """Return Gaussians of the cells that the moments alone choose."""
         return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
     def cells_of_values(self) -> Leaves:
-        """Cells for any function: those of `tree.value_score`."""
+        """Return cells for any function: those of `tree.value_score`."""
         return leaves_of(self.tree, select(self.tree, self.budget, value_score(self.tree, self.labels)))
 
     def gaussians_of(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
-        """Gaussians of cells."""
+        """Return the Gaussians of cells."""
         return self._sharpened(leaves, self._cells(leaves, style))
 
     def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
@@ -104,15 +104,15 @@ class ClosedForm:
         return self.shading.lit(found, self.tree, leaves, self.degree, self.normals)
 
     def _sharpened(self, leaves: Leaves, found: Gaussians) -> Gaussians:
-        """`sharpened`, but labels: each is of one colour, and may be written to a file of its own."""
+        """Apply `sharpened`, but not to labels: each is of one colour, and may be written to a file of its own."""
         if self.labels:
             return found
         return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.half)
 
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
-        """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
+        """Return `gaussians` of cells chosen by the errors of ``drawn`` that views (n, h, w, 4) show, by ``rule``.
 
-        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden left out.
+        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden skipped.
         """
         score = split_score(self.tree)
         ids = select(self.tree, self.budget, score)
@@ -128,7 +128,7 @@ class ClosedForm:
         return self._sharpened(leaves.take(shown), found.take(shown))
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
-        """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
+        """Return Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
         start = max(int(self.budget * REFINE_FROM), 1)
         leaves = leaves_of(self.tree, select(self.tree, start))
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
@@ -151,7 +151,7 @@ def closed_form(
     degree: int = 0,
     values: bool = False,
 ) -> ClosedForm:
-    """Moments, visibility and pyramid of a scene.
+    """Compute moments, visibility and pyramid of a scene.
 
     Args:
         scene: volume under a transfer function.
@@ -172,7 +172,7 @@ def closed_form(
 
 
 def part(progress: Progress | None, first: int, last: int) -> Callable[[float], None]:
-    """What is told the share that is done of something that takes from ``first`` to ``last`` per cent of the whole."""
+    """Return a callback that maps its share to ``first`` to ``last`` per cent of the whole and reports it."""
     return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
 
 
@@ -190,43 +190,43 @@ def form_of(
     scene: Scene | None = None,
     values: bool = False,
 ) -> ClosedForm:
-    """The closed form over base cells, wherever the volume's values are; arguments as of `closed_form` and its result.
+    """Return the closed form over base cells, wherever the values are; arguments and result as of `closed_form`.
 
-    ``progress`` is told the share that is done.
+    ``progress`` is called with the completed share.
     """
-    tell = progress or (lambda share: None)
+    report = progress or (lambda share: None)
     box = Box(half, step)
     cameras = cameras or default_views("train", size=MARCH_SIZE)
-    seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
+    seen = visibility(box, cells, cameras, progress=lambda share: report(0.5 * share))
     if values:
         seen = seen.at_least(INSIDE)
     opaque = opaque_field(cells, step, half, labels)
-    tell(0.6)
+    report(0.6)
     normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]
     tree = build_tree(cells, seen, step)
     if shading is not None and normals is None:
         base = int((tree.children == 0).sum())
         normals = shading.normals(centroids(tree.moments[:base]))
-    tell(1)
+    report(1)
     return ClosedForm(
         seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
     )  # fmt: skip
 
 
 def base_level(scene: Scene, size: int, budget: int, values: bool = False) -> int:
-    """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
+    """Return the finest level whose base cells fit the memory, the budget and what the images can resolve."""
     return level_within(
         scene.step, visible_voxels(scene), most_cells(budget, values), finest_level(scene.step, pixel_width(size))
     )
 
 
 def most_cells(budget: int, values: bool = False) -> int:
-    """Base cells that a budget has use for, and memory holds; ``values``: as of `closed_form`."""
+    """Return how many base cells a budget needs and memory holds; ``values``: as of `closed_form`."""
     return min(MAX_BASE_CELLS, max((OF_VALUES if values else CELLS_A_GAUSSIAN) * budget, FEW_CELLS))
 
 
 def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> int:
-    """Finest level, from ``finest`` on, that cuts ``voxels`` voxels of edges ``step`` into ``most`` cells or fewer."""
+    """Return the finest level from ``finest`` on that cuts ``voxels`` of edges ``step`` into at most ``most`` cells."""
     level = finest
     # a long voxel holds more cells than 8^-level
     while voxels / np.prod(2.0 ** exponents(step, level)) > most:
@@ -235,12 +235,12 @@ def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> i
 
 
 def finest_level(step: np.ndarray, pixel: float) -> int:
-    """Level of the cells that pixels just tell apart; ``step`` (3,) voxel edges, ``pixel`` a pixel's, unit frame."""
+    """Return the level of cells that pixels just resolve; ``step`` (3,) voxel, ``pixel`` pixel edges, unit frame."""
     return max(FINEST, math.floor(math.log2(MIN_CELL * pixel / float(step.min()))))
 
 
 def bound(form: ClosedForm) -> str:
-    """Why there are no more Gaussians, where there are fewer than the budget."""
+    """Return why there are no more Gaussians, where there are fewer than the budget."""
     finest = 2.0 ** exponents(form.step, finest_level(form.step, form.pixel)) * form.step
     if (form.tree.edges[0] > 1.5 * finest).any():
         return f"memory for at most {MAX_BASE_CELLS} cells"
@@ -248,7 +248,7 @@ def bound(form: ClosedForm) -> str:
 
 
 def expected_cells(voxels: float, step: np.ndarray, size: int, budget: int) -> float:
-    """About how many base cells the closed form of ``budget`` Gaussians for images of ``size`` px will have."""
+    """Estimate the base cells of the closed form of ``budget`` Gaussians for images of ``size`` px."""
     level = level_within(step, voxels, most_cells(budget), finest_level(step, pixel_width(size)))
     return voxels / float(np.prod(2.0 ** exponents(step, level)))
 
@@ -260,13 +260,14 @@ def fit(
     progress: Progress | None = None,
     rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
-    """The pyramid cut where views see errors, then coloured by all of them.
+    """Cut the pyramid where views see errors, then colour its cells by all of them.
 
     Where bodies are opaque, styles of surface compete on every third view.
 
     Args:
         form: what to cut.
-        cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        cameras: of the training views.
+        views: (n, h, w, 4) float32 premultiplied.
         progress: called after each cut and at the end.
         rule: by which the views are drawn.
 
@@ -290,7 +291,7 @@ def fit(
 
 
 def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> float:
-    """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+    """Return mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
 
     A file that leans on the renderer's 0.3 px looks right at one size only.
     """

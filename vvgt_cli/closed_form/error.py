@@ -14,7 +14,7 @@ SHARED = 1.0  # mean scores that the cells above count for: an error of few pixe
 
 
 def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """Scores of splits, times what the pictures' errors are of what the scores foretold.
+    """Scale scores of splits by the ratio of the pictures' errors to those that the scores predicted.
 
     Args:
         tree: the pyramid.
@@ -27,33 +27,35 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         within it, drawn towards its parent's; cells below one that was drawn have its factor. Errors in proportion to
         the scores change nothing.
     """
-    wrong, told = np.zeros(len(tree)), np.zeros(len(tree))
-    wrong[ids], told[ids] = errors, score[ids]
+    wrong, predicted = np.zeros(len(tree)), np.zeros(len(tree))
+    wrong[ids], predicted[ids] = errors, score[ids]
     levels = list(_levels(tree))
     for level in levels[:0:-1]:
         parents = tree.parent[level]
-        for sums in (wrong, told):
+        for sums in (wrong, predicted):
             sums[parents[0] : parents[-1] + 1] += np.bincount(parents - parents[0], sums[level])
-    if not (wrong[-1] > 0 and told[-1] > 0):
+    if not (wrong[-1] > 0 and predicted[-1] > 0):
         return score
-    factor, mean = np.ones(len(tree)), wrong[-1] / told[-1]
-    prior = SHARED * told[-1] / len(ids)
+    factor, mean = np.ones(len(tree)), wrong[-1] / predicted[-1]
+    prior = SHARED * predicted[-1] / len(ids)
     for level in levels[1:]:
         above = factor[tree.parent[level]]
-        factor[level] = np.where(told[level] > 0, (wrong[level] / mean + prior * above) / (told[level] + prior), above)
+        factor[level] = np.where(
+            predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
+        )
     result: np.ndarray = score * np.clip(factor, LEAST, MOST)
     return result
 
 
 def unseen(weights: np.ndarray, most: int) -> np.ndarray:
-    """(n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
+    """Return (n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
     found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
     found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
     return found
 
 
 def _levels(tree: Tree) -> Iterator[np.ndarray]:
-    """The rows of each level, which lie together, from the root down."""
+    """Yield the rows of each level, which lie together, from the root down."""
     level = np.array([len(tree) - 1])
     while True:
         yield level

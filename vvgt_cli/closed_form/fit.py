@@ -1,4 +1,4 @@
-"""What views can mend in closed-form Gaussians without moving them: cells split by error, colours by least squares."""
+"""Fit closed-form Gaussians to views without moving them: cells split by error, colours by least squares."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Progress = Callable[[int, int], None]
 
 
 def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
-    """(K,) sum over views and pixels of blending weight x error of RGB and alpha; ``views`` (n, h, w, 4)."""
+    """Sum blending weight x error of RGB and alpha over views (n, h, w, 4) and pixels, (K,)."""
     return weights_and_errors(gaussians, cameras, views, rule)[1]
 
 
 def weights_and_errors(
     gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) sums over views and pixels of blending weight, and `image_errors` of the errors' ``power``."""
+    """Return (K,) sums over views and pixels of blending weight, and `image_errors` of the errors' ``power``."""
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera, rule)
@@ -40,7 +40,7 @@ def weights_and_errors(
 
 
 def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> np.ndarray:
-    """(K,) sum over views and pixels of blending weight, T alpha."""
+    """Sum blending weight, T alpha, over views and pixels, (K,)."""
     sums = np.zeros((len(gaussians), 5))
     for camera in cameras:
         nothing = np.zeros((4, camera.height, camera.width), np.float32)
@@ -58,7 +58,7 @@ def solve_colors(
     rule: Rule = INRIA,
     degree: int | None = None,
 ) -> Gaussians:
-    """Least-squares colours by preconditioned conjugate gradients: images are linear in them.
+    """Solve for least-squares colours by preconditioned conjugate gradients: images are linear in them.
 
     Minimises ``sum |blend(c) - view|^2 + PRIOR |c - c0|^2`` over all views and RGB; ``views`` (n, h, w, 4) float32
     premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
@@ -90,16 +90,16 @@ class System(Protocol):
     start: np.ndarray
 
     def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
+        """Render the RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
 
     def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """The adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
+        """Apply the adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
 
     def pull(self, change: np.ndarray) -> np.ndarray:
-        """Half the gradient of what is asked of a ``change`` of the unknowns: to be small."""
+        """Return half the gradient of the penalty on a ``change`` of the unknowns."""
 
     def scaled(self, gradient: np.ndarray) -> np.ndarray:
-        """The preconditioned gradient; `back` has been called."""
+        """Return the preconditioned gradient; call `back` first."""
 
 
 class _Single:
@@ -126,7 +126,7 @@ class _Single:
 
 
 def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress | None) -> np.ndarray:
-    """The unknowns after conjugate gradients of `solve_colors`."""
+    """Return the unknowns after conjugate gradients of `solve_colors`."""
     found = system.start.copy()
     rows = tuple(range(found.ndim - 1))  # all axes but the channels
     residuals = [view[..., :3] - system.forward(i, found, view.shape) for i, view in enumerate(views)]
@@ -158,12 +158,12 @@ def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress 
 
 
 def _forward(projection: Projection, colors: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """RGB image (h, w, 3) of signed colours."""
+    """Render the RGB image (h, w, 3) of signed colours."""
     return blend(projection, np.ascontiguousarray(colors, np.float32), shape[0], shape[1])[..., :3]
 
 
 def _back(projections: Sequence[Projection], images: Sequence[np.ndarray], count: int) -> np.ndarray:
-    """(K, 5): blending weights, then the adjoint of `_forward` in columns 1 to 3."""
+    """Return (K, 5): blending weights, then the adjoint of `_forward` in columns 1 to 3."""
     sums = np.zeros((count, 5))
     for projection, image in zip(projections, images, strict=True):
         fields = np.zeros((4, *image.shape[:2]), np.float32)

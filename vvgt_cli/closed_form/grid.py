@@ -13,14 +13,14 @@ from vvgt_cli.dvr.layout import GRID, Texels
 from vvgt_cli.dvr.vectors import add, lane, mix, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
 def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray) -> bool:
-    """Voxels from ``first`` on, between rows, into ``out`` (n, 4); whether any has extinction.
+    """Write voxels from ``first`` on, between rows, into ``out`` (n, 4); return whether any has extinction.
 
     ``y``, ``z`` of `between`; the row holds the edge voxels where it leaves ``values`` (nz, ny, nx, 4).
     """
@@ -43,7 +43,7 @@ def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray
 def _gather(
     row: np.ndarray, at: np.ndarray, share: np.ndarray, points: int, d: float, y: float, z: float, out: np.ndarray
 ) -> None:
-    """`quadrature._gather` of points at ``at + share`` (n,) of a ``row`` of `_row`."""
+    """Apply `quadrature._gather` to points at ``at + share`` (n,) of a ``row`` of `_row`."""
     for m0 in range(0, at.shape[0], points):
         first = second = 0.0
         total = zeros4()
@@ -63,16 +63,16 @@ def _gather(
 
 @parallel_kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", GRID, fastmath=FLAGS, error_model="numpy")
 def grid_moments(
-    part: Part,
+    thread: ThreadSlice,
     texels: Texels, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, half: np.ndarray, step: np.ndarray,
     begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """`quadrature.block_moments` of a grid, arguments as there."""
+    """Compute `quadrature.block_moments` of a grid, arguments as there."""
     values = texels.values
     nz, ny, nx, _ = values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)

@@ -1,4 +1,4 @@
-"""Whose a Gaussian of a label map is, and which way it is bounded: samples at its points."""
+"""Assign each Gaussian to a label, and find which way the label ends, by samples at its points."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vvgt_cli.closed_form.under import NARROW, in_voxels, offsets
+from vvgt_cli.closed_form.gaussian_samples import NARROW, in_voxels, offsets
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.volume import Volume
@@ -16,33 +16,34 @@ WIDE = 1.5  # standard deviations of the points that say where a label ends
 CHUNK = 1 << 14  # Gaussians whose points are looked up at once
 
 
-def labelled(
+def assign_labels(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
+    """Return rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
 
     Args:
         gaussians: box frame.
         maps: label maps on one grid, each with the numbers of its labels, ascending; rows count through all of them.
-        half, step: (3,) of the grid, unit frame.
+        half: (3,) half extents of the grid, unit frame.
+        step: (3,) voxel edges of the grid, unit frame.
 
     Returns:
         Rows; and unit vectors of the box frame along which the share of the label rises, by least squares; zeros
         within a label.
     """
-    owner, gradient = np.empty(len(gaussians), np.int64), np.zeros((len(gaussians), 3))
+    assigned, gradient = np.empty(len(gaussians), np.int64), np.zeros((len(gaussians), 3))
     for k in range(0, len(gaussians), CHUNK):
         part = gaussians.take(np.arange(k, min(k + CHUNK, len(gaussians))))
-        owner[k : k + CHUNK] = _owners(_rows(part, maps, half, step, NARROW))
-        own = _rows(part, maps, half, step, WIDE) == owner[None, k : k + CHUNK, None]
+        assigned[k : k + CHUNK] = _label_assignment(_rows(part, maps, half, step, NARROW))
+        own = _rows(part, maps, half, step, WIDE) == assigned[None, k : k + CHUNK, None]
         gradient[k : k + CHUNK] = _gradients(part, own.any(axis=0).astype(np.float64))
-    return owner, gradient
+    return assigned, gradient
 
 
 def _rows(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray, wide: float
 ) -> np.ndarray:
-    """(maps, K, points) int64 rows of the labels at points of ``wide`` standard deviations, -1 for none."""
+    """Return (maps, K, points) int64 rows of the labels at points of ``wide`` standard deviations, -1 for none."""
     centres, arms = in_voxels(gaussians, half, step)
     points = centres[:, None, :] + np.einsum("kij,mj->kmi", arms, offsets() * (wide / NARROW))
     index = np.rint(points).astype(np.int64)
@@ -56,8 +57,8 @@ def _rows(
     return found
 
 
-def _owners(rows: np.ndarray) -> np.ndarray:
-    """(K,) the row that comes most often among (maps, K, points), -1 where there is none."""
+def _label_assignment(rows: np.ndarray) -> np.ndarray:
+    """Return (K,) the row that comes most often among (maps, K, points), -1 where there is none."""
     every = np.sort(rows.transpose(1, 0, 2).reshape(rows.shape[1], -1), axis=1)
     best, most = np.full(len(every), -1, np.int64), np.zeros(len(every), np.int64)
     run = np.zeros(len(every), np.int64)
@@ -70,7 +71,7 @@ def _owners(rows: np.ndarray) -> np.ndarray:
 
 
 def _gradients(gaussians: Gaussians, own: np.ndarray) -> np.ndarray:
-    """(K, 3) unit vectors along which the values ``own`` (K, points) of `offsets` rise; zeros where they do not."""
+    """Return (K, 3) unit vectors along which values ``own`` (K, points) of `offsets` rise; zeros where they do not."""
     points = offsets()
     rise = (own - own.mean(axis=1, keepdims=True)) @ points @ np.linalg.inv(points.T @ points)
     axes = rotations(gaussians.quaternions.astype(np.float64))

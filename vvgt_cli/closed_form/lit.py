@@ -26,7 +26,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.harmonics import C2, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 NORMALS, TINT, FIXED, MEAN, ARRIVING = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
 SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
@@ -37,13 +37,13 @@ BRIGHTEST = 2.0  # as `vvgt_cli.closed_form.fit` has it
 
 @parallel_kernel("Voxels Optics f8:1 f8:2 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
 def point_normals(
-    part: Part, voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray
 ) -> None:
-    """Normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3), into ``out`` (n, 4).
+    """Write normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3) into ``out`` (n, 4).
 
     ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond the box.
     """
-    for k in turns_of(part, len(points)):
+    for k in iterations(thread, len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         out[k, 0], out[k, 1], out[k, 2] = normal(voxels.values, edge, x, y, z)
         u = table_coordinate(sample(voxels.values, x, y, z), optics)
@@ -52,7 +52,7 @@ def point_normals(
 
 @parallel_kernel("Light f8:2 f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
 def _shade(
-    part: Part,
+    thread: ThreadSlice,
     light: Light,
     normals: np.ndarray,
     moments: np.ndarray,
@@ -62,13 +62,13 @@ def _shade(
     step: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 18) into ``out`` (k, 16 + lights).
+    """Write sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 18) into ``out`` (k, 16 + lights).
 
     Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
     the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
     (3,) of `Scene`.
     """
-    for k in turns_of(part, len(first)):
+    for k in iterations(thread, len(first)):
         row = out[k]
         row[:] = 0.0
         mass = seen = 0.0
@@ -107,7 +107,7 @@ def _shade(
 
 @dataclass(frozen=True)
 class Shading:
-    """What the colours of cells under light follow from, wherever the volume's values are.
+    """Inputs of the colours of cells under light, wherever the volume's values are.
 
     Attributes:
         light: as kernels take it.
@@ -122,13 +122,13 @@ class Shading:
 
     @classmethod
     def of(cls, scene: Scene) -> Shading | None:
-        """Of a scene in memory; None where nothing is lit."""
+        """Build from a scene in memory; None where nothing is lit."""
         if scene.light is None:
             return None
         return cls(scene.light, scene.half, scene.step, lambda points: at_points(scene, points)[:, :3])
 
     def lit(self, gaussians: Gaussians, tree: Tree, leaves: Leaves, degree: int, base: np.ndarray) -> Gaussians:
-        """Gaussians of ``leaves`` with the colours of their cells, harmonics up to ``degree``.
+        """Return Gaussians of ``leaves`` with the colours of their cells, harmonics up to ``degree``.
 
         ``base`` (n, 3): normals at the centroids of the tree's base cells.
         """
@@ -141,7 +141,7 @@ class Shading:
         return colored(gaussians, self.light, sums, degree)
 
     def alone(self, gaussians: Gaussians, degree: int) -> Gaussians:
-        """Gaussians with their own colours under the light, as it is at their centres."""
+        """Return Gaussians with their own colours under the light, as it is at their centres."""
         rows = _rows(gaussians.means)
         rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
         return colored(gaussians, self.light, self.sums(rows, self.normals(rows[:, FIRST])), degree)
@@ -149,7 +149,7 @@ class Shading:
     def sums(
         self, rows: np.ndarray, normals: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
     ) -> np.ndarray:
-        """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
+        """Return `_shade` of each row, or of rows ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
         if first is None or last is None:
             first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
         return shaded(self.light, self.half, self.step, rows, normals, first, last)
@@ -159,7 +159,7 @@ def shaded(
     light: Light, half: np.ndarray, step: np.ndarray, rows: np.ndarray, normals: np.ndarray, first: np.ndarray,
     last: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """`_shade` from rows ``first`` (k,) to ``last``, over the weight: means (k, 16 + lights)."""
+    """Return `_shade` from rows ``first`` (k,) to ``last``, over the weight: means (k, 16 + lights)."""
     out = np.empty((len(first), ARRIVING + len(light.directions)))
     _shade(light, np.ascontiguousarray(normals), np.ascontiguousarray(rows), first, last, half, step, out)
     out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
@@ -167,13 +167,13 @@ def shaded(
 
 
 def centroids(moments: np.ndarray) -> np.ndarray:
-    """(n, 3) of rows of moments, box frame."""
+    """Return centroids (n, 3) of rows of moments, box frame."""
     result: np.ndarray = moments[:, FIRST] / moments[:, [MASS]]
     return result
 
 
 def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Normals and extinction (n, 4) of `point_normals` at points (n, 3) of the box frame."""
+    """Return normals and extinction (n, 4) of `point_normals` at points (n, 3) of the box frame."""
     out = np.empty((len(points), 4))
     point_normals(
         scene.voxels, scene.optics, scene.step, np.ascontiguousarray((points + scene.half) / scene.step - 0.5), out
@@ -182,7 +182,7 @@ def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def normal_points(gaussians: Gaussians) -> np.ndarray:
-    """(7 K, 3) points for `mean_normals`, box frame: each centre, and those a standard deviation along the axes."""
+    """Return points (7 K, 3) for `mean_normals`, box frame: centres, and a standard deviation along each axis."""
     axes = rotations(gaussians.quaternions.astype(np.float64))  # columns
     arms = (axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]).transpose(0, 2, 1)  # (K, 3, 3)
     arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
@@ -191,7 +191,7 @@ def normal_points(gaussians: Gaussians) -> np.ndarray:
 
 
 def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """(K, 3) unit directions of the mean gradient of the optical mass around Gaussians, box frame; zeros for none.
+    """Return (K, 3) unit directions of the mean gradient of optical mass around Gaussians, box frame; zeros for none.
 
     Args:
         points: (7 K, 3) of `normal_points`; the mean over each seven is weighted by the extinction there.
@@ -206,14 +206,14 @@ def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.
 
 
 def directions(mean: np.ndarray) -> np.ndarray:
-    """(n, 3) unit vectors along means of normals; zeros where they cancel out."""
+    """Return (n, 3) unit vectors along means of normals; zeros where they cancel out."""
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     result: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
     return result
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
-    """Rows of moments (n, 18) of mass 1 at points (n, 3), black."""
+    """Return rows of moments (n, 18) of mass 1 at points (n, 3), black."""
     rows = np.zeros((len(points), COLUMNS))
     rows[:, [MASS, SEEN]] = 1
     rows[:, FIRST] = points
@@ -221,7 +221,7 @@ def _rows(points: np.ndarray) -> np.ndarray:
 
 
 def base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and last + 1 of the base cells, in Morton order, within ``nodes`` (k,) of a tree."""
+    """Return first and last + 1 of the base cells, in Morton order, within ``nodes`` (k,) of a tree."""
     first, last = nodes, nodes
     while (inner := tree.children[first] > 0).any():
         down = tree.first[last] + tree.children[last] - 1
@@ -230,7 +230,7 @@ def base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
-    """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `Shading.sums` stand for."""
+    """Colour Gaussians by the means ``out`` (K, 16 + lights) of `Shading.sums`."""
     colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
     normals = symmetric(out[:, NORMALS])
     white = np.ones((1, 3))
@@ -248,12 +248,12 @@ def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) ->
 
 
 def symmetric(columns: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of xx, xy, xz, yy, yz, zz (n, 6)."""
+    """Return symmetric matrices (n, 3, 3) of xx, xy, xz, yy, yz, zz (n, 6)."""
     return columns[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over directions (n,) and coefficients of degree 2 (n, 5) of the mean of abs(n . d)^power.
+    """Return mean over directions (n,) and coefficients of degree 2 (n, 5) of the mean of abs(n . d)^power.
 
     ``normals`` (n, 3, 3) are means of n n^T, of a trace below 1 where some have no normal.
     """
@@ -272,11 +272,12 @@ def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np
 def highlights(
     normals: np.ndarray, directions: np.ndarray, arriving: np.ndarray, power: float, degree: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over directions (n,) and coefficients (n, M) of the highlights of lights at infinity.
+    """Return mean over directions (n,) and coefficients (n, M) of the highlights of lights at infinity.
 
     Args:
         normals: (n, 3, 3) means of n n^T.
-        directions: (lights, 3) towards them; ``arriving`` (n, lights) what arrives.
+        directions: (lights, 3) unit vectors towards the lights.
+        arriving: (n, lights) share of each light that arrives.
         power: of abs(n . h).
         degree: of the harmonics.
     """

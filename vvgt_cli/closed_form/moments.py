@@ -46,7 +46,7 @@ class Cells:
 
 
 def exponents(step: np.ndarray, level: int) -> np.ndarray:
-    """Per-axis exponents of cells of about ``2^level`` x the finest voxel edge, as cubic as powers of two allow.
+    """Return per-axis exponents of cells of about ``2^level`` x the finest voxel edge, as cubic as powers of two allow.
 
     No voxel is cut into more than ``2^-FINEST_CUT`` along an axis: trilinear matter has nothing to show below that.
     """
@@ -55,7 +55,7 @@ def exponents(step: np.ndarray, level: int) -> np.ndarray:
 
 
 def morton(index: np.ndarray) -> np.ndarray:
-    """(n, 3) cell indices below 2^21 -> (n,) uint64 Morton codes, x lowest."""
+    """Return (n,) uint64 Morton codes of (n, 3) cell indices below 2^21, x lowest."""
     out = np.empty(len(index), np.uint64)
     morton_codes(np.ascontiguousarray(index, np.int32), out)
     return out
@@ -67,9 +67,9 @@ def base_cells(
     points_per_voxel: int = POINTS,
     progress: Callable[[float], None] | None = None,
 ) -> Cells:
-    """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch.
+    """Integrate the moments of every base cell with extinction (see `Cells`) in a fixed scratch beside the result.
 
-    ``progress`` is told the share that is done.
+    ``progress`` is called with the completed share.
     """
     block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
@@ -97,7 +97,7 @@ class Region:
 
     @classmethod
     def whole(cls, scene: Scene) -> Region:
-        """All of a scene."""
+        """Return the region of a whole scene."""
         texels = None if scene.grid is None else scene.texels
         return cls(scene.voxels, scene.optics, np.asarray(scene.half), np.asarray(scene.step), np.zeros(3), texels)
 
@@ -109,7 +109,7 @@ def region_cells(
     points_per_voxel: int = POINTS,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cells with extinction in the blocks of `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
+    """Return cells with extinction in `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
 
     Returns:
         Indices (m, 3) int32 and moments (m, 13), as in `Cells`: the same bytes whatever part of the volume is there.
@@ -143,7 +143,7 @@ def region_cells(
 
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
-    """`block_moments` by the kernel of the region's kind."""
+    """Compute `block_moments` by the kernel of the region's kind."""
     where = region.half, region.step, region.begin
     if region.texels is None:
         block_moments(region.voxels, region.optics, at, points, cell, *where, out)
@@ -154,18 +154,18 @@ def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndar
 
 
 def _integrate_voxels(region: Region, at: np.ndarray, exponent: np.ndarray, out: np.ndarray) -> None:
-    """The same of cells of whole voxels, two points a voxel and axis or what comes to the same."""
-    from vvgt_cli.closed_form.straight import straight_until
+    """Compute `block_moments` of cells of whole voxels, two points a voxel and axis or the equivalent."""
+    from vvgt_cli.closed_form.linear_ranges import linear_ranges
     from vvgt_cli.closed_form.voxelwise import voxel_moments
 
-    straight = straight_until(region.optics)
+    linear_until = linear_ranges(region.optics)
     voxel_moments(
-        region.voxels, region.optics, straight, at, exponent, region.half, region.step, region.begin, out
+        region.voxels, region.optics, linear_until, at, exponent, region.half, region.step, region.begin, out
     )  # fmt: skip
 
 
 def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
+    """Return edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
 
     Such blocks, taken in Morton order, leave cells in Morton order.
     """
@@ -177,7 +177,7 @@ def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, 3) and the rows of ``parts`` in Morton order; parts are let go of as they are laid in their place."""
+    """Return indices (n, 3) and the rows of ``parts`` in Morton order; parts are freed as they are copied."""
     codes = morton(index)
     moments, done = np.empty((len(index), MOMENTS)), 0
     order = None if (codes[1:] > codes[:-1]).all() else np.argsort(codes, kind="stable")
@@ -198,7 +198,7 @@ CHILDREN = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)],
 
 
 def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """Moments (n, 8, 13) of the children of cells of ``edge`` (3,) voxels, ``corners`` (n, 3) voxels from the box's."""
+    """Return moments (n, 8, 13) of children of cells of ``edge`` (3,) voxels at ``corners`` (n, 3), voxels."""
     child = edge / 2
     points = np.maximum(np.round(child * 2), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
@@ -208,7 +208,7 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray) -> np.ndar
 
 
 def _active_blocks(scene: Scene, block: np.ndarray) -> np.ndarray:
-    """Origins (n, 3) in voxels (x, y, z) of the blocks that hold a brick with extinction, in (z, y, x) order."""
+    """Return origins (n, 3) in voxels (x, y, z) of the blocks that hold a brick with extinction, in (z, y, x) order."""
     mask = scene.empty == 0
     for axis in range(3):  # a block's first half voxel interpolates with the brick before it
         ahead = [slice(None)] * 3

@@ -8,7 +8,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, SQUARE, XX, YY, ZZ, X, Y, Z
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 SWEEPS = 8  # of Jacobi rotations: each squares the error, three are enough for most
 TINY = 1e-300  # of what is divided by
@@ -17,7 +17,7 @@ CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
 
 @inlined()
 def _spread_bits(number: int) -> np.uint64:
-    """The 21 lowest bits of ``number``, two zeros between them."""
+    """Return the 21 lowest bits of ``number`` with two zeros between them."""
     v = np.uint64(number)
     v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
     v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
@@ -28,23 +28,23 @@ def _spread_bits(number: int) -> np.uint64:
 
 
 @parallel_kernel("i4:2 u8:1")
-def morton_codes(part: Part, index: np.ndarray, out: np.ndarray) -> None:
-    """Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
-    for n in turns_of(part, len(index)):
+def morton_codes(thread: ThreadSlice, index: np.ndarray, out: np.ndarray) -> None:
+    """Write Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
+    for n in iterations(thread, len(index)):
         x, y, z = _spread_bits(index[n, 0]), _spread_bits(index[n, 1]), _spread_bits(index[n, 2])
         out[n] = x | (y << np.uint64(1)) | (z << np.uint64(2))
 
 
 @parallel_kernel("i4:2 f8:1 f4:3 f4:3 f4:2")
 def look_up(
-    part: Part, index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray
+    thread: ThreadSlice, index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray
 ) -> None:
-    """``out`` (n, 2) of ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid.
+    """Write ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid, into ``out`` (n, 2).
 
     ``index`` (n, 3) int32 cell indices; ``ratio`` (3,) a cell's edges in those of the grid's cells.
     """
     nz, ny, nx = mean.shape
-    for n in turns_of(part, len(index)):
+    for n in iterations(thread, len(index)):
         i = min(max(math.floor((index[n, 0] + 0.5) * ratio[0]), 0), nx - 1)
         j = min(max(math.floor((index[n, 1] + 0.5) * ratio[1]), 0), ny - 1)
         k = min(max(math.floor((index[n, 2] + 0.5) * ratio[2]), 0), nz - 1)
@@ -53,13 +53,13 @@ def look_up(
 
 @parallel_kernel("f8:2 i8:1 f4:2 f8:2 f8:1")
 def take_base(
-    part: Part, moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray
+    thread: ThreadSlice, moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray
 ) -> None:
-    """Rows ``keep`` (n,) of ``moments`` (m, 13) as a pyramid's base ``out`` (n, 18), ``top`` (n,).
+    """Copy rows ``keep`` (n,) of ``moments`` (m, 13) into a pyramid's base ``out`` (n, 18), ``top`` (n,).
 
     ``seen`` (m, 2): mean and largest transmittance.
     """
-    for n in turns_of(part, len(keep)):
+    for n in iterations(thread, len(keep)):
         row, mean = moments[keep[n]], np.float64(seen[keep[n], 0])
         top[n] = seen[keep[n], 1]
         for column in range(MOMENTS):
@@ -74,10 +74,10 @@ def take_base(
 
 @parallel_kernel("f8:2 f8:1 i8:1 f8:2 f8:1")
 def sum_children(
-    part: Part, rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray
+    thread: ThreadSlice, rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray
 ) -> None:
-    """Sums ``out`` (m, 18) of the rows (n, 18) from one of ``start`` (m,) to the next; the largest of ``top`` (n,)."""
-    for m in turns_of(part, len(start)):
+    """Sum rows (n, 18) from one ``start`` (m,) to the next into ``out`` (m, 18), with the largest of ``top`` (n,)."""
+    for m in iterations(thread, len(start)):
         stop = start[m + 1] if m + 1 < len(start) else len(rows)
         for column in range(COLUMNS):
             out[m, column] = rows[start[m], column]
@@ -90,14 +90,14 @@ def sum_children(
 
 @parallel_kernel("f8:2 f8:1 f8:1 f8 f8:1", error_model="numpy")
 def score_splits(
-    part: Part, moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray
+    thread: ThreadSlice, moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray
 ) -> None:
-    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 18), ``top`` (n,), of edges ``edge`` (3,).
+    """Write `tree.split_score` of rows of ``moments`` (n, 18), ``top`` (n,), edges ``edge`` (3,), into ``out`` (n,).
 
     ``plain``: variance added to that of the colours; infinite: colours do not count.
     """
     area = (edge[0] * edge[1] * edge[2]) ** (2.0 / 3.0)
-    for n in turns_of(part, len(out)):
+    for n in iterations(thread, len(out)):
         row, mass = moments[n], moments[n, MASS]
         x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
         variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
@@ -112,7 +112,7 @@ def score_splits(
 
 @inlined(error_model="numpy")
 def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
-    """One Jacobi rotation of the symmetric ``a`` (3, 3) that makes a[p, q] zero; ``v`` (3, 3) gathers them."""
+    """Apply one Jacobi rotation to symmetric ``a`` (3, 3) that makes a[p, q] zero; ``v`` (3, 3) gathers them."""
     if a[p, q] == 0.0:
         return
     theta = (a[q, q] - a[p, p]) / (2 * a[p, q])
@@ -128,9 +128,9 @@ def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
 
 
 @parallel_kernel("f8:3 f8:2 f8:3", error_model="numpy")
-def principal_axes(part: Part, cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
-    """Eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` (n, 3, 3), by Jacobi."""
-    for n in turns_of(part, len(cov)):
+def principal_axes(thread: ThreadSlice, cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
+    """Compute eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` by Jacobi."""
+    for n in iterations(thread, len(cov)):
         a, v = np.empty((3, 3)), np.zeros((3, 3))
         for row in range(3):
             v[row, row] = 1.0

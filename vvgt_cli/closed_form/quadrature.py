@@ -14,7 +14,7 @@ from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 Between = tuple[int, int, float, float]  # of `between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
@@ -24,7 +24,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 @_jit
 def between(p: float, d: float, n: int) -> Between:
-    """Voxels on both sides of ``p`` along an axis of ``n``, the share of the second, and the length of spread there.
+    """Return voxels on both sides of ``p`` along an axis of ``n``, the second's share, and the length of spread there.
 
     That is ``d``, and 0 in the rim before the first centre (beyond the last one both neighbours are the same voxel).
     """
@@ -44,7 +44,7 @@ def _rows(
     along_y: np.ndarray,
     along_z: np.ndarray,
 ) -> tuple[float, float, float]:
-    """Voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
+    """Write voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
     ``y``, ``z`` of `between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
     the smallest and largest value, and the largest square of both differences.
@@ -72,7 +72,7 @@ def _rows(
 
 @_jit
 def _all_dark(low: float, high: float, spread: float, optics: Optics) -> bool:
-    """Whether nothing within ``spread`` of the values from ``low`` to ``high`` has extinction."""
+    """Return whether nothing within ``spread`` of the values from ``low`` to ``high`` has extinction."""
     if not low <= high:
         return True  # no voxel is finite
     u0, u1 = table_coordinate(low - spread, optics), table_coordinate(high + spread, optics)
@@ -83,7 +83,7 @@ def _all_dark(low: float, high: float, spread: float, optics: Optics) -> bool:
 def _ranges(
     rows: Rows, at: np.ndarray, share: np.ndarray, dx: float, optics: Optics, u0: np.ndarray, u1: np.ndarray
 ) -> None:
-    """Table coordinates at both ends of the spread of each point of a row; ``u1`` -1 where a voxel is not finite.
+    """Write table coordinates of both ends of the spread of a row's points; ``u1`` -1 where a voxel is not finite.
 
     Points lie at ``at + share`` (n,) of the ``rows`` of `_rows`. The spread is the root of the summed squared
     differences over a point's box.
@@ -147,7 +147,7 @@ def _gather(
 
 @_jit
 def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, float]) -> None:
-    """Moments about a cell's corner (x, y, z) -> about the origin; a point's own box ``d`` has variance d^2 / 12."""
+    """Move moments about a cell's corner (x, y, z) to the origin; a point's own box ``d`` has variance d^2 / 12."""
     mass, first_x, first_y, first_z = row[MASS], row[X], row[Y], row[Z]
     row[XX] += mass * (x * x + d[0] * d[0] / 12) + 2 * x * first_x
     row[YY] += mass * (y * y + d[1] * d[1] / 12) + 2 * y * first_y
@@ -164,7 +164,7 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
 
 @parallel_kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def block_moments(
-    part: Part,
+    thread: ThreadSlice,
     voxels: Voxels,
     optics: Optics,
     blocks: np.ndarray,
@@ -175,7 +175,7 @@ def block_moments(
     begin: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Moments of the cells of each block by ``points`` (3,) points a cell.
+    """Integrate the moments of the cells of each block by ``points`` (3,) points a cell.
 
     ``blocks`` (n, 3) origins in voxels from the corner of ``voxels``; ``cell`` (3,) a cell's edges, voxels; ``half``,
     ``step`` (3,) of `Scene`; ``begin`` (3,) voxel of the whole volume that ``voxels`` begin with; all (x, y, z).
@@ -184,7 +184,7 @@ def block_moments(
     nz, ny, nx = voxels.values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)
@@ -220,15 +220,15 @@ def block_moments(
 
 @parallel_kernel("f8:5 i8:1 i8:1 f8:2 i4:2")
 def compact(
-    part: Part, dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray
+    thread: ThreadSlice, dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray
 ) -> None:
-    """Rows with mass of ``dense`` (n, cells z, cells y, cells x, 13), block by block, by ``order`` within a block.
+    """Copy rows with mass of ``dense`` (n, cells z, cells y, cells x, 13), block by block, by ``order`` within a block.
 
     ``order`` (cells,) numbers of a block's cells, x fastest; ``start`` (n,) where a block's rows begin in ``moments``
     (rows, 13) and ``cells`` (rows, 3), which get the cells' (x, y, z) in their block.
     """
     cy, cx = dense.shape[2], dense.shape[3]
-    for b in turns_of(part, dense.shape[0]):
+    for b in iterations(thread, dense.shape[0]):
         to = start[b]
         for cell in order:
             x, y, z = cell % cx, cell // cx % cy, cell // (cx * cy)

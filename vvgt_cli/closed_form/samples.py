@@ -16,7 +16,7 @@ Triple = tuple[int, int, int]
 
 
 def sample_spacing(dims: Triple) -> int:
-    """Voxels between two bricks."""
+    """Return the voxels between two bricks."""
     spacing = 16
     while math.prod(-(-n // spacing) for n in dims) > SAMPLES:
         spacing *= 2
@@ -24,7 +24,7 @@ def sample_spacing(dims: Triple) -> int:
 
 
 def samples_in(dims: Triple, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First voxels (n, 3) of the bricks in a box from ``lo`` to ``hi`` (3,), and how many voxels each stands for, (n,).
+    """Return first voxels (n, 3) of the bricks from ``lo`` to ``hi`` (3,), and the voxels each represents (n,).
 
     One lies in the middle of every cube of `sample_spacing` voxels, of which the box holds whole ones; at the volume's
     end it is moved into what is left of the cube, or there is none.
@@ -43,7 +43,7 @@ def samples_in(dims: Triple, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray
 
 
 def visible_share(tables: Optics, values: np.ndarray) -> np.ndarray:
-    """Share (n,) of the cubes of eight voxels of bricks ``values`` (n, z, y, x) that hold extinction."""
+    """Return the share (n,) of the cubes of eight voxels of bricks ``values`` (n, z, y, x) that hold extinction."""
     positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
     u = tables.coordinate(values)
     u = np.where(np.isfinite(u), u, 0)
@@ -59,12 +59,12 @@ def visible_share(tables: Optics, values: np.ndarray) -> np.ndarray:
 
 
 def estimate(shares: np.ndarray, weights: np.ndarray, voxels: int) -> float:
-    """Visible voxels of ``voxels``, from bricks' shares (n,) and the voxels (n,) that each stands for."""
+    """Estimate the visible ones of ``voxels``, from bricks' shares (n,) and the voxels (n,) that each represents."""
     return float((shares * weights).sum() / weights.sum() * voxels)
 
 
 def visible_voxels(scene: Scene) -> float:
-    """About how many voxels of a scene in memory have extinction."""
+    """Estimate how many voxels of a scene in memory have extinction."""
     nx, ny, nz = dims = scene.volume.dims
     places, weights = samples_in(dims, np.zeros(3, np.int64), np.array(dims))
     x, y, z = np.minimum(SAMPLE, dims)

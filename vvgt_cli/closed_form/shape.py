@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
-from vvgt_cli.closed_form.inset import Opaque, inset, pressed
 from vvgt_cli.closed_form.pyramid import principal_axes
+from vvgt_cli.closed_form.surface_offset import Opaque, flattened, surface_offset
 from vvgt_cli.closed_form.tree import Leaves, central
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MAX_ALPHA
@@ -24,13 +24,13 @@ DEBLUR = 0.3  # px^2 that an opaque cell gives back: the renderer's dilation add
 
 @dataclass(frozen=True)
 class SurfaceStyle:
-    """How Gaussians of opaque bodies are laid, in cell edges or pixels.
+    """Style in which Gaussians are laid on opaque bodies, in cell edges or pixels.
 
     Attributes:
         tangent: smallest standard deviation along the surface, in cell edges.
         normal: smallest standard deviation across it, in pixels.
         chord: length in pixels of a grazing ray inside the body: how many splats it meets.
-        dilation: px^2 that the inset allows for: 0.3 is right at the size aimed for, 0.075 at twice that.
+        dilation: px^2 that the offset allows for: 0.3 is right at the size aimed for, 0.075 at twice that.
     """
 
     tangent: float
@@ -46,7 +46,7 @@ STYLES = {"round": ROUND, "middle": MIDDLE, "sharp": SHARP}
 
 
 def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, style: SurfaceStyle) -> Gaussians:
-    """One Gaussian a cell.
+    """Return one Gaussian a cell.
 
     Args:
         leaves: the cells.
@@ -66,7 +66,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
     solid = -np.expm1(-2 * mass / edge**2)[:, None]
     variances, axes = np.empty_like(mean), np.empty_like(cov)
     if opaque.any:
-        principal_axes(pressed(opaque, mean, cov, FACING / 12 * solid[:, 0] * edge**2), variances, axes)
+        principal_axes(flattened(opaque, mean, cov, FACING / 12 * solid[:, 0] * edge**2), variances, axes)
         variances = ((cov @ axes) * axes).sum(axis=1)
     else:
         principal_axes(cov, variances, axes)  # ascending
@@ -78,14 +78,16 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
         floor = np.stack([np.full_like(edge, style.normal * pixel), style.tangent * edge, style.tangent * edge], 1)
         spread = np.maximum(spread, solid * floor**2)
         reach = np.sqrt(2 * np.log(np.clip(1.43 * style.chord * pixel / edge, 1.5, 90)))  # at most 3
-        mean = mean + inset(opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel)
+        mean = mean + surface_offset(
+            opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel
+        )
         mean = np.clip(mean, -opaque.half, opaque.half)  # where the box cuts a body
     opacity = peak_opacity(mass, spread, pixel)
     return make_gaussians(mean, spread, axes, opacity, visible_color(moments))
 
 
 def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
-    """Of the same mass, wider by ``factor`` along all axes but the shortest: neighbours on a surface overlap more.
+    """Widen by ``factor`` along all axes but the shortest, of the same mass: neighbours on a surface overlap more.
 
     Cells stand on a lattice: Gaussians of standard deviation s at distances a ripple by ``2 exp(-2 pi^2 s^2 / a^2)`` of
     their mean. ``pixel``: as for `peak_opacity`.
@@ -98,7 +100,7 @@ def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
 
 
 def visible_color(moments: np.ndarray) -> np.ndarray:
-    """(n, 3) mean colour as the views see it; of all the extinction where they see none."""
+    """Return (n, 3) mean colour as the views see it; of all the extinction where they see none."""
     mass, seen = moments[:, [MASS]], moments[:, [SEEN]]  # (n, 1)
     hidden = seen <= 1e-12 * mass
     return np.where(hidden, moments[:, COLOR] / mass, moments[:, SEEN_COLOR] / np.where(hidden, 1, seen))
@@ -113,7 +115,7 @@ def make_gaussians(
 
 
 def quaternions(axes: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) (a reflection is undone on the first column) -> unit quaternions (w, x, y, z) (n, 4)."""
+    """Return unit quaternions (w, x, y, z) (n, 4) of rotations (n, 3, 3); a reflection flips the first column."""
     m = axes.copy()
     m[np.linalg.det(axes) < 0, :, 0] *= -1
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]

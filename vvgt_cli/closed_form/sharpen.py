@@ -16,7 +16,7 @@ import numpy as np
 from vvgt_cli.closed_form.moments import morton
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 AMOUNT = np.float32(0.45)  # more makes the lattice of cells visible (docs/log/closed-form.md)
 CURVES = 4  # Z-orders, each shifted against the one before by a fifth of the box: who is near is near along one of them
@@ -28,11 +28,11 @@ DARKEST, BRIGHTEST = 0.0, 1.0  # as those of the function: what is stored in 8 b
 
 @parallel_kernel("i4:2 i4:2 f4:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f8:1")
 def mix_neighbours(
-    part: Part,
+    thread: ThreadSlice,
     orders: np.ndarray, places: np.ndarray, means: np.ndarray, widths: np.ndarray, areas: np.ndarray, seen: np.ndarray,
     values: np.ndarray, mixed: np.ndarray, front: np.ndarray, around: np.ndarray,
 ) -> None:  # fmt: skip
-    """Means of the ``values`` (n, m) of each Gaussian and of those `WINDOW` near along any curve.
+    """Average the ``values`` (n, m) of each Gaussian and of those `WINDOW` near along any curve.
 
     They count by ``areas`` (n,) times ``exp(-d^2 / (2 (w_i^2 + w_k^2)))`` with ``widths`` w (n,) and distances d of
     ``means`` (n, 3): ``mixed`` (n, m), and ``around`` (n,) of what is ``seen`` (n,); times what is seen of them:
@@ -40,7 +40,7 @@ def mix_neighbours(
     """
     several, n = orders.shape
     count = values.shape[1]
-    for i in turns_of(part, n):
+    for i in iterations(thread, n):
         total = max(areas[i], TINY)
         open_ = total * seen[i]
         sums, ahead = np.empty(count), np.empty(count)
@@ -72,7 +72,7 @@ def mix_neighbours(
 
 
 def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gaussians:
-    """With colours, harmonics too, that show what they were once neighbours are mixed in.
+    """Return Gaussians whose colours, once neighbours are mixed in, show what theirs showed; harmonics too.
 
     Args:
         gaussians: of the closed form, box frame, their colours those of their cells.
@@ -101,7 +101,7 @@ def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gauss
 
 
 def curves(means: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians at ``means`` (n, 3) along `CURVES` Z-orders (c, n) int32, and their places there (c, n) int32.
+    """Return Gaussians at ``means`` (n, 3) along `CURVES` Z-orders (c, n) int32, and their places there (c, n) int32.
 
     The orders are of the box of half extents ``half`` (3,): some of the Gaussians lie in them as they do among all.
     """

@@ -44,6 +44,7 @@ class Tree:
     parent: np.ndarray
 
     def __len__(self) -> int:
+        """Return the number of cells."""
         return len(self.largest)
 
     @property
@@ -69,14 +70,14 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | N
 
 
 def shown(cells: Cells, seen: Visibility, step: np.ndarray) -> np.ndarray:
-    """Rows (n,) int64 of the cells that some view sees: the base of their tree."""
+    """Return rows (n,) int64 of the cells that some view sees: the base of their tree."""
     return np.flatnonzero(seen.at(cells.index, cells.edge / step)[:, 1] > HIDDEN)
 
 
 def pyramid(
     base: np.ndarray, base_edge: np.ndarray, fill: Callable[[np.ndarray, np.ndarray], None], levels: int | None = None
 ) -> Tree:
-    """The tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
+    """Build the tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
 
     ``fill`` is given their moments (n, 18) and largest transmittance (n,) to write.
     """
@@ -110,7 +111,7 @@ def pyramid(
 
 
 def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (n,), centroid (n, 3) and covariance (n, 3, 3) of rows of moments."""
+    """Return mass (n,), centroid (n, 3) and covariance (n, 3, 3) of rows of moments."""
     mass = moments[:, MASS]
     mean = moments[:, FIRST] / mass[:, None]
     second = moments[:, SECOND] / mass[:, None]
@@ -121,7 +122,7 @@ def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def split_score(tree: Tree, plain: float = PLAIN) -> np.ndarray:
-    """(n,) what a cell's spread costs the image: saturated mass x visibility x variance x (that of colours + plain).
+    """Score a cell's spread (n,): saturated mass x visibility x variance x (that of colours + plain).
 
     The variance of the colours is that of its base cells, by what is seen of them; ``plain``: infinite where colours do
     not count.
@@ -133,7 +134,7 @@ def split_score(tree: Tree, plain: float = PLAIN) -> np.ndarray:
 
 
 def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
-    """`split_score` with the variance of values in place of that of colours: any function may tell apart what differs.
+    """Score as `split_score`, but by the variance of values, not of colours: any function may separate what differs.
 
     Of a scene whose red is the value, as a share of its range, and green its square. ``filled``: all that is visible
     has the same extinction, what is empty counts as another value, and blue is how much a part counts.
@@ -154,7 +155,7 @@ def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
-    """At most ``budget`` cells that cover the scene: split while the score is above a threshold found by bisection.
+    """Choose at most ``budget`` cells that cover the scene: split while the score is above a bisected threshold.
 
     Returns ids into the tree, ascending. A cell is split only where all above it are.
     """
@@ -186,13 +187,13 @@ def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarr
 
 
 def _cells_above(entries: np.ndarray, exits: np.ndarray, threshold: float) -> int:
-    """Number of cells when all with a score above ``threshold`` are split (both arrays ascending)."""
+    """Return the number of cells when all with a score above ``threshold`` are split (both arrays ascending)."""
     exist = len(entries) - np.searchsorted(entries, threshold, "right")
     return int(exist - (len(exits) - np.searchsorted(exits, threshold, "right")))
 
 
 def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
-    """Each cell's score, lowered to the smallest above it."""
+    """Lower each cell's score to the smallest above it."""
     capped = score.copy()
     end = len(tree) - 1
     level = np.array([end])
@@ -223,19 +224,21 @@ class Leaves:
     node: np.ndarray
 
     def __len__(self) -> int:
+        """Return the number of cells."""
         return len(self.node)
 
     def take(self, which: np.ndarray) -> Leaves:
+        """Return the rows ``which`` (indices or bool)."""
         return Leaves(self.moments[which], self.index[which], self.edge[which], self.node[which])
 
 
 def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
-    """The rows ``ids`` of a tree."""
+    """Return the rows ``ids`` of a tree."""
     return Leaves(tree.moments[ids], tree.index[ids], tree.edges[tree.level[ids]], ids)
 
 
 def spread_of(leaves: Leaves) -> np.ndarray:
-    """Opacity x area of cells, and that x the variance of what is in each, both summed (2,)."""
+    """Return opacity x area of cells, and that x the variance of what is in each, both summed (2,)."""
     mass, _, covariance = central(leaves.moments)
     area = leaves.edge.prod(axis=1) ** (2 / 3)
     weight = -np.expm1(-mass / area) * area
@@ -256,15 +259,15 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
     if len(below) and scene is not None:
         # integrate no more than can be used: most have at least three visible children
         below = below[: np.searchsorted(np.cumsum(np.where(inside, counts - 1, 2)), room, "right") + 1]
-        owner, grown = _children_below(leaves.take(order[below]), scene, seen)
-        counts[below] = np.bincount(owner, minlength=len(below))
+        parent, grown = _children_below(leaves.take(order[below]), scene, seen)
+        counts[below] = np.bincount(parent, minlength=len(below))
     else:
         below = below[:0]
     splits = np.flatnonzero(counts > 0)
     splits = splits[: np.searchsorted(np.cumsum(counts[splits] - 1), room, "right")]
     parts = []
     if len(below):
-        parts.append(grown.take(np.flatnonzero(np.isin(below[owner], splits))))
+        parts.append(grown.take(np.flatnonzero(np.isin(below[parent], splits))))
     nodes = leaves.node[order[splits[inside[splits]]]]
     many = tree.children[nodes]
     offsets = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
@@ -277,9 +280,9 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
 
 
 def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
-    """Visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
+    """Return visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
     step = np.asarray(scene.step)
-    owners, found = [], []
+    parents, found = [], []
     for edge in np.unique(leaves.edge, axis=0):
         chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
         moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
@@ -287,19 +290,19 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
         keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
         rows = with_visible(moments[keep], through[keep, 0])
-        owners.append(np.repeat(chosen, keep.sum(axis=1)))
+        parents.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
         )
-    owner = np.concatenate(owners)
+    parent = np.concatenate(parents)
     fields = ("moments", "index", "edge", "node")
     together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
-    order = np.argsort(owner, kind="stable")
-    return owner[order], together.take(order)
+    order = np.argsort(parent, kind="stable")
+    return parent[order], together.take(order)
 
 
 def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Moments (n, 13) and mean transmittance (n,) -> (n, 18) with the seen mass, colour and its square."""
+    """Return (n, 18): moments (n, 13) by mean transmittance (n,), with the seen mass, colour and its square."""
     square = (moments[:, COLOR] ** 2).sum(axis=1) / np.maximum(moments[:, MASS], np.finfo(np.float64).tiny)
     return np.concatenate(
         [moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None], (square * mean)[:, None]], axis=1

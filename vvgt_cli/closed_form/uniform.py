@@ -12,7 +12,7 @@ from vvgt_cli.gaussians.opacity import peak_opacity
 
 
 def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gaussians:
-    """``budget`` isotropic Gaussians at points drawn uniformly where the scene has extinction that some view sees.
+    """Draw ``budget`` isotropic Gaussians uniformly where the scene has extinction that some view sees.
 
     A base cell's extinction is shared by the samples expected in it; sigma is half the mean distance of the samples.
     """

@@ -30,7 +30,7 @@ class ViewDependentSystem:
     def __init__(
         self, gaussians: Gaussians, eyes: Sequence[np.ndarray], projections: Sequence[Projection], prior: float
     ) -> None:
-        """``eyes`` (3,) and ``projections`` of the views; ``prior`` of the colours, pixels."""
+        """Prepare for ``eyes`` (3,) and ``projections`` of the views; ``prior`` of the colours, pixels."""
         assert gaussians.harmonics is not None
         self.given, self.eyes, self.projections = gaussians, eyes, projections
         self.start = np.concatenate([gaussians.colors[:, None], gaussians.harmonics], axis=1).astype(np.float64)
@@ -39,13 +39,13 @@ class ViewDependentSystem:
         self.inverse: np.ndarray | None = None  # (K, 1 + M, 1 + M) float32
 
     def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
+        """Render the RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
         colors, harmonics = (np.ascontiguousarray(part, np.float32) for part in (unknowns[:, 0], unknowns[:, 1:]))
         seen = seen_colors(self.given.means, colors, harmonics, self.eyes[view])
         return blend(self.projections[view], seen, shape[0], shape[1])[..., :3]
 
     def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """The adjoint of `forward`, summed over the views' ``images``."""
+        """Apply the adjoint of `forward`, summed over the views' ``images``."""
         from vvgt_cli.splat import harmonics
 
         means, out = self.given.means, np.zeros_like(self.start)
@@ -65,7 +65,7 @@ class ViewDependentSystem:
         return out
 
     def _invert(self, matrices: np.ndarray) -> None:
-        """Priors from the weights, which stand in the corner of ``matrices``, and inverses of both together."""
+        """Return priors from the weights, which stand in the corner of ``matrices``, and inverses of both together."""
         self.prior = np.full((*self.start.shape[:2], 1), self.color_prior)
         self.prior[:, 1:, 0] = PIXELS + SHARE * matrices[:, :1, 0]
         for first in range(0, len(matrices), CHUNK):
@@ -75,19 +75,19 @@ class ViewDependentSystem:
         self.inverse = matrices
 
     def pull(self, change: np.ndarray) -> np.ndarray:
-        """Half the gradient of what is asked of a ``change`` of the unknowns: to be small."""
+        """Return half the gradient of the penalty on a ``change`` of the unknowns."""
         assert self.prior is not None
         result: np.ndarray = self.prior * change
         return result
 
     def scaled(self, gradient: np.ndarray) -> np.ndarray:
-        """The gradient times the inverse of each Gaussian's own matrix."""
+        """Return the gradient times the inverse of each Gaussian's own matrix."""
         assert self.inverse is not None
         result: np.ndarray = np.matmul(self.inverse, gradient.astype(np.float32)).astype(np.float64)
         return result
 
     def gaussians(self, unknowns: np.ndarray, brightest: float) -> Gaussians:
-        """With colours in [0, ``brightest``], and harmonics that nowhere change them by more."""
+        """Return Gaussians with colours in [0, ``brightest``], and harmonics that nowhere change them by more."""
         colors, harmonics = np.clip(unknowns[:, 0], 0, brightest), unknowns[:, 1:]
         size = np.linalg.norm(harmonics, axis=1, keepdims=True)  # the most of any direction is this, times a factor
         most = size * np.sqrt(harmonics.shape[1] / (4 * np.pi))

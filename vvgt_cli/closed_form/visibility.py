@@ -1,4 +1,4 @@
-"""What the cameras see of each cell: a march through the cells' extinction that adds up what is seen."""
+"""Visibility of each cell from the cameras: a march through the cells' extinction that adds up what is seen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.pyramid import look_up
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 MAX_CELLS = 1 << 21
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
@@ -42,20 +42,20 @@ class Visibility:
     edge: np.ndarray
 
     def at(self, index: np.ndarray, edge: np.ndarray) -> np.ndarray:
-        """Mean and largest transmittance (n, 2) of cells ``index`` (n, 3) int32 (x, y, z), edges (3,) in voxels."""
+        """Return mean and largest transmittance (n, 2) of cells ``index`` (n, 3) int32 (x, y, z), edges in voxels."""
         out = np.empty((len(index), 2), np.float32)
         look_up(np.ascontiguousarray(index, np.int32), edge / self.edge, self.mean, self.largest, out)
         return out
 
     def at_least(self, share: float) -> Visibility:
-        """The same where nothing is hidden altogether: transmittances from ``share`` to 1."""
+        """Return the same with nothing hidden altogether: transmittances from ``share`` to 1."""
         low, rest = np.float32(share), np.float32(1 - share)
         return Visibility(low + rest * self.mean, low + rest * self.largest, self.edge)
 
 
 @inlined(fastmath=FLAGS, error_model="numpy")
 def _axis(p: float, d: float, t: float, n: int) -> tuple[int, int, float, float]:
-    """Cell of ``p + t d`` along an axis of ``n`` cells, the way through them, when the next begins, and its length."""
+    """Return the cell of ``p + t d`` along an axis of ``n``, the direction, where the next begins, its length."""
     i = min(max(math.floor(p + t * d), 0), n - 1)
     if d > 0.0:
         return i, 1, (i + 1 - p) / d, 1 / d
@@ -66,7 +66,7 @@ def _axis(p: float, d: float, t: float, n: int) -> tuple[int, int, float, float]
 
 @inlined(fastmath=FLAGS, error_model="numpy")
 def _span(p: Vector, d: Vector, n: tuple[int, int, int]) -> tuple[float, float]:
-    """Entry and exit t >= 0 of a ray through the box [0, n]; entry >= exit: missed."""
+    """Return entry and exit t >= 0 of a ray through the box [0, n]; entry >= exit: missed."""
     t0, t1 = 0.0, np.inf
     for axis in range(3):
         a, b, m = p[axis], d[axis], n[axis]
@@ -81,7 +81,7 @@ def _span(p: Vector, d: Vector, n: tuple[int, int, int]) -> tuple[float, float]:
 
 @inlined(fastmath=FLAGS, error_model="numpy")
 def _deposit(extinction: np.ndarray, p: Vector, d: Vector, sums: np.ndarray) -> None:
-    """Go from cell to cell along p + t d and add to ``sums`` (nz, ny, nx, 3).
+    """Traverse cells along p + t d and add to ``sums`` (nz, ny, nx, 3).
 
     p, d (x, y, z) in cells from the box's corner, t in unit-frame lengths as ``extinction`` (nz, ny, nx) is per. What
     lies behind an opaque front adds to the depth only: it is there, and not seen.
@@ -118,7 +118,7 @@ def _deposit(extinction: np.ndarray, p: Vector, d: Vector, sums: np.ndarray) -> 
 
 @parallel_kernel("f4:3 f8:2 f8:3 f8:2 i8 f8:1 f4:5", fastmath=FLAGS, error_model="numpy")
 def march(
-    part: Part,
+    thread: ThreadSlice,
     extinction: np.ndarray,
     eyes: np.ndarray,
     bases: np.ndarray,
@@ -127,13 +127,13 @@ def march(
     edge: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Rays of all views, dealt over the workers; ``sums`` (workers, nz, ny, nx, 3) float32.
+    """March rays of all views, dealt over the workers; ``sums`` (workers, nz, ny, nx, 3) float32.
 
     ``eyes`` (n, 3), ``bases`` (n, 3, 3), ``lenses`` (n, 4) as `camera_arrays` has them; ``size`` px; ``edge`` (3,) of
     a cell in voxels.
     """
     workers = sums.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         for job in range(worker, eyes.shape[0] * size, workers):
             view, row = job // size, job % size
             eye, basis, lens = eyes[view], bases[view], lenses[view]
@@ -150,7 +150,7 @@ def march(
 
 
 def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
-    """How many rays of all views meet a cell near the centre, on average over directions; ``edge`` (3,) unit frame."""
+    """Return how many rays of all views meet a cell near the centre, on average; ``edge`` (3,) unit frame."""
     x, y, z = edge
     area = (x * y + y * z + z * x) / 2  # a convex body shows a quarter of its surface
     return float(
@@ -159,7 +159,7 @@ def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
 
 
 def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray:
-    """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
+    """Return (nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
     shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
     mass = summed(cells.index, cells.moments[:, MASS], wider, shape)
@@ -168,20 +168,20 @@ def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray
 
 
 def voxels_of(box: BoxGeometry) -> np.ndarray:
-    """Voxels (3,) along x, y, z of a box."""
+    """Return the voxels (3,) along x, y, z of a box."""
     result: np.ndarray = np.round(2 * np.asarray(box.half) / np.asarray(box.step))
     return result
 
 
 @kernel("i4:2 f8:1 i8 f8:3")
 def add_cells(index: np.ndarray, values: np.ndarray, wider: int, out: np.ndarray) -> None:
-    """``out`` (nz, ny, nx) += ``values`` (n,), each at ``index`` (n, 3), x first, in cells 2^``wider`` as wide."""
+    """Add ``values`` (n,), each at ``index`` (n, 3), x first, in cells 2^``wider`` as wide, to ``out`` (nz, ny, nx)."""
     for i in range(len(values)):
         out[index[i, 2] >> wider, index[i, 1] >> wider, index[i, 0] >> wider] += values[i]
 
 
 def summed(index: np.ndarray, values: np.ndarray, wider: int, shape: np.ndarray) -> np.ndarray:
-    """Sums (nz, ny, nx) of ``values`` (n,), in order, by cell 2^``wider`` times as wide as those of ``index`` (n, 3).
+    """Sum ``values`` (n,), in order, by cell 2^``wider`` times as wide as those of ``index`` (n, 3): (nz, ny, nx).
 
     ``index`` and ``shape`` (3,) of the wider ones are x first.
     """
@@ -198,7 +198,7 @@ def visibility(
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
     The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. ``progress`` is
-    told the share that is done.
+    called with the completed share.
     """
     wider = widening(voxels_of(scene), cells.exponent, scene.step, cameras)
     extinction = _mean_extinction(cells, scene, wider)
@@ -206,7 +206,7 @@ def visibility(
 
 
 def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: Sequence[Camera]) -> int:
-    """By how many powers of two the cells of the march are wider than those of 2^``exponent`` (3,) voxels.
+    """Return the exponent of two by which the march's cells are wider than those of 2^``exponent`` (3,) voxels.
 
     ``dims`` (3,) voxels and ``step`` (3,) their edges in the unit frame, (x, y, z).
     """
@@ -230,7 +230,7 @@ def march_views(
     cameras: Sequence[Camera],
     progress: Callable[[float], None] | None = None,
 ) -> Visibility:
-    """What cameras see through ``extinction`` (nz, ny, nx) float32, mean over cells of ``voxels`` (3,) voxels.
+    """March what cameras see through ``extinction`` (nz, ny, nx) float32, mean over cells of ``voxels`` (3,) voxels.
 
     In a box that is thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along z
     lies between two columns of pixels in every view with z upright.
@@ -249,5 +249,5 @@ def march_views(
 
 
 def _pixel(camera: Camera) -> float:
-    """Width of a pixel at the centre, unit frame."""
+    """Return the width of a pixel at the centre, unit frame."""
     return float(np.linalg.norm(camera.position)) / camera.fx

@@ -1,4 +1,4 @@
-"""Moments of cells of whole voxels: one point a voxel where the function is straight, else eight.
+"""Moments of cells of whole voxels: one point a voxel where the function is linear_until, else eight.
 
 Bricks of 8^3 voxels with their neighbours are laid out as table coordinates. Range, mean and mean slopes of the
 trilinear values over each voxel's box follow from the 27 voxels around, for all of a brick at once, axis by axis.
@@ -17,7 +17,7 @@ from vvgt_cli.dvr.kernel import FLAGS, U, mean_optics
 from vvgt_cli.dvr.layout import BRICK, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.vectors import add, lane, row, scale, sub
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 EDGE = BRICK + 2  # of a brick with a voxel around it
 PLANE = EDGE * EDGE
@@ -35,7 +35,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 @_jit
 def _smooth(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """Means of linear values over the boxes of voxels, along the axis of ``stride``."""
+    """Write means of linear values over the boxes of voxels, along the axis of ``stride``."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -44,7 +44,7 @@ def _smooth(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _slopes(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """Mean slopes over the boxes of voxels."""
+    """Write mean slopes over the boxes of voxels."""
     n = ALL - 2 * stride
     before, after, out = source[:n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -53,7 +53,7 @@ def _slopes(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _least(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """The smallest of each voxel and the middles between it and both neighbours."""
+    """Write the smallest of each voxel and the middles between it and both neighbours."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -63,7 +63,7 @@ def _least(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _most(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """The largest of them."""
+    """Write the largest of each voxel and the middles between it and both neighbours."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -73,7 +73,7 @@ def _most(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _lay_out(values: np.ndarray, x0: int, y0: int, z0: int, optics: Optics, to: np.ndarray) -> None:
-    """Table coordinates, beyond the table too, of the brick from voxel (x0, y0, z0) on and of the voxels around it."""
+    """Write table coordinates, beyond the table too, of the brick from voxel (x0, y0, z0) on and its surroundings."""
     nz, ny, nx = values.shape
     start, stop = min(max(1 - x0, 0), EDGE), min(EDGE, nx + 1 - x0)
     for k in range(EDGE):
@@ -90,7 +90,7 @@ def _lay_out(values: np.ndarray, x0: int, y0: int, z0: int, optics: Optics, to: 
 
 @_jit
 def _means(s: np.ndarray) -> None:
-    """Rows MEAN to ALONG_Z of the scratch from row VALUE."""
+    """Fill rows MEAN to ALONG_Z of the scratch from row VALUE."""
     _smooth(s[VALUE], s[MEAN], PLANE)
     _slopes(s[VALUE], s[ALONG_Z], PLANE)
     _slopes(s[MEAN], s[ALONG_Y], EDGE)
@@ -103,8 +103,8 @@ def _means(s: np.ndarray) -> None:
 
 
 @_jit
-def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
-    """Sums over the eight points of voxel ``p`` of a brick, where the function is a line."""
+def _linear(s: np.ndarray, p: int, optics: Optics) -> Sums:
+    """Sum over the eight points of voxel ``p`` of a brick, where the function is linear."""
     top = optics.nodes.shape[0] - 1
     u = min(max(np.float64(s[MEAN, p]), 0.0), float(top))
     index = min(int(u), top - 1)
@@ -115,8 +115,8 @@ def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
 
 
 @_jit
-def _bent(v: np.ndarray, p: int, optics: Optics) -> Sums:
-    """The same where it is none: each point averaged over the spread of its own box."""
+def _curved(v: np.ndarray, p: int, optics: Optics) -> Sums:
+    """Sum over the same points where it is not linear, each averaged over the spread of its own box."""
     bins = float(optics.nodes.shape[0] - 1)
     red = green = blue = mass = fx = fy = fz = xy = xz = yz = 0.0
     for octant in range(8):
@@ -182,7 +182,7 @@ def _brick(values: np.ndarray, optics: Optics, x0: int, y0: int, z0: int, s: np.
 
 @_jit
 def _add_row(
-    s: np.ndarray, p: int, x0: int, x1: int, optics: Optics, straight: np.ndarray, shift: int, y: float, z: float,
+    s: np.ndarray, p: int, x0: int, x1: int, optics: Optics, linear_until: np.ndarray, shift: int, y: float, z: float,
     step: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add the voxels ``x0`` to ``x1`` of a row, at ``p + x`` of a brick, to cells ``out`` (n, 13) of 2^``shift`` each.
@@ -197,25 +197,25 @@ def _add_row(
         if finite and u1 <= optics.dark[first]:
             continue
         at = (x & mask) * step[0] + d[0], y, z
-        if finite and u1 <= straight[first] and low >= -ROUNDING and high <= bins + ROUNDING:
-            _deposit(out[U(x >> shift)], at, d, _straight(s, p + x, optics))
+        if finite and u1 <= linear_until[first] and low >= -ROUNDING and high <= bins + ROUNDING:
+            _deposit(out[U(x >> shift)], at, d, _linear(s, p + x, optics))
         else:
-            _deposit(out[U(x >> shift)], at, d, _bent(s[VALUE], p + x, optics))
+            _deposit(out[U(x >> shift)], at, d, _curved(s[VALUE], p + x, optics))
 
 
 @parallel_kernel("Voxels Optics f8:1 f8:2 i8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def voxel_moments(
-    part: Part,
-    voxels: Voxels, optics: Optics, straight: np.ndarray, blocks: np.ndarray, exponent: np.ndarray, half: np.ndarray,
-    step: np.ndarray, begin: np.ndarray, out: np.ndarray,
+    thread: ThreadSlice,
+    voxels: Voxels, optics: Optics, linear_until: np.ndarray, blocks: np.ndarray, exponent: np.ndarray,
+    half: np.ndarray, step: np.ndarray, begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """`quadrature.block_moments` of cells of 2^``exponent`` (3,) whole voxels, two points a voxel and axis.
+    """Integrate `quadrature.block_moments` of cells of 2^``exponent`` (3,) voxels, two points a voxel and axis.
 
-    ``straight`` (bins + 1,) of `straight_until`; other arguments as there.
+    ``linear_until`` (bins + 1,) of `linear_ranges`; other arguments as there.
     """
     nz, ny, nx = voxels.values.shape
     ex, ey, ez = exponent
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = int(blocks[b, 0]), int(blocks[b, 1]), int(blocks[b, 2])
         last_x, last_y = min(out.shape[3] << ex, nx - x0), min(out.shape[2] << ey, ny - y0)
@@ -231,7 +231,7 @@ def voxel_moments(
                             dy = ((y & ((1 << ey) - 1)) + 0.5) * step[1]
                             dz = ((z & ((1 << ez) - 1)) + 0.5) * step[2]
                             stop = min(kx + BRICK, last_x)
-                            _add_row(s, p, kx, stop, optics, straight, ex, dy, dz, step, out[b, z >> ez, y >> ey])
+                            _add_row(s, p, kx, stop, optics, linear_until, ex, dy, dz, step, out[b, z >> ez, y >> ey])
         for k, j, i in np.ndindex(out.shape[1:4]):
             if out[b, k, j, i, MASS] > 0.0:
                 x = (begin[0] + x0 + (i << ex)) * step[0] - half[0]

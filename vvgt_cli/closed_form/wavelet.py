@@ -19,7 +19,7 @@ from vvgt_cli.gaussians.opacity import peak_opacity
 
 @functools.cache
 def box_surrogate() -> tuple[float, float]:
-    """(sigma / H, mass kept) of the isotropic Gaussian nearest in L2 to a unit box of edge H in three dimensions.
+    """Return (sigma / H, mass kept) of the isotropic Gaussian nearest in L2 to a unit box of edge H in 3D.
 
     For a given sigma the best amplitude is <box, g> / <g, g>; both factor over the axes. Sigma by golden section.
     """
@@ -37,7 +37,7 @@ def box_surrogate() -> tuple[float, float]:
 
 
 def detail_energy(tree: Tree) -> np.ndarray:
-    """(n,) largest energy of a cell's seven Haar details or those of any cell in it; 0 for base cells.
+    """Return the largest energy (n,) of a cell's seven Haar details or those of any cell in it; 0 for base cells.
 
     The energy is the children's squared density minus the cell's own, times volume. A cell whose children are alike has
     none, and is still split where something finer in it has some.
@@ -59,7 +59,7 @@ def detail_energy(tree: Tree) -> np.ndarray:
 
 
 def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
-    """At most ``budget`` isotropic Gaussians; ``pixel`` is a pixel's width at the centre, unit frame."""
+    """Return at most ``budget`` isotropic Gaussians; ``pixel`` is a pixel's width at the centre, unit frame."""
     ids = select(tree, budget, detail_energy(tree))
     moments, edge = tree.moments[ids], np.cbrt(tree.edges[tree.level[ids]].prod(axis=1))
     sigma, kept = box_surrogate()

@@ -26,10 +26,10 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume import ReadOptions
-from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.space import axis_facts
-from vvgt_cli.volume.vtk_family import is_index as is_vtk_index
+from vvgt_cli.volume.vtk import is_index as is_vtk_index
 
 if TYPE_CHECKING:
     from vvgt_cli.field.layered import Content

@@ -170,7 +170,7 @@ class Reference:
         """Return another renderer's mean PSNR on the views that are drawn whole, None if it cannot draw them."""
         from vvgt_cli.dvr.backends import view_renderer
         from vvgt_cli.images.metrics import score_view
-        from vvgt_cli.volume.vtk_messages import quiet_vtk
+        from vvgt_cli.volume.vtk.messages import quiet_vtk
 
         if not isinstance(field, Resident):
             return None

@@ -55,7 +55,7 @@ def synthesise(request: SynthRequest, console: Console | None = None) -> Convers
 
 def _make(request: SynthRequest, run: Run, shape: bool) -> ConversionReport:
     from vvgt_cli.synth.shapes import make_shape
-    from vvgt_cli.volume.nrrd_write import write_nrrd
+    from vvgt_cli.volume.medical.nrrd import write_nrrd
 
     with run.stage(request.kind) as stage:
         if shape:

@@ -30,7 +30,7 @@ from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.volume.slices import matching
+from vvgt_cli.volume.tiff.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
 SOON = 10.0  # seconds of reading after which a page is shown that waits; what fails sooner is told without one

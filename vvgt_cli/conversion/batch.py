@@ -1,57 +1,35 @@
 """A batch: several clouds of one run, as files with an index, as one page, or in memory.
 
-A batch is the frames of a series, several functions, or the labels of a map: it yields an `Item` for each cloud. One
-loop (`_run`) converts them, one after the other, into a sink: `Files` or `Memory`; a page is saved from memory.
-`CANNOT` says which options do not go with which kind.
+A batch is the frames of a series (`frames`), several functions, or the labels of a map (`labels`): it yields an `Item`
+for each cloud, and `convert_batch` converts them. `CANNOT` says which options do not go with which kind.
 """
 
 from __future__ import annotations
 
-import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.conversion.convert import convert, convert_in_memory, opened, planned, run_conversion
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     FUNCTIONS,
-    INDEX,
     LABELS,
-    entry,
-    function_name,
-    index_of,
-    index_output,
-    is_pattern,
-    psnr_of,
-    put_name,
-    write_index,
 )
-from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import NONE, content_of, open_parts
 from vvgt_cli.field.open import automatic
-from vvgt_cli.files import claim
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.formats.streamed import is_streamed
-from vvgt_cli.gaussians.outputs import check_outputs, claimed
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.result import Conversion
     from vvgt_cli.conversion.warm_start import WarmStart
 
 ONE, LIVE, LEVELS, PAGE = "one volume", "--live", "streamed levels", "a page of several clouds"
-WHOLE_RUN = Shard()
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and what to do
@@ -191,170 +169,6 @@ class Functions(Batch):
                 yield Item(name, stem, request, {"function": fact})
 
 
-class Files:
-    """The sink that writes a file for each item, and their index; a series keeps a manifest, by which it resumes."""
-
-    def __init__(self, request: ConvertRequest, shard: Shard) -> None:
-        self._request, self._shard = request, shard
-        self._manifest: Manifest | None = None
-        self._rows: dict[str, dict[str, Any]] = {}
-        self._stack = ExitStack()
-
-    def names(self, kind: str, stem: str) -> list[str]:
-        """Return output, report and preview of an item.
-
-        Raises:
-            UsageError: a pattern without one place for the name.
-        """
-        request = self._request
-        patterns = {"-o": request.output, "--report": request.report, "--preview": request.preview}
-        return [put_name(option, pattern, kind, stem) for option, pattern in patterns.items() if pattern is not None]
-
-    def _named(self, request: ConvertRequest, names: Sequence[str]) -> ConvertRequest:
-        rest = list(names)
-        output = rest.pop(0)
-        report = rest.pop(0) if self._request.report is not None else None
-        return replace(
-            request, output=output, report=report, preview=rest.pop(0) if rest else None,
-            overwrite=request.overwrite or self._manifest is not None,
-        )  # fmt: skip
-
-    def open(self, batch: Batch, run: Run) -> None:
-        """Check the outputs, before and after the batch is prepared, and claim the folder of a series.
-
-        Raises:
-            UsageError: outputs that may not be written, or a folder of another series.
-        """
-        request, overwrite = self._request, self._request.overwrite
-        if request.overwrite and self._shard.count > 1:
-            raise UsageError("--overwrite with --shard: parts would remove each other's files; remove them instead")
-        first = self.names(batch.kind, batch.stems[0] if batch.stems else INDEX)
-        index = index_output(str(request.output))
-        check_outputs([*self._named(request, first).outputs(), index], request.inputs(), overwrite or batch.resumes)
-        self._check_stems(batch)
-        batch.prepare(run)
-        self._check_stems(batch)
-        rows = [self.names(batch.kind, stem) for stem in batch.stems]
-        if not batch.resumes:
-            outputs = [output for row in rows for output in self._named(request, row).outputs()]
-            check_outputs([*outputs, index], request.inputs(), overwrite)
-            return
-        folders = {str(Path(name).parent) for name in first}
-        if len(folders) > 1:
-            raise UsageError(f"the frames, reports and previews of a series go to one folder; got {', '.join(folders)}")
-        self._manifest = Manifest(Path(folders.pop()), batch.settings(), self._shard, what="frames")
-        self._stack.enter_context(claim(self._manifest.folder / self._shard.manifest))
-        self._manifest.open([Path(name).name for name in (*(n for row in rows for n in row), index.path)], overwrite)
-        self._manifest.record()
-
-    def close(self) -> None:
-        """Let go of the folder."""
-        self._stack.close()
-
-    @staticmethod
-    def _check_stems(batch: Batch) -> None:
-        if len(set(batch.stems)) < len(batch.stems):
-            stated = ", ".join(dict.fromkeys(batch.stems))
-            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would have one name; rename one")
-
-    def wants(self, batch: Batch, stem: str) -> bool:
-        """Tell whether an item is this part's, and not there yet."""
-        if self._manifest is None:
-            return True
-        own = [Path(name).name for name in self.names(batch.kind, stem)]
-        return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
-
-    def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item to its files."""
-        return convert(
-            self._named(item.request, self.names(batch.kind, item.stem)), console, item.gaussians, batch.previous
-        )
-
-    def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
-        """Record an item that is whole."""
-        names = [Path(name) for name in self.names(batch.kind, item.stem)]
-        row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
-        folder = Path(index_output(str(self._request.output)).path).parent
-        row["file"] = Path(os.path.relpath(names[0], folder)).as_posix()
-        self._rows[item.stem] = row
-        if self._manifest is not None:
-            self._manifest.record([name.name for name in names], {names[0].name: {"row": row}})
-
-    def finish(self, batch: Batch, console: Console) -> dict[str, Any]:
-        """Write the index: of a series in parts, what all parts have recorded; the part that ends last finds all."""
-        path, manifest, known = index_output(str(self._request.output)).path, self._manifest, -1
-        rows = list(self._rows.values())
-        while manifest is None or len(manifest.files) > known:
-            if manifest is not None:
-                known = len(manifest.files)
-                files = (Path(self.names(batch.kind, stem)[0]).name for stem in batch.stems)
-                rows = [manifest.files[file]["row"] for file in files if file in manifest.files]
-            found = index_of(batch.kind, batch.volume, rows, **batch.facts)
-            write_index(path, found, self._request.overwrite or manifest is not None)
-            if manifest is None:
-                break
-            manifest.refresh()  # another part may have recorded its last item meanwhile
-        console.say(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted now")
-        return found
-
-
-class Memory:
-    """The sink that keeps Gaussians, scores and layouts."""
-
-    def __init__(self) -> None:
-        self._clouds: list[Cloud] = []
-        self._made: Cloud | None = None
-
-    def open(self, batch: Batch, run: Run) -> None:
-        """Prepare the batch."""
-        batch.prepare(run)
-
-    def wants(self, batch: Batch, stem: str) -> bool:
-        """Take every item."""
-        return True
-
-    def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item, whose volume is let go of."""
-        run = Run(console, ConversionReport("convert"))
-        with opened(run, item.request) as volume:
-            found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
-            normals = found.normals()
-        run.finish()
-        self._made = Cloud(found.gaussians, found.report, found.ply, item.name, item.stem, dict(item.facts), normals)
-        return found.report
-
-    def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
-        """Keep an item."""
-        assert self._made is not None
-        self._clouds.append(replace(self._made, facts={**self._made.facts, **facts}))
-
-    def finish(self, batch: Batch, console: Console) -> Clouds:
-        """Return all items."""
-        return Clouds(batch.kind, batch.volume, self._clouds, batch.facts)
-
-    def close(self) -> None:
-        """Do nothing: what is kept is the caller's."""
-
-
-def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
-    """Convert what a sink wants of a batch, one item after the other, and finish the sink.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command makes it again.
-    """
-    run = Run(console, ConversionReport("convert"))
-    try:
-        sink.open(batch, run)
-        for item in batch.items(run, lambda stem: sink.wants(batch, stem)):
-            report = sink.convert(batch, item, console)
-            if report.interrupted:
-                raise KeyboardInterrupt
-            sink.take(batch, item, report, batch.previous.facts() if batch.previous else {})
-        return sink.finish(batch, console)
-    finally:
-        sink.close()
-
-
 def options_in(request: ConvertRequest) -> set[str]:
     """Return the options of `CANNOT` that a request uses."""
     fit, limits, source = request.fit, request.limits, request.source
@@ -376,123 +190,3 @@ def check_options(kind: str, used: Iterable[str]) -> None:
     for option, why in CANNOT[kind].items():
         if option in used:
             raise UsageError(f"{option} with {kind}: {why}")
-
-
-def convert_files(
-    request: ConvertRequest, functions: Sequence[str] = (), *, split_labels: bool = False, dry_run: bool = False,
-    shard: str | None = None, console: Console | None = None,
-) -> str | None:  # fmt: skip
-    """Convert one volume, the frames of a series, several functions or the labels of a map to files or a page.
-
-    Args:
-        request: of all of it; ``output`` says by a place for a number or name (``{}``) that there are several files.
-        functions: of ``--tf``; one of them is the request's own.
-        split_labels: a cloud for each label.
-        dry_run: plan one volume, and write nothing.
-        shard: ``I/N``, the part of a series to convert.
-        console: for messages.
-
-    Returns:
-        The plan of a dry run.
-
-    Raises:
-        UsageError: options that do not go together, found before anything is read.
-        DataError: as `convert`; files that are whole stay.
-    """
-    from vvgt_cli.conversion.frames import is_glob_of_volumes
-
-    console, output = console or Console(), request.output or ""
-    several, numbered = len(functions) > 1, is_pattern(output)
-    flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "several --tf": several}
-    used = options_in(request) | {option for option, given in flags.items() if given}
-    kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
-    kinds = [LEVELS] if is_streamed(output) else [kind, *([LIVE] if request.live else [])]
-    page = kind != ONE and is_page(output) and not numbered
-    for one in [*kinds, *([PAGE] if page else [])]:
-        check_options(one, used)
-    if is_streamed(output):
-        from vvgt_cli.conversion.shards.run import init_in_blocks, streams
-
-        request = replace(request, blocks=request.blocks or automatic(request.source, console))
-        if streams(request):
-            init_in_blocks(request, console)
-        return None
-    if dry_run:
-        return planned(request, console).text()
-    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
-        try:
-            convert(request, console)
-            return None
-        except SeveralSteps:
-            if not is_page(output):
-                raise
-    if kind == ONE:
-        kind, page = FRAMES, True
-        check_options(PAGE, used)
-    part = WHOLE_RUN if shard is None else parse_shard(shard)
-    under = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, under, part, page)
-    if not page:
-        _run(batch, Files(request, part), console)
-        return None
-    run = Run(console, ConversionReport("convert"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite):
-        clouds = _run(batch, Memory(), console)
-        if not clouds:
-            raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
-        with run.stage("write") as stage:
-            size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
-            stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
-        run.finish()
-    return None
-
-
-def convert_to_memory(
-    requests: Mapping[str, ConvertRequest], *, several: bool = False, split_labels: bool = False,
-    after: Conversion | None = None, console: Console | None = None,
-) -> Conversion | Clouds:  # fmt: skip
-    """Convert one volume, the frames of a series, several looks or the labels of a map, without files.
-
-    Args:
-        requests: by the names of looks.
-        several: a cloud for each look, even where there is one.
-        split_labels: a cloud for each label.
-        after: an earlier conversion of the same volume to start from.
-        console: for messages.
-
-    Raises:
-        UsageError, DataError: as `convert_files`.
-    """
-    from vvgt_cli.conversion.frames import is_glob_of_volumes
-    from vvgt_cli.conversion.previous_look import PreviousLook
-
-    console, request = console or Console(), next(iter(requests.values()))
-    used = options_in(request) | ({"after"} if after else set()) | ({"--split-labels"} if split_labels else set())
-    kind = FUNCTIONS if several else LABELS if split_labels else ONE
-    for one in [kind, *([LIVE] if request.live else [])]:
-        check_options(one, used)
-    path = request.source.volume
-    if kind == ONE and not (isinstance(path, str) and is_glob_of_volumes(path)):
-        try:
-            return convert_in_memory(request, console, None if after is None else PreviousLook(after))
-        except SeveralSteps:
-            if not isinstance(path, str):
-                raise
-    kind = FRAMES if kind == ONE else kind
-    check_options(kind, used)
-    batch = _batch(kind, request, [(name, one, name) for name, one in requests.items()])
-    found: Clouds = _run(batch, Memory(), console)
-    return found
-
-
-def _batch(
-    kind: str, request: ConvertRequest, functions: Sequence[tuple[str, ConvertRequest, str]], shard: Shard = WHOLE_RUN,
-    page: bool = False,
-) -> Batch:  # fmt: skip
-    """Return the batch of a kind."""
-    from vvgt_cli.conversion.frames import Series
-    from vvgt_cli.conversion.labels import Labels
-
-    if kind == FRAMES:
-        return Series(request, shard, page)
-    return Labels(request) if kind == LABELS else Functions(functions)

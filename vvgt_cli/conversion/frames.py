@@ -30,7 +30,8 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.slices import SUFFIXES, matching
+from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
     from vvgt_cli.look import TransferFunction

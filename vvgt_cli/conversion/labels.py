@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.convert import fitted, opened
 from vvgt_cli.conversion.index import LABELS
@@ -147,6 +146,8 @@ def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> 
     with opened(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None
+        from vvgt_cli.closed_form.tree import HIDDEN
+
         hides = hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
     for part in parts:

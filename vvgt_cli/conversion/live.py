@@ -202,10 +202,10 @@ def in_box(source: Source) -> Lighting | None:
 
 def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     """Gaussians that carry values with their colours under a light in their frame."""
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
     assert gaussians.live is not None
-    return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
+    return gaussians if lighting is None else relight(gaussians, gaussians.live[:, GRADIENT], lighting)
 
 
 def table_of(source: Source) -> Table:

@@ -53,13 +53,13 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
 
 def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Gaussians of the fog with the rows of their labels, without those that lie in none."""
-    from vvgt_cli.closed_form.labelled import labelled
+    from vvgt_cli.closed_form.labelled import assign_labels
 
     assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source
     with run.stage("labels") as stage:
         maps = [(source.layers[0].volume, [label.number for label in labels])]
-        owner, gradient = labelled(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
+        owner, gradient = assign_labels(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
         known = np.flatnonzero(owner >= 0)
         gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
         owner, gradient = owner[known], gradient[known]

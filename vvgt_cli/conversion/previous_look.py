@@ -137,7 +137,7 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
 
 def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Gaussians as a look alone has them, of ``under`` (K, 5), and (K,) extinctions, per unit-frame length."""
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
     grain = 2 / max(source.volume.dims)
@@ -146,7 +146,7 @@ def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting = in_box(look)
-    return (plain if lighting is None else relit(plain, under[:, GRADIENT], lighting)), tau
+    return (plain if lighting is None else relight(plain, under[:, GRADIENT], lighting)), tau
 
 
 def _same(field: Field, other: Field) -> bool:

@@ -141,9 +141,9 @@ def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel:
     found, gradient = found.take(there), seen.live[there, GRADIENT]
     if lighting is None:
         return found
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
-    return relit(found, gradient, lighting)
+    return relight(found, gradient, lighting)
 
 
 def placed_function(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:

@@ -17,7 +17,7 @@ RENDERERS = ("cpu", "cuda", "vtk")
 def view_renderer(
     renderer: str, scene: Scene, settings: RenderSettings | None = None
 ) -> Callable[[Camera], np.ndarray]:
-    """A function from a camera to its view, (height, width, 4) float32, premultiplied RGBA over nothing.
+    """Return a function from a camera to its view, (height, width, 4) float32, premultiplied RGBA over nothing.
 
     What a renderer prepares once a scene (uploads, pipelines) is prepared here, so views can be asked for one by one.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
 @inlined()
 def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
-    """Largest difference between pixels (row, col) and (i, j) of ``image`` (h, w, c) in any channel."""
+    """Return the largest difference of pixels (row, col) and (i, j) of ``image`` (h, w, c) in any channel."""
     most = 0.0
     for channel in range(image.shape[2]):
         most = max(most, abs(image[row, col, channel] - image[i, j, channel]))
@@ -18,10 +18,10 @@ def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
 
 
 @parallel_kernel("f4:3 b1:2 f4:2")
-def _contrast(part: Part, image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
-    """`contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
+def _contrast(thread: ThreadSlice, image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
+    """Write `contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
     height, width = out.shape
-    for row in turns_of(part, height):
+    for row in iterations(thread, height):
         for col in range(width):
             most = 0.0
             if not known[row, col]:
@@ -35,7 +35,7 @@ def _contrast(part: Part, image: np.ndarray, known: np.ndarray, out: np.ndarray)
 
 
 def contrast(image: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """Largest difference of each pixel from its 8 neighbours, (h, w), in any channel of an image (h, w, c).
+    """Return each pixel's largest difference from its 8 neighbours, (h, w), in any channel of an image (h, w, c).
 
     ``known`` (h, w) bool: pixels that have been rendered; others differ from nothing.
     """

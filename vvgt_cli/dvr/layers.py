@@ -23,7 +23,7 @@ from vvgt_cli.volume.types import triple
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
 MOST_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
-VOXEL_BYTES = 20  # of a scene: four float32, and extinction once more
+VOXEL_BYTES = 20  # of a scene: four float32, and extinction again
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Layer:
 
     @property
     def name(self) -> str:
-        """Of the volume and what colours it."""
+        """Name of the volume and of the function that colours it."""
         return f"{self.volume.name} ({self.tf.name})"
 
     @property
@@ -58,7 +58,7 @@ class Layer:
         return self.colors is None and isinstance(self.tf, TransferFunction)
 
     def classify(self, x: np.ndarray) -> np.ndarray:
-        """Extinction per world length times (r, g, b, 1) at data values of any shape, (..., 4) float32; 0 at NaN."""
+        """Return extinction per world length times (r, g, b, 1) at values of any shape, (..., 4) float32; 0 at NaN."""
         flat = x.ravel().astype(np.float64)
         known = np.isfinite(flat)
         flat = np.where(known, flat, self.tf.node_range()[0])
@@ -80,7 +80,7 @@ class Layer:
         return self.classify(self.volume.slope * stored + self.volume.intercept)
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-        """The optics of voxels ``lo`` to ``hi`` (3,) of its own grid, x first: (z, y, x, 4) float32."""
+        """Return the optics of voxels ``lo`` to ``hi`` (3,) of the layer's own grid, x first: (z, y, x, 4) float32."""
         volume, stored = self.volume, read_block(self.volume, lo, hi)
         if self._table is not None:
             out: np.ndarray = self._table[stored.view(f"u{stored.dtype.itemsize}")]
@@ -98,14 +98,14 @@ class Layer:
 
 
 def same_grid(a: Volume, b: Volume) -> bool:
-    """Whether two volumes' voxels lie at the same places, to `SAME` voxels."""
+    """Return whether two volumes' voxels lie at the same places, to `SAME` voxels."""
     corners = np.array([[0, 0, 0, 1], [*a.dims, 1], [a.dims[0], 0, 0, 1], [0, a.dims[1], 0, 1]], np.float64)
     off = (corners @ (a.affine - b.affine).T)[:, :3]
     return a.dims == b.dims and bool(np.abs(off).max() <= SAME * min(a.spacing))
 
 
 def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
-    """The grid that layers add up on: the first one's box, in the finest voxels along each of its axes; no values.
+    """Return the grid on which layers are added: the first one's box, the finest voxels along each axis; no values.
 
     Where layers are ``stored`` it is never there as a whole.
 
@@ -140,7 +140,7 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
 
 
 def _check_meeting(first: Volume, other: Volume, inner: np.ndarray) -> None:
-    """Refuse boxes without a common point, by the axes of both."""
+    """Reject boxes without a common point, naming the axes of both."""
     corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float64)
     own = corners * [*first.dims, 1] - [0.5, 0.5, 0.5, 0]
     theirs = corners * [*other.dims, 1] - [0.5, 0.5, 0.5, 0]
@@ -154,7 +154,7 @@ def _check_meeting(first: Volume, other: Volume, inner: np.ndarray) -> None:
 
 
 def grid_of(layers: Sequence[Layer], target: Volume) -> np.ndarray:
-    """What layers add up to on the grid of ``target``: (nz, ny, nx, 4) float32 per world length."""
+    """Add up layers on the grid of ``target``: (nz, ny, nx, 4) float32 per world length."""
     nx, ny, nz = target.dims
     out = np.zeros((nz, ny, nx, 4), np.float32)
     for z in range(0, nz, SLAB):
@@ -164,7 +164,7 @@ def grid_of(layers: Sequence[Layer], target: Volume) -> np.ndarray:
 
 
 def grid_box(layers: Sequence[Layer], target: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """`grid_of` for voxels ``lo`` to ``hi`` (3,) of it, x first: the same values whatever the box."""
+    """Return `grid_of` for its voxels ``lo`` to ``hi`` (3,), x first: the same values whatever the box."""
     out = np.zeros((*(hi - lo)[::-1], 4), np.float32)
     for layer in layers:
         if same_grid(layer.volume, target):

@@ -1,4 +1,4 @@
-"""What the ray caster's kernels read: a volume's values, the optics, the light, the bricks of the empty-space map."""
+"""Data of the ray caster's kernels: a volume's values, the optics, the light, the bricks of the empty-space map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))  # of va
 
 
 def pairs_fit(shape: Sequence[int]) -> bool:
-    """Whether 32 bits, read at any pair of integers along x, lie within an array of ``shape`` (nz, ny, nx)."""
+    """Return whether 32 bits, read at any pair of integers along x, lie within an array of ``shape`` (nz, ny, nx)."""
     return shape[2] > 1 and math.prod(shape) > 3
 
 
@@ -37,6 +37,7 @@ class Voxels(_Values):
     __slots__ = ()
 
     def __new__(cls, values: np.ndarray) -> Voxels:
+        """Check the layout of ``values``, see the class."""
         shape, kind = values.shape, values.dtype
         if len(shape) != 3 or 0 in shape or kind not in TYPES or not kind.isnative:
             names = ", ".join(map(str, TYPES))
@@ -66,6 +67,7 @@ class Texels(_Grid):
     __slots__ = ()
 
     def __new__(cls, values: np.ndarray) -> Texels:
+        """Check the layout of ``values``, see the class."""
         if values.ndim != 4 or values.shape[3] != 4 or 0 in values.shape or values.dtype != np.dtype(np.float32):
             raise ValueError(f"grid {values.shape} of {values.dtype}; expected (nz, ny, nx, 4) float32, not empty")
         if not (values.flags.c_contiguous and values.flags.aligned and values.flags.writeable):
@@ -74,7 +76,7 @@ class Texels(_Grid):
 
 
 class Light(NamedTuple):
-    """What falls on a scene, in its box frame (docs/light.md).
+    """Light on a scene, in its box frame (docs/light.md).
 
     Attributes:
         ambient, diffuse, specular, power: coefficients; ``power`` is of the highlight.

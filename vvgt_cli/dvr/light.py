@@ -29,7 +29,7 @@ def scene_light(
     shape: Sequence[int],
     extinction: Callable[[int], np.ndarray],
 ) -> Light:
-    """What falls on a volume.
+    """Return the light that falls on a volume.
 
     Args:
         lighting: in world axes; a direction is taken through the volume's axes.
@@ -62,7 +62,7 @@ def scene_light(
 
 
 def shade_cell(shape: Sequence[int]) -> int:
-    """Voxels along the edge of a cell of the grids of shadows and occlusion: 1, 2, 4, ..., for `MAX_CELLS` at most."""
+    """Return the edge in voxels of a cell of shadows and occlusion: 1, 2, 4, ..., for `MAX_CELLS` at most."""
     cell = 1
     while math.prod(-(-n // cell) for n in shape) > MAX_CELLS:
         cell *= 2
@@ -70,7 +70,7 @@ def shade_cell(shape: Sequence[int]) -> int:
 
 
 def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
-    """Mean extinction per unit-frame length of the voxels of each cube of ``cell`` of them, (cz, cy, cx) float32."""
+    """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
     from vvgt_cli.dvr.shadows import cell_extinction
 
     out = np.empty(tuple(-(-n // cell) for n in scene.voxels.values.shape), np.float32)
@@ -79,16 +79,23 @@ def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
 
 
 class Absorbing(Protocol):
-    """What rays are attenuated in, as kernels take it, and its voxels' edges (3,) in the unit frame."""
+    """Medium that attenuates rays, as kernels take it, and its voxels' edges (3,) in the unit frame."""
 
     @property
-    def voxels(self) -> Voxels: ...
+    def voxels(self) -> Voxels:
+        """Stored values."""
+
     @property
-    def optics(self) -> Optics: ...
+    def optics(self) -> Optics:
+        """Optics over the stored values."""
+
     @property
-    def empty(self) -> np.ndarray: ...
+    def empty(self) -> np.ndarray:
+        """Distance to visible bricks, (bz, by, bx) uint8."""
+
     @property
-    def step(self) -> np.ndarray: ...
+    def step(self) -> np.ndarray:
+        """Voxel edges (3,), unit frame."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class Matter:
 
     @classmethod
     def of(cls, extinction: np.ndarray, step: np.ndarray) -> Matter:
-        """Of (nz, ny, nx) float32 per unit-frame length; ``step`` (3,) edges of its cells, unit frame."""
+        """Wrap (nz, ny, nx) float32 per unit-frame length; ``step`` (3,) edges of its cells, unit frame."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
         extinction.flags.writeable = False  # as volumes' values are: kernels are compiled for such
@@ -114,7 +121,7 @@ def transmittance(
     matter: Absorbing, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
     offset: float | None = None, wanted: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].
+    """Return mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].
 
     Args:
         matter: what lies before the lights.
@@ -138,7 +145,7 @@ def transmittance(
 
 
 def cone(axis: np.ndarray, angle: float, count: int) -> np.ndarray:
-    """(count, 3) unit vectors spread evenly over the disc within ``angle`` degrees of a unit vector (3,)."""
+    """Return (count, 3) unit vectors spread evenly over the disc within ``angle`` degrees of a unit vector (3,)."""
     first = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
     second = np.cross(axis, first)
     n = np.arange(count)
@@ -150,7 +157,7 @@ def cone(axis: np.ndarray, angle: float, count: int) -> np.ndarray:
 
 
 def sphere(count: int) -> np.ndarray:
-    """(count, 3) unit vectors spread evenly over all directions."""
+    """Return (count, 3) unit vectors spread evenly over all directions."""
     n = np.arange(count)
     z = 1 - (2 * n + 1) / count
     turn = math.pi * (3 - math.sqrt(5)) * n

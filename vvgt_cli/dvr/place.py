@@ -6,12 +6,12 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
 @parallel_kernel("f8:4 f8:2 i8:1 i8:1 i8:1 f8 f8:4", fastmath=FLAGS, error_model="numpy")
 def place(
-    part: Part,
+    thread: ThreadSlice,
     values: np.ndarray, matrix: np.ndarray, lo: np.ndarray, first: np.ndarray, dims: np.ndarray, outside: float,
     out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -23,7 +23,7 @@ def place(
     """
     nx, ny, nz, channels = dims[0], dims[1], dims[2], values.shape[3]
     mz, my, mx, _ = out.shape
-    for k in turns_of(part, mz):
+    for k in iterations(thread, mz):
         for j in range(my):
             for i in range(mx):
                 u, v, w = i + lo[0], j + lo[1], k + lo[2]

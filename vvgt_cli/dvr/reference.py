@@ -20,7 +20,7 @@ RAYS = 4096  # marched at a time: bounds the memory
 
 
 def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
-    """Data values (n,) float64 at voxel coordinates (n, 3), (x, y, z), clamped to the edge voxels.
+    """Return data values (n,) float64 at voxel coordinates (n, 3), (x, y, z), clamped to the edge voxels.
 
     NaN where one of the eight voxels around is not finite.
     """
@@ -39,7 +39,7 @@ def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
 
 
 def optics(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction (n,) per unit-frame length and colour (n, 3) of data values (n,); NaN is transparent."""
+    """Return extinction (n,) per unit-frame length and colour (n, 3) of data values (n,); NaN is transparent."""
     known = np.isfinite(x)
     tf = cast(TransferFunctionLike, scene.tf)
     clean = np.clip(np.where(known, x, 0.0), *tf.node_range())
@@ -48,7 +48,7 @@ def optics(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
+    """Return extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
     if scene.grid is None:
         return optics(scene, trilinear(scene.volume, points))
     *color, tau = (grid_values(scene.grid[..., k], points) for k in range(4))
@@ -56,7 +56,7 @@ def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
+    """Return directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
 
     Central differences of stored voxels (clamped at the edges), interpolated trilinearly.
     """
@@ -81,7 +81,7 @@ def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values (n,) of a grid (nz, ny, nx) at its coordinates (n, 3), (x, y, z), clamped."""
+    """Return values (n,) of a grid (nz, ny, nx) at its coordinates (n, 3), (x, y, z), clamped."""
     top = np.array(grid.shape[::-1]) - 1
     points = np.clip(points, 0, top)
     low = np.floor(points).astype(np.int64)
@@ -93,7 +93,7 @@ def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(factor of the colour (n,), white to add (n,)) at voxel coordinates (n, 3), seen along unit vectors (n, 3)."""
+    """Return the colours' factor (n,) and white to add (n,) at voxel coordinates (n, 3) seen along (n, 3)."""
     light = scene.light
     assert light is not None
     at = (points + 0.5) * light.inv_cell - 0.5
@@ -113,7 +113,7 @@ def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.
 
 
 def rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and unit directions (height, width, samples^2, 3) in the unit frame."""
+    """Return origin (3,) and unit directions (height, width, samples^2, 3) in the unit frame."""
     offset = (np.arange(samples) + 0.5) / samples
     x = (np.arange(camera.width)[:, None] + offset - camera.cx) / camera.fx  # (w, s)
     y = (np.arange(camera.height)[:, None] + offset - camera.cy) / camera.fy  # (h, s)
@@ -124,7 +124,7 @@ def rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float) -> np.ndarray:
-    """Premultiplied RGBA (n, 4) float64 along unit ``directions`` (n, 3); ``step`` in voxels of the smallest edge."""
+    """Return premultiplied RGBA (n, 4) float64 along unit ``directions`` (n, 3); ``step`` in smallest voxel edges."""
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = (-scene.half - origin) / directions, (scene.half - origin) / directions
     parallel = directions == 0  # no face across that axis: inside its slab, or never
@@ -149,7 +149,7 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
 
 
 def render_view_reference(scene: Scene, camera: Camera, step: float = 0.125, samples: int = 1) -> np.ndarray:
-    """(height, width, 4) float64 premultiplied RGBA, ``samples`` x ``samples`` rays in every pixel."""
+    """Render (height, width, 4) float64 premultiplied RGBA by ``samples`` x ``samples`` rays in every pixel."""
     origin, directions = rays(camera, samples)
     flat = directions.reshape(-1, 3)
     parts = [march(scene, origin, flat[i : i + RAYS], step) for i in range(0, len(flat), RAYS)]

@@ -22,7 +22,7 @@ LATTICE = {5: 2, 13: 5}  # point i of n at (i, k i mod n) / n: all columns and r
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a view is integrated.
+    """Settings of the integration along rays.
 
     Attributes:
         step: sampling distance in voxels; scalars are linear between samples (pre-integration).
@@ -38,6 +38,11 @@ class RenderSettings:
     footprint: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            UsageError: a number out of its range.
+        """
         if not 0 < self.step <= 4:
             raise UsageError(f"step {self.step} voxels; expected more than 0 and at most 4")
         if self.samples is not None and not 1 <= self.samples <= 16:
@@ -51,7 +56,7 @@ FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # what colours are solved from
 
 
 def ray_offsets(count: int) -> np.ndarray:
-    """(count, 2) places of a pixel's rays, right and down from its centre in pixels: a lattice, or a grid of a square.
+    """Return a pixel's ray positions (count, 2), right and down from its centre in pixels: a lattice or square grid.
 
     Raises:
         ValueError: neither.
@@ -71,9 +76,12 @@ class BoxGeometry(Protocol):
     """A box: half extents and voxel edges (3,) float64 in the unit frame, (x, y, z), as `Scene` has them."""
 
     @property
-    def half(self) -> np.ndarray: ...
+    def half(self) -> np.ndarray:
+        """Half extents (3,), unit frame."""
+
     @property
-    def step(self) -> np.ndarray: ...
+    def step(self) -> np.ndarray:
+        """Voxel edges (3,), unit frame."""
 
 
 class Box(NamedTuple):
@@ -84,7 +92,7 @@ class Box(NamedTuple):
 
 
 def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
+    """Return eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
     eye = (camera.position + scene.half) / scene.step - 0.5
     basis = camera.rotation / scene.step[None, :]
     lens = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy])
@@ -92,7 +100,7 @@ def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.nd
 
 
 def tile_order(height: int, width: int, blocks: Blocks | None = None) -> np.ndarray:
-    """Numbers of the tiles of a picture, or of its ``blocks``, in the order in which they are begun."""
+    """Return the numbers of a picture's tiles, or of its ``blocks``, in the order in which they are begun."""
     from vvgt_cli.dvr.kernel import TILE
 
     return np.arange(-(-height // TILE) * -(-width // TILE)) if blocks is None else blocks.numbers
@@ -107,21 +115,21 @@ class Rays(NamedTuple):
 
 
 def tiers(settings: RenderSettings, image: np.ndarray, blocks: Blocks | None = None) -> Iterator[list[Rays]]:
-    """What fills ``image`` (h, w, 4), or its ``blocks``: rays to be cast into it before the next are asked for."""
+    """Yield rays to cast into ``image`` (h, w, 4), or its ``blocks``, before the next are asked for."""
     everywhere = np.ones(image.shape[:2], bool) if blocks is None else blocks.mask()
     yield first_rays(settings, everywhere)
     yield more_rays(settings, image, everywhere)
 
 
 def first_rays(settings: RenderSettings, everywhere: np.ndarray) -> list[Rays]:
-    """All rays of pixels ``everywhere`` (h, w) bool, or one each where their contrast decides on `more_rays`."""
+    """Return all rays of pixels ``everywhere`` (h, w) bool, or one each where their contrast decides on `more_rays`."""
     if settings.samples is not None:
         return [Rays(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)]
     return [Rays(np.zeros((1, 2)), everywhere, 0)]
 
 
 def more_rays(settings: RenderSettings, image: np.ndarray, everywhere: np.ndarray) -> list[Rays]:
-    """Rays that ``image`` (h, w, 4), of one ray for each pixel of ``everywhere`` (h, w) bool, still needs."""
+    """Return the rays that ``image`` (h, w, 4), of one ray per pixel of ``everywhere`` (h, w) bool, still needs."""
     from vvgt_cli.dvr.contrast import contrast
 
     if settings.samples is not None:
@@ -138,39 +146,34 @@ def more_rays(settings: RenderSettings, image: np.ndarray, everywhere: np.ndarra
 
 
 def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> RenderSettings:
-    """Many rays for every pixel, where all of the box may lie between the middles of two rows or columns of them."""
+    """Set many rays for every pixel if the whole box may fall between the middles of two rows or columns."""
     if 2 * box.half.min() * camera.fx >= np.linalg.norm(camera.position):
         return settings
     return replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
 
 
 def _rays(scene: Scene) -> Callable[..., None]:
-    """The kernel of a scene's kind, with what it reads of it."""
+    """Return the kernel for a scene's kind, bound to what it reads of the scene."""
+    from vvgt_cli.dvr import march
+
     if scene.grid is None:
-        if scene.light is None:
-            from vvgt_cli.dvr import kernel
-
-            return partial(kernel.render_tiles, scene.voxels, scene.optics, scene.empty)
-        from vvgt_cli.dvr import lit
-
-        return partial(lit.render_lit_tiles, scene.voxels, scene.optics, scene.empty, scene.light)
-    from vvgt_cli.dvr import grid
-
-    if scene.light is None:
-        return partial(grid.render_grid_tiles, scene.texels, scene.empty)
-    return partial(grid.render_lit_grid_tiles, scene.texels, scene.voxels, scene.empty, scene.light)
+        kernel = march.render_tiles if scene.light is None else march.render_lit_tiles
+        return partial(kernel, scene.voxels, scene.optics, None, scene.empty, scene.light)
+    kernel = march.render_grid_tiles if scene.light is None else march.render_lit_grid_tiles
+    return partial(kernel, scene.voxels, scene.optics, scene.texels, scene.empty, scene.light)
 
 
 class Viewed(Protocol):
-    """What draws its own pictures, as a volume does of which only blocks are in memory."""
+    """Source of its own pictures, such as a volume of which only blocks are in memory."""
 
-    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray: ...
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """Render one view, as `render_view` does."""
 
 
 def render_view(
     scene: Scene | Viewed, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
 ) -> np.ndarray:
-    """One view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
+    """Render one view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
     settings = settings or RenderSettings()
     if not isinstance(scene, Scene):
         return scene.view(camera, settings, blocks)
@@ -190,7 +193,7 @@ def render_views(
     settings: RenderSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:
-    """Views of one size: (n, height, width, 4) float32, premultiplied; ``progress(done, total)`` after each."""
+    """Render views of one size: (n, height, width, 4) float32, premultiplied; ``progress(done, total)`` after each."""
     images = []
     for i, camera in enumerate(cameras):
         images.append(render_view(scene, camera, settings))

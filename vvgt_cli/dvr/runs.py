@@ -9,19 +9,15 @@ from typing import Any, TypeAlias
 import numba as nb
 import numpy as np
 from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.core.errors import TypingError
+from numba import TypingError, types
 
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, intrinsic
+from vvgt_cli.jit.numba_internals import alloca_once, get_or_insert_function
 
 RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
 MOST = (1 << 31) - 1
 NEAR = MOST // (4 * RUN + 3)  # voxels of a slab up to which the offsets within a run of steps to 4 voxels fit 32 bits
-
-# Arrays are not reference-counted within these functions: counting cost 100 ns a ray.
-BORROWED = {"_nrt": False}
 
 F: Any = nb.float32  # Any: mypy knows what they make outside of kernels
 N: Any = nb.int32
@@ -32,13 +28,13 @@ Run: TypeAlias = Any  # pointer to `RUN` float32, of `stack_run`
 
 @intrinsic
 def stack_run(typingctx: Any) -> Any:
-    """Pointer to `RUN` float32 on the caller's stack.
+    """Return a pointer to `RUN` float32 on the caller's stack.
 
     Stores to memory that the compiler cannot tell apart from the volume would forbid it to vectorise.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = cgutils.alloca_once(builder, ir.ArrayType(ir.FloatType(), RUN))
+        array = alloca_once(builder, ir.ArrayType(ir.FloatType(), RUN))
         return builder.bitcast(array, ir.FloatType().as_pointer())
 
     return types.CPointer(types.float32)(), codegen
@@ -46,7 +42,7 @@ def stack_run(typingctx: Any) -> Any:
 
 @intrinsic
 def run_range(typingctx: Any, run: Any) -> Any:
-    """Smallest and largest of the `RUN` values behind a pointer; none may be NaN."""
+    """Return the smallest and largest of the `RUN` values behind a pointer; none may be NaN."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = ir.VectorType(ir.FloatType(), RUN)
@@ -54,7 +50,7 @@ def run_range(typingctx: Any, run: Any) -> Any:
         kind = ir.FunctionType(ir.FloatType(), [vector])
         ends = []
         for name in ("fmin", "fmax"):
-            reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f32")
+            reduce = get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f32")
             ends.append(builder.call(reduce, [values], fastmath=("nnan", "nsz")))
         return context.make_tuple(builder, signature.return_type, ends)
 
@@ -63,7 +59,7 @@ def run_range(typingctx: Any, run: Any) -> Any:
 
 @intrinsic
 def _first(typingctx: Any, voxels: Any) -> Any:
-    """Pointer to the first value of `Voxels`: of nothing else, for only their layout has been checked."""
+    """Return a pointer to the first value of `Voxels`: of nothing else, for only their layout has been checked."""
     if getattr(voxels, "instance_class", None) is not Voxels:
         raise TypingError(f"runs of samples are read from Voxels, not from {voxels}")
 
@@ -75,7 +71,7 @@ def _first(typingctx: Any, voxels: Any) -> Any:
 
 @intrinsic
 def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
-    """Values ``index + edge`` and ``index + 1`` behind a pointer, as float32.
+    """Return values ``index + edge`` and ``index + 1`` behind a pointer, as float32.
 
     Integers come in one load of 32 bits, without ``edge``: its weight is zero there, but a NaN would not vanish by
     that. ``last``: the highest index at which such a load stays within the array.
@@ -108,9 +104,9 @@ def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
     return types.UniTuple(types.float32, 2)(values, index, edge, last), codegen
 
 
-@inlined(error_model="numpy", **BORROWED)
+@inlined(error_model="numpy", borrowed=True)
 def _base(p: float, v: float, n: int) -> tuple[int, float, float]:
-    """Lowest voxel of a run along an axis of ``n``, and from there its start and the end of the axis, float32.
+    """Return a run's lowest voxel along an axis of ``n``, and from there its start and the axis' end, float32.
 
     The run goes from ``p`` by ``v`` a sample, voxels. Counted from there, float32 keeps positions to 1e-5 voxels in a
     volume of any size.
@@ -121,7 +117,7 @@ def _base(p: float, v: float, n: int) -> tuple[int, float, float]:
 
 @intrinsic
 def _from(typingctx: Any, values: Any, index: Any) -> Any:
-    """Pointer to value ``index`` behind a pointer."""
+    """Return a pointer to value ``index`` behind a pointer."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.gep(args[0], [args[1]])
@@ -130,14 +126,14 @@ def _from(typingctx: Any, values: Any, index: Any) -> Any:
 
 
 def _sampler(index: Callable[[int], int]) -> Callable[..., None]:
-    """The loop over a run, its offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two.
+    """Make the loop over a run, offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two.
 
     ``here`` points to the run's lowest voxel; ``row``, ``slab``: voxels from one row, one slab to the next; ``last``:
     see `_pair`; ``start``, ``step``, ``top``, ``last_voxel`` (x, y, z) voxels from ``here``; ``table`` (lo, inv_width,
     bins); ``out`` (RUN,) float32.
     """
 
-    @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
+    @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", borrowed=True)
     def samples(
         here: Pointer, row: int, slab: int, last: int, start: tuple[float, float, float],
         step: tuple[float, float, float], top: tuple[float, float, float], last_voxel: tuple[int, int, int],
@@ -177,11 +173,11 @@ def _sampler(index: Callable[[int], int]) -> Callable[..., None]:
 _near_samples, _far_samples = _sampler(N), _sampler(L)
 
 
-@inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
+@inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", borrowed=True)
 def sample_run(
     voxels: Voxels, px: float, py: float, pz: float, vx: float, vy: float, vz: float, optics: Optics, out: Run
 ) -> None:
-    """Table coordinates in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
+    """Write table coordinates in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
 
     ``voxels`` `Voxels`, ``optics`` `Optics`; p, v in voxels (x, y, z), from the first voxel's centre; ``out``
     `stack_run`, (RUN,) float32. As `kernel.sample` and `kernel.table_coordinate`, in float32.

@@ -17,7 +17,7 @@ from vvgt_cli.volume import Volume
 
 @dataclass(frozen=True)
 class PreparedVolume:
-    """What of a scene does not depend on the function.
+    """Part of a scene that does not depend on the function.
 
     Attributes:
         values, slope, intercept: of `kernel_values`.
@@ -40,7 +40,7 @@ class PreparedVolume:
 
 @dataclass(frozen=True)
 class Scene:
-    """What every later stage reads.
+    """Volume under a transfer function, as every later stage reads it.
 
     Attributes:
         volume: the source.
@@ -123,7 +123,7 @@ class Scene:
         cls, volume: Volume, tf: Named, unit_distance: float, grid: np.ndarray, lighting: Lighting | None = None,
         labels: bool = False,
     ) -> Scene:  # fmt: skip
-        """An optics grid (nz, ny, nx, 4) float32 per world length, taken over and scaled, on the grid of ``volume``."""
+        """Build from an optics grid (nz, ny, nx, 4) float32 per world length, scaled in place, on ``volume``'s grid."""
         from vvgt_cli.dvr import bricks
 
         frame = volume.unit_frame()
@@ -136,7 +136,7 @@ class Scene:
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:
-        """The same scene under light; shadows and occlusion are marched here."""
+        """Return the same scene under light; shadows and occlusion are marched here."""
         light = scene_light(
             lighting, self.volume.axes, self.step, self.values.shape, lambda cell: mean_extinction(self, cell)
         )
@@ -144,7 +144,7 @@ class Scene:
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
-    """Stored values as uint8, uint16 or float32, with the slope and intercept that make them data values.
+    """Return stored values as uint8, uint16 or float32, with the slope and intercept that make them data values.
 
     The array is C-contiguous, in native byte order and read-only (kernels compile once, for mapped files and arrays
     in memory alike); it is a view of the volume's where that has such values already. int8 is raised to uint8. Types
@@ -165,7 +165,7 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
 
 @dataclass(frozen=True)
 class KernelRule:
-    """How stored values become those that kernels read, of which the data value is ``slope * value + intercept``.
+    """Rule that turns stored values into those of kernels; the data value is ``slope * value + intercept``.
 
     Attributes:
         dtype: uint8, uint16 or float32.
@@ -182,7 +182,7 @@ class KernelRule:
     raised: bool = False
 
     def apply(self, stored: np.ndarray) -> np.ndarray:
-        """Stored values, any shape and byte order, as kernels read them."""
+        """Return stored values, any shape and byte order, as kernels read them."""
         if self.raised:
             raised: np.ndarray = np.ascontiguousarray(stored).view(np.uint8) ^ np.uint8(128)
             return raised
@@ -195,7 +195,7 @@ class KernelRule:
 
 
 def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> KernelRule:
-    """The rule of `kernel_values`; ``limits`` gives the least and greatest finite stored value, where they matter."""
+    """Return the rule of `kernel_values`; ``limits``: least and greatest finite stored value, where they matter."""
     kind = volume.data.dtype.newbyteorder("=")
     if kind == np.bool_:
         kind = np.dtype(np.uint8)
@@ -214,12 +214,12 @@ def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> Ke
 
 
 def kernel_type(volume: Volume) -> str:
-    """Name of the type that `kernel_values` gives a volume's values."""
+    """Return the name of the type that `kernel_values` gives a volume's values."""
     return kernel_rule(volume, lambda: (0.0, 1.0)).dtype.name
 
 
 def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """``data`` as a read-only, aligned, C-contiguous array of ``dtype``; copied (slab by slab) only where it is not."""
+    """Return ``data`` read-only, aligned, C-contiguous, of ``dtype``; copied (slab by slab) only where it is not."""
     if data.dtype == dtype and data.flags.c_contiguous and data.flags.aligned:
         out = data.view(np.ndarray)
     else:

@@ -9,19 +9,18 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 U = nb.uint64
 
-_jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 
 @_jit
 def _places(p: float, n: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64, float]:
-    """Voxels before, at, after and beyond a clamped coordinate along an axis of ``n``, and its share."""
+    """Return voxels before, at, after and beyond a clamped coordinate along an axis of ``n``, and its share."""
     p = min(max(p, 0.0), n - 1.0)
     i = int(p)
     return U(max(i - 1, 0)), U(i), U(min(i + 1, n - 1)), U(min(i + 2, n - 1)), p - i
@@ -29,7 +28,7 @@ def _places(p: float, n: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint6
 
 @_jit
 def _line(values: np.ndarray, k: Any, j: Any, i: int) -> Quad:
-    """The voxels before, at, after and beyond voxel ``i`` of row (k, j), clamped to the edge voxels."""
+    """Return the voxels before, at, after and beyond voxel ``i`` of row (k, j), clamped to the edge voxels."""
     nx = values.shape[2]
     if 0 < i < nx - 2:
         return four(values, (k * U(values.shape[1]) + j) * U(nx) + U(i - 1))
@@ -42,7 +41,7 @@ def _line(values: np.ndarray, k: Any, j: Any, i: int) -> Quad:
 
 @_jit
 def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Direction (x, y, z) of the gradient at voxel coordinates, box frame; zeros where there is none.
+    """Return the gradient's direction (x, y, z) at voxel coordinates, box frame; zeros where there is none.
 
     Central differences at the eight voxels around, interpolated trilinearly; ``values`` (nz, ny, nx), ``edge`` (3,) of
     `Light`. There is none where all differences are zero, or one is not finite.
@@ -75,7 +74,7 @@ def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -
 
 @_jit
 def shade_at(light: Light, channel: int, x: float, y: float, z: float) -> float:
-    """``light.shade`` of a channel at voxel coordinates, trilinear between the cells' centres."""
+    """Interpolate ``light.shade`` of a channel at voxel coordinates, trilinear between the cells' centres."""
     nz, ny, nx = light.shade.shape[1:]
     x = min(max((x + light.origin[0] + 0.5) * light.inv_cell - 0.5, 0.0), nx - 1.0)
     y = min(max((y + light.origin[1] + 0.5) * light.inv_cell - 0.5, 0.0), ny - 1.0)
@@ -93,7 +92,7 @@ def shade_at(light: Light, channel: int, x: float, y: float, z: float) -> float:
 
 @_jit
 def openness(light: Light, x: float, y: float, z: float) -> float:
-    """How open the place is: 1 without occlusion."""
+    """Return how open the place is: 1 without occlusion."""
     if light.occlusion == 0:
         return 1.0
     return shade_at(light, light.shade.shape[0] - 1, x, y, z)
@@ -101,7 +100,7 @@ def openness(light: Light, x: float, y: float, z: float) -> float:
 
 @_jit
 def arrives(light: Light, which: int, x: float, y: float, z: float) -> float:
-    """Part of a light's that arrives: 1 without shadows."""
+    """Return the share of a light that arrives: 1 without shadows."""
     if light.shadows == 0:
         return 1.0
     return shade_at(light, which, x, y, z)
@@ -119,7 +118,7 @@ def fixed_diffuse(light: Light, n0: float, n1: float, n2: float, x: float, y: fl
 
 @_jit
 def _power(x: float, power: float) -> float:
-    """x^power, by squares where it is a whole number: the library's function takes as long as all else of a sample."""
+    """Return x^power, by squares for a whole number: the library's takes as long as all else of a sample."""
     left, result = int(power), 1.0
     if left != power or power > 256.0:
         result = x**power
@@ -152,7 +151,7 @@ def _fixed_highlights(
 def shading(
     values: np.ndarray, light: Light, x: float, y: float, z: float, d0: float, d1: float, d2: float
 ) -> tuple[float, float]:
-    """(factor of the colour, white to add) at voxel coordinates, seen along the unit vector d (box frame)."""
+    """Return (factor of the colour, white to add) at voxel coordinates, seen along the unit vector d (box frame)."""
     open_ = openness(light, x, y, z)
     n0, n1, n2 = normal(values, light.edge, x, y, z)
     if n0 == 0.0 and n1 == 0.0 and n2 == 0.0:

@@ -8,14 +8,13 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES, Optics, Voxels
-from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 BLACK = 1e-3  # transmittance at which a ray ends, as none
 
 
-@inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+@inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 def _transmittance(
     voxels: Voxels,
     optics: Optics,
@@ -30,7 +29,7 @@ def _transmittance(
     last: float,
     step: float,
 ) -> float:
-    """From p along d (voxels a unit-frame length), from ``first`` voxels to the length ``last``; ``step`` in voxels."""
+    """Return transmittance from p along d (voxels a unit length), from ``first`` voxels to the length ``last``."""
     values, dark = voxels.values, optics.dark
     nz, ny, nx = values.shape
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
@@ -69,7 +68,7 @@ def _transmittance(
 
 @parallel_kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", TUPLES, fastmath=FLAGS, error_model="numpy")
 def mean_transmittance(
-    part: Part,
+    thread: ThreadSlice,
     voxels: Voxels,
     optics: Optics,
     empty: np.ndarray,
@@ -81,14 +80,14 @@ def mean_transmittance(
     step: float,
     out: np.ndarray,
 ) -> None:
-    """Mean over ``directions`` (n, 3), voxels a unit-frame length, at the centres of cubes of ``cell`` voxels.
+    """Average over ``directions`` (n, 3), voxels a unit-frame length, at the centres of cubes of ``cell`` voxels.
 
     ``out`` (cz, cy, cx) float32; cells that are not ``wanted`` (cz, cy, cx) get 1.
     Rays begin ``first`` voxels from there and end at the unit-frame length ``last``; ``step`` in voxels.
     """
     nz, ny, nx = voxels.values.shape
     cz, cy, cx = out.shape
-    for flat in turns_of(part, cz * cy):
+    for flat in iterations(thread, cz * cy):
         k, j = flat // cy, flat % cy
         z, y = min((k + 0.5) * cell, nz - 0.5) - 0.5, min((j + 0.5) * cell, ny - 0.5) - 0.5
         for i in range(cx):
@@ -106,11 +105,13 @@ def mean_transmittance(
 
 
 @parallel_kernel("Voxels Optics u1:3 i8 f4:3", TUPLES, fastmath=FLAGS, error_model="numpy")
-def cell_extinction(part: Part, voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray) -> None:
-    """Mean extinction of the voxels in each cube of ``cell`` of them along an edge, into ``out`` (cz, cy, cx)."""
+def cell_extinction(
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray
+) -> None:
+    """Write the mean extinction of each cube of ``cell`` voxels along an edge into ``out`` (cz, cy, cx)."""
     nz, ny, nx = voxels.values.shape
     cz, cy, cx = out.shape
-    for flat in turns_of(part, cz * cy):
+    for flat in iterations(thread, cz * cy):
         k, j = flat // cy, flat % cy
         z0, z1, y0, y1 = k * cell, min((k + 1) * cell, nz), j * cell, min((j + 1) * cell, ny)
         for i in range(cx):

@@ -9,8 +9,7 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 from llvmlite import ir
-from numba import types
-from numba.core.errors import TypingError
+from numba import TypingError, types
 from numba.extending import models, register_model
 
 from vvgt_cli.jit.decorators import inlined, intrinsic
@@ -24,6 +23,7 @@ class QuadType(types.Type):
     """Type of `row` and of what is computed from it."""
 
     def __init__(self) -> None:
+        """Name the type "Quad"."""
         super().__init__(name="Quad")
 
 
@@ -45,7 +45,7 @@ def _splat(builder: Any, scalar: Any) -> Any:
 
 @intrinsic
 def row(typingctx: Any, table: Any, index: Any) -> Any:
-    """Row ``index`` (unsigned, in range) of a C-contiguous float64 array (n, 4)."""
+    """Load row ``index`` (unsigned, in range) of a C-contiguous float64 array (n, 4)."""
     if not (isinstance(table, types.Array) and (table.dtype, table.ndim, table.layout) == (types.float64, 2, "C")):
         raise TypingError(f"rows are taken from C-contiguous float64 tables, not from {table}")
 
@@ -60,7 +60,7 @@ def row(typingctx: Any, table: Any, index: Any) -> Any:
 
 @intrinsic
 def texel(typingctx: Any, grid: Any, index: Any) -> Any:
-    """Voxel ``index`` (unsigned, in range, x fastest) of a C-contiguous float32 array (nz, ny, nx, 4)."""
+    """Load voxel ``index`` (unsigned, in range, x fastest) of a C-contiguous float32 array (nz, ny, nx, 4)."""
     if not (isinstance(grid, types.Array) and (grid.dtype, grid.ndim, grid.layout) == (types.float32, 4, "C")):
         raise TypingError(f"voxels are taken from C-contiguous float32 grids, not from {grid}")
 
@@ -76,7 +76,7 @@ def texel(typingctx: Any, grid: Any, index: Any) -> Any:
 
 @intrinsic
 def four(typingctx: Any, values: Any, index: Any) -> Any:
-    """Values ``index`` (unsigned) to ``index + 3``, all in range, of a C-contiguous array (nz, ny, nx) of numbers."""
+    """Load values ``index`` (unsigned) to ``index + 3``, all in range, of a C-contiguous array (nz, ny, nx)."""
     if not (isinstance(values, types.Array) and (values.ndim, values.layout) == (3, "C")):
         raise TypingError(f"values are taken from C-contiguous volumes, not from {values}")
 
@@ -92,7 +92,7 @@ def four(typingctx: Any, values: Any, index: Any) -> Any:
 
 @intrinsic
 def vector(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """(a, b, c, d)."""
+    """Return (a, b, c, d)."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         found = ir.Constant(QUAD, ir.Undefined)
@@ -105,13 +105,13 @@ def vector(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
 
 @intrinsic
 def zeros4(typingctx: Any) -> Any:
-    """(0, 0, 0, 0)."""
+    """Return (0, 0, 0, 0)."""
     return quad(), lambda context, builder, signature, args: ir.Constant(QUAD, [0.0] * 4)
 
 
 @intrinsic
 def lane(typingctx: Any, vector: Any, index: Any) -> Any:
-    """Entry ``index`` of a vector."""
+    """Return entry ``index`` of a vector."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.extract_element(args[0], builder.trunc(args[1], ir.IntType(32)))
@@ -121,19 +121,19 @@ def lane(typingctx: Any, vector: Any, index: Any) -> Any:
 
 @intrinsic
 def add(typingctx: Any, a: Any, b: Any) -> Any:
-    """a + b."""
+    """Return a + b."""
     return quad(quad, quad), lambda context, builder, signature, args: builder.fadd(*args, flags=FLAGS)
 
 
 @intrinsic
 def sub(typingctx: Any, a: Any, b: Any) -> Any:
-    """a - b."""
+    """Return a - b."""
     return quad(quad, quad), lambda context, builder, signature, args: builder.fsub(*args, flags=FLAGS)
 
 
 @intrinsic
 def scale(typingctx: Any, a: Any, b: Any) -> Any:
-    """Float ``a`` times vector ``b``."""
+    """Multiply vector ``b`` by float ``a``."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fmul(_splat(builder, args[0]), args[1], flags=FLAGS)
@@ -143,5 +143,5 @@ def scale(typingctx: Any, a: Any, b: Any) -> Any:
 
 @inlined(error_model="numpy", _nrt=False)
 def mix(a: Quad, b: Quad, share: float) -> Quad:
-    """From a to b."""
+    """Interpolate linearly from a to b."""
     return add(a, scale(share, sub(b, a)))

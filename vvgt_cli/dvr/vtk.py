@@ -35,7 +35,7 @@ PROBE = (
 
 
 def require_opengl() -> None:
-    """Try an off-screen window in a process of its own, because VTK ends the process where it finds no OpenGL.
+    """Check an off-screen window in another process, because VTK ends the process where it finds no OpenGL.
 
     Raises:
         DataError: there is none.
@@ -49,7 +49,7 @@ def require_opengl() -> None:
 
 
 def view_renderer(scene: Scene, settings: RenderSettings, mended: bool = False) -> Callable[[Camera], np.ndarray]:
-    """A function from a camera to VTK's view, (height, width, 4) float32, premultiplied RGBA in steps of 1/255.
+    """Return a function from a camera to VTK's view, (height, width, 4) float32, premultiplied in steps of 1/255.
 
     One ray a pixel at ``settings.step`` voxels of the mean edge. The volume is padded by its edge voxels and cropped to
     the box, because VTK's own bounds end at the outermost voxel centres. ``mended`` turns normals to the eye without
@@ -100,7 +100,7 @@ def view_renderer(scene: Scene, settings: RenderSettings, mended: bool = False) 
 
 
 def _cropped(scene: Scene) -> np.ndarray:
-    """(3,) half extents of cropping planes that leave the box.
+    """Return the (3,) half extents of cropping planes that leave the box.
 
     VTK's shader compares a plane's place between the first and the last of n voxel centres with a texture's coordinate,
     which is 0 and 1 half a voxel beyond them: at the planes of the box itself it would leave half a voxel too much.
@@ -111,7 +111,7 @@ def _cropped(scene: Scene) -> np.ndarray:
 
 
 def image_data(scene: Scene, padded: bool) -> Any:
-    """The stored values as vtkImageData in the unit frame; ``padded`` by one voxel of the edge's value."""
+    """Return stored values as vtkImageData in the unit frame; ``padded`` by one voxel of the edge's value."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkImageData
 
@@ -127,7 +127,7 @@ def image_data(scene: Scene, padded: bool) -> Any:
 
 
 def add_lights(renderer: Any, scene: Scene) -> None:
-    """The scene's lights where some are at infinity; else VTK makes its head-light, the only one that it knows well.
+    """Add the scene's lights if some are at infinity; else VTK makes its head-light, the one that it handles well.
 
     With others its mapper takes the ambient colour from the lights, not from the volume: there is none (docs/light.md).
     """
@@ -148,7 +148,7 @@ def add_lights(renderer: Any, scene: Scene) -> None:
 
 
 def volume_property(scene: Scene, highlight: float = REFLECTED) -> Any:
-    """vtkVolumeProperty over stored values: the scene's function, unit distance and shading, linear interpolation.
+    """Return a vtkVolumeProperty over stored values: the scene's function, unit distance, shading; linear.
 
     ``highlight``: what the power of highlights is multiplied with.
     """
@@ -207,7 +207,7 @@ def aim(renderer: Any, camera: Camera) -> None:
 
 
 def read_pixels(window: Any, width: int, height: int) -> np.ndarray:
-    """The window's frame buffer, (height, width, 4) float32 in [0, 1], top row first."""
+    """Return the window's frame buffer, (height, width, 4) float32 in [0, 1], top row first."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 

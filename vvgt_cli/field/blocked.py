@@ -286,7 +286,7 @@ class Blocked:
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field.sample`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, values_of
 
         self.source.one_field()
         assert isinstance(self.reader, Scalars)

@@ -98,7 +98,7 @@ class CellBlocks(Blockwise):
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells with extinction of a tile (x, y, z) in a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
-        from vvgt_cli.closed_form.ranges import visible_blocks
+        from vvgt_cli.dvr.bricks import visible_blocks
 
         grid = self.grid
         exponent = np.array(grid.exponent, np.int64)
@@ -120,7 +120,7 @@ class CellBlocks(Blockwise):
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Of a tile's cells ``local`` (n, 3): mass in cells of the march, opacity of the field, largest of a cell."""
-        from vvgt_cli.closed_form.inset import opaque_depth
+        from vvgt_cli.closed_form.surface_offset import opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
         grid = self.grid
@@ -189,7 +189,7 @@ class ValueBlocks(Blockwise):
 
     def __call__(self, number: int) -> None:
         """Leave the values of those points that lie in block ``number``: numbers of them, over all Gaussians."""
-        from vvgt_cli.closed_form.under import POINTS, offsets, reach, sample_points
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, offsets, reach, sample_points
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")

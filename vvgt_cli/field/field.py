@@ -67,7 +67,7 @@ class Field(Protocol):
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Return mean value, spread and gradient under Gaussians of the box frame, (K, 5) float32.
 
-        See `vvgt_cli.closed_form.under.values_of`.
+        See `vvgt_cli.closed_form.gaussian_samples.values_of`.
 
         Raises:
             UsageError: an optics grid, which has no values.
@@ -148,7 +148,7 @@ class Resident:
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field.sample`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 
         self.source.one_field()
         scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)

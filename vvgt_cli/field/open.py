@@ -199,7 +199,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     """The level of a file of several: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
     from vvgt_cli.cameras.sets import pixel_width
     from vvgt_cli.closed_form.closed_form import MIN_CELL
-    from vvgt_cli.volume.levels import level_shapes
+    from vvgt_cli.volume.registry import level_shapes
 
     shapes = level_shapes(path, read)
     if not shapes:
@@ -218,7 +218,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
 
 def files_of(path: str) -> list[Path]:
     """The slices in a folder or of a glob; a file, or a folder of anything else, itself; none where nothing is."""
-    from vvgt_cli.volume.slices import matching, slices_of
+    from vvgt_cli.volume.tiff.slices import matching, slices_of
 
     if not os.path.exists(path):
         return matching(path)

@@ -191,16 +191,13 @@ def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., N
     """The kernel of a box's kind, with what it reads of it."""
     from functools import partial
 
-    from vvgt_cli.dvr import segments
+    from vvgt_cli.dvr import march
 
-    texels = box.texels
-    if texels is None:
-        if light is None:
-            return partial(segments.cast_segments, box.voxels, box.optics, empty)
-        return partial(segments.cast_lit_segments, box.voxels, box.optics, empty, light)
-    if light is None:
-        return partial(segments.cast_grid_segments, texels, empty)
-    return partial(segments.cast_lit_grid_segments, texels, box.voxels, empty, light)
+    if box.texels is None:
+        kernel = march.cast_segments if light is None else march.cast_lit_segments
+    else:
+        kernel = march.cast_grid_segments if light is None else march.cast_lit_grid_segments
+    return partial(kernel, box.voxels, box.optics, box.texels, empty, light)
 
 
 def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:

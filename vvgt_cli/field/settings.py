@@ -102,8 +102,8 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least
 
     Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
     """
-    from vvgt_cli.closed_form.inset import field_coarsening
     from vvgt_cli.closed_form.moments import blocks
+    from vvgt_cli.closed_form.surface_offset import field_coarsening
 
     frame = volume.unit_frame()
     step = np.array(frame.step)

@@ -1,5 +1,1 @@
-"""How kernels are compiled: by a process of their own, and then loaded from disk (docs/kernels.md).
-
-`decorators` marks kernels, `cache` keeps their machine code, `compile` has it made, `worker` makes it, `ahead` lists
-what commands will need. Importing this package loads none of them.
-"""
+"""Compile kernels in a process of their own, keep their machine code on disk and load it (docs/kernels.md)."""

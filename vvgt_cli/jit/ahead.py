@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-RENDER, RENDER_LIT = "vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.lit:render_lit_tiles"
-BRICK_RANGES = "vvgt_cli.dvr.bricks:_ranges"
+RENDER, RENDER_LIT = "vvgt_cli.dvr.march:render_tiles", "vvgt_cli.dvr.march:render_lit_tiles"
+BLOCK_RANGES = "vvgt_cli.dvr.bricks:block_ranges"
 SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
 MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
 VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
 MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
-FRAME_STEPS = "vvgt_cli.refine.steps:own_frame"
+AXES_STEPS = "vvgt_cli.refine.steps:own_axes"
 REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
-FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps in the own frame
+FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps along own axes
 
-RAYCAST_REST = (BRICK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
+RAYCAST_REST = (BLOCK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
 RAYCAST = (RENDER, *RAYCAST_REST)
 GRID = {
-    RENDER: "vvgt_cli.dvr.grid:render_grid_tiles",
-    RENDER_LIT: "vvgt_cli.dvr.grid:render_lit_grid_tiles",
+    RENDER: "vvgt_cli.dvr.march:render_grid_tiles",
+    RENDER_LIT: "vvgt_cli.dvr.march:render_lit_grid_tiles",
     BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
 }
 DRAW = (
@@ -42,10 +42,10 @@ CELLS = (
     "vvgt_cli.closed_form.pyramid:principal_axes",
     MIX,
 )
-CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")))
+CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")))
 DESCENT = (
     PAIR_SUMS,
-    "vvgt_cli.splat.backward:own_frame",
+    "vvgt_cli.splat.backward:own_axes",
     "vvgt_cli.splat.kernel:project_factors",
     "vvgt_cli.refine.loss:loss_gradient",
     "vvgt_cli.refine.ssim:blur",
@@ -53,25 +53,24 @@ DESCENT = (
     "vvgt_cli.refine.texture:weigh",
     "vvgt_cli.refine.texture:add_fine",
 )
-REFINE = (FRAME_STEPS, *DESCENT)
+REFINE = (AXES_STEPS, *DESCENT)
 SHARED = (*REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
 VIEWS = (*RAYCAST, *CELLS, VOXEL_MOMENTS)  # and points to start from, of cells of voxels or wider ones
-INIT = (*CLOSED_FORM, BRICK_RANGES)
+INIT = (*CLOSED_FORM, BLOCK_RANGES)
 MERGE = (*(name for name in CLOSED_FORM if name not in (BLOCK_MOMENTS, COMPACT)), *DRAW)
 COUNT_WHOLE = ("vvgt_cli.volume.count_kernel:count_values",)  # of types of which every number is counted
 COUNT_REAL = ("vvgt_cli.volume.count_kernel:range_values", "vvgt_cli.volume.count_kernel:bin_values")  # of others
 SEGMENTS = {
-    RENDER: "vvgt_cli.dvr.segments:cast_segments",
-    RENDER_LIT: "vvgt_cli.dvr.segments:cast_lit_segments",
-    GRID[RENDER]: "vvgt_cli.dvr.segments:cast_grid_segments",
-    GRID[RENDER_LIT]: "vvgt_cli.dvr.segments:cast_lit_grid_segments",
+    RENDER: "vvgt_cli.dvr.march:cast_segments",
+    RENDER_LIT: "vvgt_cli.dvr.march:cast_lit_segments",
+    GRID[RENDER]: "vvgt_cli.dvr.march:cast_grid_segments",
+    GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
 }
-BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
-CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-LIVE = ("vvgt_cli.closed_form.under:sample_points",)
+CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
+LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
@@ -89,35 +88,34 @@ ALL = (
     *DEPOSITS,
     *SEGMENTS.values(),
     *LIVE,
-    BLOCK_RANGES,
     VOXEL_MOMENTS,
     *COUNT_WHOLE,
     *COUNT_REAL,
-    "vvgt_cli.volume.slc_kernel:decode_plane",
+    "vvgt_cli.volume.plain.run_lengths:decode_runs",
     "vvgt_cli.gaussians.formats.codebook_kernels:cut_clusters",
     "vvgt_cli.gaussians.formats.codebook_kernels:divide",
 )
 
 
 def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
-    """Kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion."""
+    """Return the kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion."""
     rays = tuple(RENDER_LIT if name == RENDER else name for name in names)
     return (*rays, *(SHADE if MARCH in names else ()), *(SHADOWS if attenuated else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
-    """Kernels of a command that meets Gaussians with harmonics of a degree: more, where that is above 0."""
+    """Return the kernels of a command for Gaussians with harmonics of ``degree``: above 0 it needs more."""
     if not degree:
         return names
     slopes = [VIEW_SLOPES] if PAIR_SUMS in names else []
-    return (*names, *slopes, VIEW_COLORS, *([FIELD_STEPS] if FRAME_STEPS in names else []))
+    return (*names, *slopes, VIEW_COLORS, *([FIELD_STEPS] if AXES_STEPS in names else []))
 
 
 def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Kernels of a command whose scene is an optics grid."""
+    """Return the kernels of a command whose scene is an optics grid."""
     return tuple(GRID.get(name, name) for name in names)
 
 
 def for_blocks(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Kernels of a command whose volume is gone through in blocks."""
+    """Return the kernels of a command that reads its volume in blocks."""
     return (*(SEGMENTS.get(name, name) for name in names), BLOCK_RANGES)

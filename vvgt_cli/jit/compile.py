@@ -1,4 +1,4 @@
-"""Has kernels compiled by another process."""
+"""Have kernels compiled by another process."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.registry import cpu_target
 
+from vvgt_cli.jit.numba_internals import config
 from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
-from vvgt_cli.jit.target import config
 
 VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
 
@@ -38,29 +37,30 @@ class Job:
     types: tuple[Any, ...]
     file: str
 
+    def kernel(self) -> Any:
+        """Return the dispatcher."""
+        return getattr(import_module(self.module), self.function)
+
 
 def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[Job]:
-    """Jobs for the declared argument types of kernels ("vvgt_cli.room.module:function"); none where numba is off."""
+    """Return jobs for the declared types of kernels ("vvgt_cli.room.module:function"); none where numba is off."""
     jobs: list[Job] = []
-    if config.DISABLE_JIT:
-        return jobs
-    for name in names:
+    for name in [] if config.DISABLE_JIT else dict.fromkeys(names):
         module, function = name.split(":")
-        dispatcher = getattr(import_module(module), function)
-        codegen = cpu_target.target_context.codegen()
-        for types in dict.fromkeys(usual_types(dispatcher, kind) for kind in volumes):
-            jobs.append(Job(module, function, types, dispatcher._cache.file(types, codegen)))
+        kernel = getattr(import_module(module), function)
+        for types in dict.fromkeys(usual_types(kernel, kind) for kind in volumes):
+            jobs.append(Job(module, function, types, kernel.kernel_cache.file(types)))
     return jobs
 
 
-def usual_types(dispatcher: Any, volume: str) -> tuple[Any, ...]:
-    """numba types that a kernel declares; `V`: read-only values (nz, ny, nx) of type ``volume``."""
-    tuples = {kind.__name__: (kind, fields) for kind, fields in dispatcher.tuples.items()}
-    return _types(dispatcher.usual, tuples, volume)
+def usual_types(kernel: Any, volume: str) -> tuple[Any, ...]:
+    """Return the numba types that a kernel declares; `V`: read-only values (nz, ny, nx) of type ``volume``."""
+    tuples = {kind.__name__: (kind, fields) for kind, fields in kernel.tuples.items()}
+    return _types(kernel.usual, tuples, volume)
 
 
 def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tuple[Any, ...]:
-    """numba types from their short names and those of named ``tuples`` {name: (class, types of its fields)}."""
+    """Return numba types for short names, and for those of named ``tuples`` {name: (class, types of its fields)}."""
     found: list[Any] = []
     for word in usual.split():
         name, _, axes = word.partition(":")
@@ -76,21 +76,26 @@ def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tupl
 
 
 def missing(jobs: Iterable[Job]) -> list[Job]:
-    """Those of ``jobs`` whose code does not lie on disk."""
-    return [job for job in jobs if getattr(import_module(job.module), job.function)._cache.find(job.file) is None]
+    """Return those of ``jobs`` whose code is not on disk."""
+    return [job for job in jobs if job.kernel().kernel_cache.find(job.file) is None]
 
 
 def compile_in_subprocess(jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None) -> bool:
-    """Compile ``jobs`` in another process, one at a time on each processor; whether that worked.
+    """Compile ``jobs`` in another process, one at a time on each processor.
 
-    What did not work is left to the caller, who finds no file.
+    Args:
+        jobs: what to compile.
+        progress: called after each with (done, total).
+
+    Returns:
+        Whether all went well; whoever asked for a kernel that could not be compiled finds no file.
     """
     folder = folder_for_writing()
     if folder is None or not sys.executable:
         return False
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")])),
-        "PYTHONHASHSEED": "0",  # sets of names are walked through while compiling
+        "PYTHONHASHSEED": "0",  # numba walks through sets of names
     }
     try:
         process = subprocess.Popen(
@@ -109,7 +114,7 @@ def compile_in_subprocess(jobs: Sequence[Job], progress: Callable[[int, int], No
 
 
 def _follow(process: Any, order: bytes, count: int, progress: Callable[[int, int], None] | None) -> bool:
-    """Hand the order over, and follow what the worker prints: a line a kernel that is done."""
+    """Send the order and follow what the worker prints, a line per kernel; return whether all went well."""
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(order)
         process.stdin.close()
@@ -120,7 +125,7 @@ def _follow(process: Any, order: bytes, count: int, progress: Callable[[int, int
 
 
 def _kill(process: Any) -> None:
-    """End a worker and what it has started."""
+    """End a worker and its forks."""
     with contextlib.suppress(OSError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)
@@ -131,14 +136,14 @@ def _kill(process: Any) -> None:
 def compile_ahead(
     names: Iterable[str], progress: Callable[[int, int], None] | None = None
 ) -> tuple[int, int, Path | None]:
-    """Compile kernels that are not found, for every type of values.
+    """Compile kernels that are not on disk, for every type of values.
 
     Args:
         names: of `vvgt_cli.jit.ahead`.
         progress: called after each with (done, total).
 
     Returns:
-        (how many were missing, how many still are, the folder that later runs look into; None where none can be kept).
+        How many were missing, how many still are, and the folder in which later runs look, None where none can be kept.
     """
     todo = missing(usual_jobs(names))
     if todo:

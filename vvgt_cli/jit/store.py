@@ -1,4 +1,4 @@
-"""The folders that hold compiled kernels: which they are, who is believed, how files come and go."""
+"""The folders that hold compiled kernels: which they are, whose files are trusted, and how files come and go."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from pathlib import Path
 PACKAGE = Path(__file__).parent.parent
 MAGIC = b"vvgt kernel 1\n"
 WORKING: Path | None = None  # file that this process compiles for; None in processes that load
-_said: set[str] = set()
+_warned: set[str] = set()
 
 
 def warn_once(message: str) -> None:
-    """A `RuntimeWarning` that is given once a process."""
-    if message not in _said:
-        _said.add(message)
+    """Give a `RuntimeWarning` once per process."""
+    if message not in _warned:
+        _warned.add(message)
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
 def folders() -> list[Path]:
-    """Where kernels are looked for, and written to in the first place that allows it.
+    """Return the folders in which kernels are looked for; they are written to the first that allows it.
 
-    ``NUMBA_CACHE_DIR`` where it is set; else beside the package's byte code, then in the user's cache.
+    ``NUMBA_CACHE_DIR`` if it is set; else beside the package's byte code, then in the user's cache.
     """
     mine = f"vvgt-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}"
     if os.environ.get("NUMBA_CACHE_DIR"):
@@ -40,7 +40,7 @@ def folders() -> list[Path]:
 
 @cache
 def temporary_folder() -> Path:
-    """A folder for this process alone, removed at its end.
+    """Make a folder for this process alone, removed at its end.
 
     Raises:
         OSError: nothing can be written there either.
@@ -54,7 +54,7 @@ def temporary_folder() -> Path:
 
 
 def writable(folder: Path) -> bool:
-    """Whether a file can be made in ``folder``, which is made where it is missing."""
+    """Return whether a file can be made in ``folder``, which is made if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -65,7 +65,7 @@ def writable(folder: Path) -> bool:
 
 @cache
 def folder_for_writing() -> Path | None:
-    """The first of `folders` that can be written to, else a temporary one, which is said; None where there is none."""
+    """Return the first of `folders` that can be written to, else a temporary one, with a warning; None without any."""
     tried = folders()
     for folder in tried:
         if writable(folder):
@@ -79,31 +79,31 @@ def folder_for_writing() -> Path | None:
 
 
 def folders_for_reading() -> list[Path]:
-    """`folders`, and the one of this process alone where there is one."""
+    """Return `folders`, and the temporary one of this process if it has one."""
     return [*folders(), *([temporary_folder()] if temporary_folder.cache_info().currsize else [])]
 
 
-def owners() -> set[int]:
-    """User ids whose files are believed: this user, root, the owner of the package."""
+def trusted_users() -> set[int]:
+    """Return the ids of the users whose files are trusted: this user, root, the owner of the package."""
     if not hasattr(os, "geteuid"):
         return {0}  # what os.stat gives where there are no user ids
     return {os.geteuid(), 0, PACKAGE.stat().st_uid}
 
 
 def read(path: Path) -> bytes | None:
-    """Contents of a file that is whole and of an owner who is believed, else None; what is wrong is said once."""
+    """Return the contents of a file that is intact and of a trusted user, else None; warn once of what is wrong."""
     try:
         with path.open("rb") as stream:
             owner = os.fstat(stream.fileno()).st_uid
             text = stream.read()
     except OSError:
         return None
-    if owner not in owners():
+    if owner not in trusted_users():
         warn_once(f"{path.parent}: kernels of another user (id {owner}) are not read")
         return None
     body = text[len(MAGIC) + 32 :]
     if text[: len(MAGIC)] != MAGIC or hashlib.sha256(body).digest() != text[len(MAGIC) : len(MAGIC) + 32]:
-        warn_once(f"{path.parent}: damaged kernels are compiled anew")
+        warn_once(f"{path.parent}: damaged kernels are compiled again")
         return None
     return body
 

@@ -1,13 +1,14 @@
-"""The process that compiles kernels: ``python -m vvgt_cli.jit.worker``, with its orders on standard input.
+"""The process that compiles kernels: ``python -m vvgt_cli.jit.worker``, with its order on standard input.
 
 Each kernel is compiled in a fork that has compiled nothing before, so that its machine code does not depend on what
-else is asked for. Two runs that want the same kernel at once share the work: who comes second waits, and finds it.
+else is asked for. Two runs that want the same kernel at once share the work: the second waits, and finds it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import sys
 import traceback
@@ -20,7 +21,7 @@ MOST = 8  # kernels at once: 0.3 GB each
 
 @contextlib.contextmanager
 def claim(folder: Path, file: str) -> Iterator[None]:
-    """Hold the right to write ``file``; without it where the file system has no locks."""
+    """Hold the right to write ``file``; go on without it where the file system has no locks."""
     try:
         import fcntl
     except ImportError:
@@ -33,25 +34,18 @@ def claim(folder: Path, file: str) -> Iterator[None]:
 
 
 def make(folder: Path, job: Any) -> None:
-    """Compile one kernel, unless somebody else has meanwhile."""
-    import importlib
-    import itertools
-
-    from numba.core import bytecode
-    from numba.core.registry import cpu_target
-
+    """Compile one kernel, unless another worker has meanwhile."""
     from vvgt_cli.jit import store
+    from vvgt_cli.jit.numba_internals import number_symbols
 
-    dispatcher = getattr(importlib.import_module(job.module), job.function)
-    file = dispatcher._cache.file(job.types, cpu_target.target_context.codegen())
-    if file != job.file:
+    kernel = job.kernel()
+    if kernel.kernel_cache.file(job.types) != job.file:
         raise RuntimeError(f"{job.function}: other sources than the caller's")
-    with claim(folder, file):
-        if store.read(folder / file) is None:
-            # names of symbols hold this number: those of two kernels, loaded by one process, must not meet
-            bytecode.FunctionIdentity._unique_ids = itertools.count(int(file.split("-")[-1][:12], 16) << 16)
-            store.WORKING = folder / file
-            dispatcher.compile(job.types)
+    with claim(folder, job.file):
+        if store.read(folder / job.file) is None:
+            number_symbols(int(job.file.split("-")[-1][:12], 16) << 16)
+            store.WORKING = folder / job.file
+            kernel.compile(job.types)
             store.WORKING = None
 
 
@@ -65,7 +59,7 @@ def _attempt(folder: Path, job: Any) -> int:
 
 
 def _finished(running: set[int]) -> int:
-    """Wait for a fork; its exit status."""
+    """Wait for a fork and return its exit status."""
     number, status = os.wait()
     running.discard(number)
     print("done", flush=True)
@@ -73,24 +67,18 @@ def _finished(running: set[int]) -> int:
 
 
 def run(folder: Path, jobs: list[Any]) -> int:
-    """Compile all; 0 where all went well."""
-    import importlib
-
-    from numba.core.registry import cpu_target
-
-    from vvgt_cli.jit.target import widen
+    """Compile all ``jobs`` into ``folder``; return 0 where all went well."""
+    from vvgt_cli.jit.numba_internals import refresh_targets, use_wide_vectors
     from vvgt_cli.resources import processors
 
-    widen()
+    use_wide_vectors()
     for module in sorted({job.module for job in jobs}):
         importlib.import_module(module)
-    cpu_target.typing_context.refresh()  # once, rather than in every fork
-    cpu_target.target_context.refresh()
-    gc.disable()  # what a fork makes lives as long as it does
-    failed = 0
+    refresh_targets()
+    gc.disable()  # a fork's objects live as long as it does
     if not hasattr(os, "fork"):
         return sum(_attempt(folder, job) for job in jobs)
-    most = min(MOST, processors())
+    failed, most = 0, min(MOST, processors())
     running: set[int] = set()
     for job in jobs:
         if len(running) >= most:

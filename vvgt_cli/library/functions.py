@@ -84,7 +84,7 @@ def convert(
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
-    from vvgt_cli.conversion.batch import convert_to_memory
+    from vvgt_cli.conversion.convert_batch import convert_to_memory
 
     if not isinstance(after, Conversion | None):
         raise UsageError("after: expected what convert returns for one volume and look")

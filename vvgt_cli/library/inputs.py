@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeAlias, TypedDict
+from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 
 from vvgt_cli.conversion.index import function_name
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
@@ -24,11 +24,8 @@ from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.dask_arrays import is_dask, lazy
 from vvgt_cli.volume.stored import Stored
 
-if TYPE_CHECKING:
-    from vvgt_cli.library.session import Session
-
 PathLike = str | os.PathLike[str]
-VolumeLike: TypeAlias = "PathLike | Volume | Content | Session | ArrayLike | VtkImage"
+VolumeLike: TypeAlias = "PathLike | Volume | Content | ReadAlready | ArrayLike | VtkImage"
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
@@ -43,6 +40,13 @@ class ArrayLike(Protocol):
 
     @property
     def dtype(self) -> Any: ...
+
+
+class ReadAlready(Protocol):
+    """A `Session`."""
+
+    @property
+    def content(self) -> Content: ...
 
 
 class VtkImage(Protocol):
@@ -120,7 +124,7 @@ def _name_of(function: FunctionLike | None) -> str:
 
 
 @dataclass(frozen=True)
-class Goal(FitOptions, Limits):
+class Goal(Limits, FitOptions):
     """What a conversion is for: the attributes of `FitOptions` and `Limits`.
 
     Attributes:

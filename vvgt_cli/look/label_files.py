@@ -22,8 +22,8 @@ from typing import Any
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.labels import LONGEST_NAME, SOLID, Label, LabelTable, distinct
 from vvgt_cli.look.readers.fields import json_of, number, rgb, text_of
-from vvgt_cli.volume.dicom_seg import is_segmentation_file
-from vvgt_cli.volume.dicom_seg import segments as dicom_segments
+from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
+from vvgt_cli.volume.dicom.segmentation import segments as dicom_segments
 
 SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
 SEPARATED = (".csv", ".tsv")

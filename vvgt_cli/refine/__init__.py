@@ -24,11 +24,12 @@ def optimize(
     stop: Callable[[], bool] | None = None,
     free: np.ndarray | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
-    """Descend on the difference between pictures of Gaussians and views.
+    """Minimise the difference between pictures of Gaussians and views by gradient descent.
 
     Args:
         gaussians: where to start.
-        cameras, images: training views, (n, h, w, 4) float32 premultiplied.
+        cameras: of the training views.
+        images: (n, h, w, 4) float32 premultiplied.
         options: how, and when to stop.
         check: cameras and images to judge by, and `Blocks` of each where the images hold only those: what is returned
             is the best that they have seen, the input included. Without them the last step's Gaussians are returned.

@@ -33,7 +33,7 @@ STEPPED = 3  # raised when the same start and options step otherwise
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
-    """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
+    """Hash all that a run depends on; ``views``: `Train`, `Check` or None."""
     found = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
     for array in gaussians.arrays().values():
         found.update(array.tobytes())
@@ -80,19 +80,19 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
             _check_like({f"array_{i}": array for i, array in enumerate(kept)}, own)
         state.restore(saved)
         best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
-        told = {field: about["record"][field] for field in asdict(record)}
-        told["checks"] = [tuple(look) for look in told["checks"]]
+        described = {field: about["record"][field] for field in asdict(record)}
+        described["checks"] = [tuple(look) for look in described["checks"]]
     except _FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
     judge.best, judge.idle, judge.kept = best, idle, tuple(kept) or None
-    for field, value in told.items():
+    for field, value in described.items():
         setattr(record, field, value)
     return walk
 
 
 def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What was said about the run, and the arrays; all as it lies in the file, so that nothing grows in memory."""
+    """Return the run's description and the arrays, all as it lies in the file, so that nothing grows in memory."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
@@ -105,7 +105,7 @@ def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _check_like(saved: dict[str, np.ndarray], own: dict[str, np.ndarray]) -> None:
-    """See that arrays are those of a state of any number of Gaussians: kernels do not check.
+    """Check that arrays are those of a state of any number of Gaussians: kernels do not check.
 
     Raises:
         ValueError: other names, types or shapes.

@@ -27,7 +27,7 @@ FIRST, LAST, EVERY, RESET = 500 / 30_000, 0.5, 100 / 30_000, 3_000 / 30_000  # s
 FEWEST, RECOVERY = 10, 300  # steps
 SLOPE = 2e-4  # mean gradient of the loss a pixel, in half pictures, above which a Gaussian is cloned or split
 DENSE = 0.01  # of the cameras' extent: larger ones are split, smaller ones cloned
-FAINTEST = 0.005  # opacity below which a Gaussian is left out
+FAINTEST = 0.005  # opacity below which a Gaussian is removed
 RESET_TO = 0.01  # opacity
 SHRINK = 1.6  # of the scales of the two that a split makes
 FINAL_RATE = 0.01  # of positions, at the end of the run
@@ -39,6 +39,7 @@ class Densified(Fields):
     STEADY = False
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> None:
+        """Take the limit of Gaussians, or their number, and the random seed from ``options``."""
         super().__init__(gaussians, cameras)
         self.limit = max(options.max_gaussians or len(gaussians), 1)
         self.rng = np.random.default_rng(options.seed)
@@ -61,7 +62,7 @@ class Densified(Fields):
         share: float,
         speed: float,
     ) -> None:
-        """One step, and density control where it is due."""
+        """Take one step, with density control where it is due."""
         seen = self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
         size = 3 * camera.width * camera.height  # their loss is a mean, ours a sum
@@ -77,7 +78,7 @@ class Densified(Fields):
             self.last_reset, self.share_reset = self.step, share
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on."""
+        """Return all that the next steps depend on."""
         last = np.array([self.last, self.last_reset, self.share, self.share_reset], np.float64)
         drawn = np.array(json.dumps(self.rng.bit_generator.state))
         return super().saved() | {"slopes": self.slopes, "seen": self.seen, "last": last, "drawn": drawn}
@@ -109,7 +110,7 @@ class Densified(Fields):
 def densify(
     gaussians: Gaussians, score: np.ndarray, limit: int, extent: float, rng: np.random.Generator
 ) -> tuple[Gaussians, np.ndarray]:
-    """Leave out the faint, clone small and split large Gaussians of large score, until there are ``limit``.
+    """Remove faint, clone small and split large Gaussians of large score, until there are ``limit``.
 
     Args:
         gaussians: K of them.

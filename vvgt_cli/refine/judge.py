@@ -16,9 +16,10 @@ FALLEN = 3.0  # dB below the best: rates were too large
 
 
 class Judge:
-    """Looks at the check views, and remembers the best state that they have seen."""
+    """Judge of a run by its check views, which keeps the best state that they have seen."""
 
     def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
+        """Judge ``state`` by the views of ``check``, drawn by ``rule``; scores go into ``record``."""
         self.state, self.check, self.record, self.rule = state, check, record, rule
         self.best: float | None = None
         self.kept: tuple[np.ndarray, ...] | None = None
@@ -57,7 +58,7 @@ class Judge:
         self.state.arrays = tuple(kept.copy() for kept in self.kept)
 
     def result(self, start: Gaussians) -> Gaussians:
-        """The best state as Gaussians; the input itself where nothing was better."""
+        """Return the best state as Gaussians; the input itself where nothing was better."""
         self.record.psnr_after = self.best
         if self.check is None:
             self.record.kept = self.record.steps

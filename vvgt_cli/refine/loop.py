@@ -17,7 +17,7 @@ from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.densify import Densified
 from vvgt_cli.refine.judge import Judge
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.refine.states import Fields, OwnFrame, State
+from vvgt_cli.refine.states import Fields, OwnAxes, State
 from vvgt_cli.splat import blend
 
 SLOWER = 0.5  # rates after a fall
@@ -38,7 +38,7 @@ def run(
     stop: Callable[[], bool] | None,
     free: np.ndarray | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
-    """`optimize` without its defaults."""
+    """Run `optimize` without its defaults."""
     _fit("training", cameras, images)
     if check is not None:
         _fit("check", *check)
@@ -84,7 +84,7 @@ def run(
 
 @dataclass
 class _Course:
-    """What changes from step to step beside the state."""
+    """Values that change from step to step beside the state."""
 
     error: float | None = None
     speed: float = 1.0
@@ -95,7 +95,7 @@ class _Course:
 def _checkpoint(
     options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, judge: Judge
 ) -> tuple[Callable[[], None], _Course]:
-    """What saves the run, and where it begins: the end of the last one where there is a checkpoint."""
+    """Return the run's checkpoint and its start: the end of the last one where there is a file, else the given one."""
     path = options.checkpoint
     if path is None:
         return lambda: None, _Course()
@@ -107,13 +107,13 @@ def _checkpoint(
 def begin(
     gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
 ) -> State:
-    """What the method descends on: of Gaussians that carry values, the look that they have."""
+    """Return the state that a method descends on: Gaussians that carry values with the look that they have."""
     gaussians = replace(gaussians, live=None)
     if options.method == "3dgs":
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnFrame(gaussians, cameras, options.rule, free)
+    return OwnAxes(gaussians, cameras, options.rule, free)
 
 
 def step(
@@ -150,7 +150,7 @@ def step(
 
 
 def spread_views(cameras: Sequence[Camera], seed: int) -> Iterator[int]:
-    """All views, then all again, each from where fewest of the last ones were seen from.
+    """Yield all views, then all again, each from where fewest of the last ones were seen from.
 
     A step follows one view's slopes; those of views side by side are alike, so that views far apart in a row make a
     better mean of all. ``seed`` decides which is first, and between equals.
@@ -169,20 +169,20 @@ def spread_views(cameras: Sequence[Camera], seed: int) -> Iterator[int]:
 
 
 def _share(options: OptimizeOptions, steps: int, elapsed: float) -> float:
-    """Of the run that lies behind, by steps or by time, whichever is more."""
+    """Return the completed share of the run, by steps or by time, whichever is more."""
     by_steps = steps / options.steps if options.steps else 0.0
     by_time = elapsed / options.time_budget if options.time_budget else 0.0
     return min(max(by_steps, by_time), 1.0)
 
 
 def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
-    """Steps in all, as far as can be told."""
+    """Estimate the total number of steps."""
     share = _share(options, steps, elapsed)
     return max(steps, round(steps / share)) if options.time_budget and share > 0 else options.steps or steps
 
 
 def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
-    """Why to stop before the next step; None to go on."""
+    """Return why to stop before the next step; None to go on."""
     if options.steps is not None and judge.record.steps >= options.steps:
         return "steps"
     if options.time_budget is not None and elapsed >= options.time_budget:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
 @parallel_kernel("f4:3 f4:3 f4 f4 f4 f4:3 f8:1")
 def loss_gradient(
-    part: Part,
+    thread: ThreadSlice,
     image: np.ndarray,
     target: np.ndarray,
     l1: np.float32,
@@ -24,7 +24,7 @@ def loss_gradient(
     ``image``, ``target`` (h, w, 4) float32; ``squares`` (h,) gets each row's sum of r^2, alpha's weighted too.
     """
     height, width = image.shape[:2]
-    for y in turns_of(part, height):
+    for y in iterations(thread, height):
         total = 0.0
         for x in range(width):
             for f in range(4):

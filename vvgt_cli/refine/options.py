@@ -1,4 +1,4 @@
-"""What a descent is asked for, and what it says that it did."""
+"""Options of a descent, and the record of what it did."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks]
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """How to descend, and when to stop.
+    """Options of gradient descent: the method, and when to stop.
 
     Attributes:
         steps: of one view each, at most; rates fall to zero over them. None: as many as the time budget allows.
-        method: "frame" steps in each Gaussian's own frame, "adam" on the file's fields with the rates of 3DGS, "3dgs"
+        method: "frame" steps along each Gaussian's own axes, "adam" on the file's fields with the rates of 3DGS, "3dgs"
             as that, and the number of Gaussians grows and shrinks as in 3DGS.
         max_gaussians: that "3dgs" may grow to; None: as many as it begins with.
         time_budget: seconds from the first step on after which no other is begun; rates fall to zero over it if it
@@ -69,6 +69,11 @@ class OptimizeOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            UsageError: an unknown method, or a number out of its range.
+        """
         if self.method not in METHODS:
             raise UsageError(f"method {self.method!r}; expected one of {', '.join(METHODS)}")
         if self.steps is None and self.time_budget is None:
@@ -86,13 +91,13 @@ class OptimizeOptions:
 
     @classmethod
     def of(cls, method: str, **options: Any) -> OptimizeOptions:
-        """Options with the loss that belongs to a method: squares, of texture too, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM)."""
+        """Return options with the method's loss: squares, of texture too, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM)."""
         return cls(method=method, **(LOSSES.get(method, {}) | options))
 
 
 @dataclass
 class OptimizeRecord:
-    """What a run did.
+    """Record of a run.
 
     Attributes:
         steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).

@@ -1,8 +1,8 @@
-"""What the steps of Gaussians that are alike have in common, which one Gaussian's own slopes tell too noisily.
+"""Steps that similar Gaussians share, estimated together: one Gaussian's own slopes are too noisy.
 
 A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
 wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.
-So the directions of all are regressed, each step anew, on what is known of each Gaussian at the start, and what the
+So the directions of all are regressed, again at each step, on what is known of each Gaussian at the start, and what the
 regression foretells is added to each one's step, several times over: a mean over thousands has hardly any noise, and
 may go further, as long as what is foretold from step to step agrees. That is descent on the parameters
 ``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi are the numbers known and random features of them
@@ -35,7 +35,7 @@ NONE = np.zeros((0, FEATURES, LANES), np.int8), np.zeros((KNOWN, FEATURES), np.f
 
 
 def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Numbers known of each Gaussian; and its axes in an order and with signs that mean the same for all.
+    """Return numbers known of each Gaussian, and its axes in an order and with signs that mean the same for all.
 
     Args:
         means: (K, 3) float32.
@@ -66,7 +66,7 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
 
 
 def sample_of(count: int) -> tuple[int, int]:
-    """Of ``count`` Gaussians one run of `RUN` in how many is regressed on, and how many Gaussians that makes.
+    """Return every how many runs of `RUN` of ``count`` Gaussians are regressed on, and how many Gaussians that makes.
 
     All below twice `SAMPLE`, else at least `SAMPLE` and less than twice as many.
     """
@@ -75,7 +75,7 @@ def sample_of(count: int) -> tuple[int, int]:
 
 
 def sampled(numbers: np.ndarray) -> np.ndarray:
-    """(n, m) of ``numbers`` (K, m): those of `sample_of`."""
+    """Return rows of ``numbers`` (K, m) that `sample_of` chooses: (n, m)."""
     every, count = sample_of(len(numbers))
     if every == 1:
         return numbers
@@ -85,7 +85,7 @@ def sampled(numbers: np.ndarray) -> np.ndarray:
 
 
 def _standard(numbers: np.ndarray) -> np.ndarray:
-    """Of mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
+    """Scale to mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
     spread = numbers.std(axis=0, dtype=np.float64)
     found = (numbers - numbers.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
     standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
@@ -106,16 +106,16 @@ class SharedSteps:
     """
 
     def __init__(self, known: np.ndarray) -> None:
-        """Of ``known`` (K, 17), as `aligned` returns it."""
+        """Prepare from ``known`` (K, 17), as `aligned` returns it."""
         count, inputs = known.shape
         rng = np.random.default_rng(0)  # the same features in each run
-        ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
-        offsets = rng.normal(size=ways.shape[1]).astype(np.float32)
+        mixing = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
+        offsets = rng.normal(size=mixing.shape[1]).astype(np.float32)
         some = sampled(known)
-        middle = np.maximum(some @ ways + offsets, 0).mean(axis=0)
+        middle = np.maximum(some @ mixing + offsets, 0).mean(axis=0)
 
         def rows(part: np.ndarray) -> np.ndarray:
-            bent = np.maximum(part @ ways + offsets, 0) - middle
+            bent = np.maximum(part @ mixing + offsets, 0) - middle
             found = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
             rounded: np.ndarray = np.clip(np.rint(found * ONE), -MOST, MOST)
             return rounded
@@ -134,7 +134,7 @@ class SharedSteps:
             self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
 
     def weights(self, directions: np.ndarray) -> np.ndarray:
-        """(KNOWN, FEATURES) float32, `factor` times what foretells ``directions`` (COUNT, n) of the sample, all finite.
+        """Return (KNOWN, FEATURES) float32: `factor` x the regression of finite ``directions`` (COUNT, n).
 
         Not of what turns the axes: it has no sign that means the same for all.
         """
@@ -150,7 +150,7 @@ class SharedSteps:
         return found
 
     def saved(self) -> dict[str, np.ndarray]:
-        """What the next steps depend on."""
+        """Return what the next steps depend on."""
         return {"last": np.append(self.before, (self.factor, self.agreement))}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -160,7 +160,7 @@ class SharedSteps:
 
 
 def shared_steps(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> SharedSteps | None:
-    """Of a start, whose axes are put in order in place; None where there are too few Gaussians for it."""
+    """Prepare from a start, whose axes are put in order in place; None with too few Gaussians for it."""
     if len(means) < LEAST:
         return None
     return SharedSteps(aligned(means, factors, logits, colors))

@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, U, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, U, iterations
 
 KERNEL = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
@@ -22,11 +22,11 @@ f32: Any = np.float32
 
 
 @parallel_kernel("f4:3 f4:1 f4:3", fastmath=True, error_model="numpy")
-def blur(part: Part, planes: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+def blur(thread: ThreadSlice, planes: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
     """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border."""
     n, h, w = planes.shape
     r = kernel.shape[0] // 2
-    for job in turns_of(part, n * h):
+    for job in iterations(thread, n * h):
         p, y = job // h, job % h
         line = np.zeros(w + 2 * r, np.float32)
         for i in range(max(r - y, 0), min(2 * r + 1, h + r - y)):
@@ -43,9 +43,9 @@ def blur(part: Part, planes: np.ndarray, kernel: np.ndarray, out: np.ndarray) ->
 
 
 @parallel_kernel(fastmath=True, error_model="numpy")
-def products(part: Part, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    """``out`` (5, h, w): x, y, x^2, y^2, x y of one channel (h, w)."""
-    for row in turns_of(part, x.shape[0]):
+def products(thread: ThreadSlice, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+    """Write x, y, x^2, y^2 and x y of one channel (h, w) into ``out`` (5, h, w)."""
+    for row in iterations(thread, x.shape[0]):
         for col in range(x.shape[1]):
             a, b = x[row, col], y[row, col]
             out[0, row, col], out[1, row, col] = a, b
@@ -53,13 +53,13 @@ def products(part: Part, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
 
 
 @parallel_kernel(fastmath=True, error_model="numpy")
-def slopes(part: Part, blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
-    """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score`` (h,).
+def slopes(thread: ThreadSlice, blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
+    """Write SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its row sums into ``score``.
 
     ``blurred`` (5, h, w): the blurs of `products`.
     """
     c1, c2 = f32(C1), f32(C2)
-    for row in turns_of(part, blurred.shape[1]):
+    for row in iterations(thread, blurred.shape[1]):
         total = f32(0)
         for col in range(blurred.shape[2]):
             m, n = blurred[0, row, col], blurred[1, row, col]
@@ -78,23 +78,31 @@ def slopes(part: Part, blurred: np.ndarray, out: np.ndarray, score: np.ndarray) 
 
 @parallel_kernel(fastmath=True, error_model="numpy")
 def add_gradient(
-    part: Part, blurred: np.ndarray, x: np.ndarray, y: np.ndarray, scale: np.float32, channel: int, grad: np.ndarray
+    thread: ThreadSlice,
+    blurred: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    scale: np.float32,
+    channel: int,
+    grad: np.ndarray,
 ) -> None:
-    """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM.
+    """Add ``scale`` times the gradient of the sum of SSIM to one channel of ``grad`` (h, w, 4).
 
     ``blurred`` (3, h, w): the blurs of `slopes`; ``x``, ``y`` (h, w) the channel of picture and target.
     """
-    for row in turns_of(part, x.shape[0]):
+    for row in iterations(thread, x.shape[0]):
         for col in range(x.shape[1]):
             slope = blurred[0, row, col] + f32(2) * x[row, col] * blurred[1, row, col]
             grad[row, col, channel] += scale * (slope + y[row, col] * blurred[2, row, col])
 
 
 def add_ssim_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad: np.ndarray) -> float:
-    """``grad`` += gradient of ``weight`` x sum over pixels and RGB of (1 - SSIM); returns the mean SSIM.
+    """Add the gradient of ``weight`` x the sum over pixels and RGB of (1 - SSIM) to ``grad``; return the mean SSIM.
 
     Args:
-        image, target: (h, w, 4) float32.
+        image: (h, w, 4) float32 premultiplied, as drawn.
+        target: (h, w, 4) float32.
+        weight: of the term in the loss.
         grad: (h, w, 4) float32.
     """
     h, w = image.shape[:2]

@@ -1,4 +1,4 @@
-"""What is descended on: a state renders itself, takes steps, and can be put back to where it was."""
+"""States of gradient descent: a state renders itself, takes steps, and can be put back to where it was."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
-from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors, seen_colors
+from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
@@ -27,19 +27,19 @@ GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/ligh
 
 
 def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
-    """The harmonics, where there are any: the last of a state's arrays."""
+    """Return the harmonics, where there are any: the last of a state's arrays."""
     return arrays[index] if len(arrays) > index else None
 
 
 def _has_harmonics(harmonics: np.ndarray | None) -> bool:
-    """Whether the highest degree of ``harmonics`` (K, M, 3), which has most of them, holds something."""
+    """Return whether the highest degree of ``harmonics`` (K, M, 3), which has most of them, holds something."""
     if harmonics is None:
         return False
     degree = math.isqrt(harmonics.shape[1] + 1) - 1
     return bool(harmonics[:, degree**2 - 1 :].any())
 
 
-class OwnFrame:
+class OwnAxes:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
@@ -59,7 +59,7 @@ class OwnFrame:
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA, free: np.ndarray | None = None
     ) -> None:
-        """``free`` (K,) bool: those that move; None: all."""
+        """Keep only ``free`` (K,) bool moving; None: all."""
         scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
         self.arrays: tuple[np.ndarray, ...] = (
@@ -83,10 +83,11 @@ class OwnFrame:
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
     def colors_from(self, camera: Camera) -> np.ndarray:
-        """(K, 3) colours as the camera sees them, which may be negative."""
+        """Return (K, 3) colours as the camera sees them, which may be negative."""
         return seen_colors(self.arrays[0], self.arrays[3], _last(self.arrays, 4), camera.position)
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        """Return the projection of the current Gaussians, by ``rule``."""
         means, factors, logits = self.arrays[:3]
         return project_factors(means, factors, logits, camera, rule)
 
@@ -100,16 +101,16 @@ class OwnFrame:
         share: float,
         speed: float,
     ) -> None:
-        """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
+        """Take one step; ``error``: RMS of pictures so far, ``share`` completed, ``speed``: a factor of rates."""
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
-        slopes = own_frame_backward(means, factors, seen, camera, projection, pairs, harmonics)
+        slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         self.step += 1
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         rates = self.RATES * self.OWN * pace if self.weakest else self.RATES * pace
-        steps.own_frame(
+        steps.own_axes(
             slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
@@ -124,7 +125,7 @@ class OwnFrame:
                 array[self.fixed] = there
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
+        """Return what is added to Adam's divisors, features and shared weights; from slopes ``rows`` (COUNT, K)."""
         if not self.weakest:
             return np.full(len(rows), EPSILON, np.float32), *NONE
         every, count = sample_of(rows.shape[1])
@@ -139,7 +140,7 @@ class OwnFrame:
         return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on, beside what is made of the start again."""
+        """Return all that the next steps depend on and that the start does not give again."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
         named |= {f"running_{i}": array for i, array in enumerate(self.running)}
         named |= self.shared.saved() if self.shared is not None else {}
@@ -155,7 +156,7 @@ class OwnFrame:
             self.shared.restore(saved)
 
     def gaussians(self) -> Gaussians:
-        """As a file has them: principal axes of ``M M^T``."""
+        """Return Gaussians as a file has them: principal axes of ``M M^T``."""
         from vvgt_cli.closed_form.pyramid import principal_axes
         from vvgt_cli.closed_form.shape import quaternions
 
@@ -175,15 +176,17 @@ class Fields:
     STEADY = True
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        """Begin at ``gaussians``, with moments of 0."""
         self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in gaussians.arrays().values())
         self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
         self.step = 0
 
     def colors_from(self, camera: Camera) -> np.ndarray:
-        """(K, 3) colours as the camera sees them, which may be negative."""
+        """Return (K, 3) colours as the camera sees them, which may be negative."""
         return seen_colors(self.arrays[0], self.arrays[4], _last(self.arrays, 5), camera.position)
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        """Return the projection of the current Gaussians, by ``rule``."""
         return project(self.gaussians(), camera, rule)
 
     def descend(
@@ -196,14 +199,14 @@ class Fields:
         share: float,
         speed: float,
     ) -> None:
-        """One step; the error does not matter, nor does the schedule: 3DGS' rates are constant over so few steps."""
+        """Take one step; error and schedule do not matter: 3DGS' rates are constant over so few steps."""
         seen = self.colors_from(camera)
         self.update(camera, projection, moments(projection, seen, image, grad), seen, self.RATES)
 
     def update(
         self, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray, rates: Sequence[float]
     ) -> None:
-        """Adam with ``rates`` for the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
+        """Apply Adam with ``rates`` to the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.step += 1
@@ -214,7 +217,7 @@ class Fields:
             steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on."""
+        """Return all that the next steps depend on."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
         for i, (first, second) in enumerate(self.running):
             named |= {f"first_{i}": first, f"second_{i}": second}
@@ -227,7 +230,8 @@ class Fields:
         self.step = int(saved["step"])
 
     def gaussians(self) -> Gaussians:
+        """Return the current Gaussians."""
         return Gaussians(*self.arrays)
 
 
-State = OwnFrame | Fields
+State = OwnAxes | Fields

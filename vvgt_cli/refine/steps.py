@@ -1,4 +1,4 @@
-"""Numba kernels of the steps: Adam in each Gaussian's own frame, and Adam on the fields of `Gaussians`."""
+"""Numba kernels of the steps: Adam along each Gaussian's own axes, and Adam on the fields of `Gaussians`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 from vvgt_cli.splat.lanes import LANES, U
 
 f32: Any = np.float32
@@ -24,21 +24,21 @@ _jit = inlined(error_model="numpy")  # a division that could raise is none of ve
 
 @_jit
 def _clip(value: float, bound: float) -> float:
-    """``value`` within +-``bound``."""
+    """Limit ``value`` to +-``bound``."""
     return min(max(value, -bound), bound)
 
 
 @_jit
 def _turn(
-    slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, ways: tuple[float, ...],
+    slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, betas: tuple[float, ...],
     floors: np.ndarray, buf: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
+    """Write Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
-    ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
+    ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``betas`` beta1, beta2
     and what undoes their start from zero; ``floors`` (COUNT,) are added to the divisors.
     """
-    beta1, beta2, fix1, fix2 = ways
+    beta1, beta2, fix1, fix2 = betas
     start, lanes = U(begin), U(count)
     for field in range(U(COUNT)):
         for i in range(lanes):
@@ -75,7 +75,7 @@ def _share(features: np.ndarray, chunk: int, weights: np.ndarray, known: np.ndar
 
 @_jit
 def _gain(buf: np.ndarray, at: int, spread: float) -> float:
-    """How much further an axis may go than a long one: a column of M, from ``at`` on.
+    """Return how much further an axis may go than a long one: a column of M, from ``at`` on.
 
     The dilation, of variance ``spread``, hides part of its step.
     """
@@ -85,7 +85,7 @@ def _gain(buf: np.ndarray, at: int, spread: float) -> float:
 
 @_jit
 def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], spread: float) -> None:
-    """What is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
+    """Write what is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
     r0, r1, r2 = rates
     c0, c1 = clips
     for i in range(U(LANES)):
@@ -113,30 +113,30 @@ def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], s
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2")
-def own_frame(
-    part: Part,
+def own_axes(
+    thread: ThreadSlice,
     slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
     second: np.ndarray, floors: np.ndarray, features: np.ndarray, weights: np.ndarray,
 ) -> None:  # fmt: skip
-    """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
+    """Step mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
-    Gradients ``slopes`` (COUNT, K) as `FrameGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
+    Gradients ``slopes`` (COUNT, K) as `AxesGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
     (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
     logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the
     least that a colour becomes. ``floors`` (COUNT,) are added to Adam's divisors, and to its directions those of
     ``weights`` (KNOWN, FEATURES) for the ``features`` (blocks or none, FEATURES, LANES) of each Gaussian.
     """
-    ways = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    betas = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
     by_logit, by_color, farthest = f32(rates[3]), f32(rates[4]), f32(clips[1])
     hidden, least, total = f32(spread), f32(darkest), means.shape[0]
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.ones((COUNT + 9) * LANES, np.float32)
-        _turn(slopes, begin, count, first, second, ways, floors, buf)
+        _turn(slopes, begin, count, first, second, betas, floors, buf)
         if chunk < features.shape[0]:
             _share(features, chunk, weights, np.empty(FEATURES * LANES, np.float32), buf)
         for i in range(count):
@@ -156,16 +156,16 @@ def own_frame(
 
 @parallel_kernel("f4:2 f4:2 f4:2 f8 f8 i8 i8 f4:2 f4:2", error_model="numpy")
 def adam_sizes(
-    part: Part, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, step: int,
-    every: int, towards: np.ndarray, sizes: np.ndarray,
+    thread: ThreadSlice, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float,
+    step: int, every: int, towards: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
-    """Numerators ``towards`` (COUNT, n) and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
+    """Write numerators ``towards`` and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
 
     Of one in ``every`` runs of `RUN` Gaussians, in that order; ``slopes`` (COUNT, K) are new, ``first``, ``second``
     (COUNT, K) the running moments without them.
     """
     b1, b2, fix1, fix2 = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
-    for row in turns_of(part, COUNT):
+    for row in iterations(thread, COUNT):
         for begin in range(0, sizes.shape[1], RUN):
             for i in range(U(begin), U(min(begin + RUN, sizes.shape[1]))):
                 k = i + U(begin * (every - 1))
@@ -176,13 +176,13 @@ def adam_sizes(
 
 @parallel_kernel("f4:2 f8:1 f8 f4:2 f4:1", error_model="numpy")
 def adam_directions(
-    part: Part, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
+    thread: ThreadSlice, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
 ) -> None:
-    """``towards`` divided by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
+    """Divide ``towards`` by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
 
     ``floors`` (COUNT,): ``weakest`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
     """
-    for row in turns_of(part, COUNT):
+    for row in iterations(thread, COUNT):
         bound, total = f32(most[row]), 0.0
         for i in range(sizes.shape[1]):
             size = sizes[row, i]
@@ -194,13 +194,13 @@ def adam_directions(
 
 
 @parallel_kernel("f4:2 f4:2 f8 f4:2")
-def regress(part: Part, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
-    """``weights`` (KNOWN, FEATURES) = ``gain`` times ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
+def regress(thread: ThreadSlice, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
+    """Write ``weights`` (KNOWN, FEATURES): ``gain`` x ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
 
     Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
     """
     whole = directions.shape[1] // LANES * LANES
-    for f in turns_of(part, FEATURES):
+    for f in iterations(thread, FEATURES):
         sums = np.empty(LANES, np.float32)
         for row in range(KNOWN):
             field = row if row < 6 else row + 3
@@ -219,17 +219,17 @@ def regress(part: Part, solver: np.ndarray, directions: np.ndarray, gain: float,
 
 @parallel_kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", error_model="numpy")
 def adam(
-    part: Part,
+    thread: ThreadSlice,
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
     second: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adam (Kingma and Ba 2015) on ``values`` (n,) in place; ``step`` counts from 1.
+    """Apply Adam (Kingma and Ba 2015) to ``values`` (n,) in place; ``step`` counts from 1.
 
     ``slopes`` (n,) gradient, ``first``, ``second`` (n,) its running moments.
     """
     fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     b1, b2, pace = f32(beta1), f32(beta2), f32(rate)
-    for i in turns_of(part, values.shape[0]):
+    for i in iterations(thread, values.shape[0]):
         m = b1 * first[i] + (ONE - b1) * slopes[i]
         v = b2 * second[i] + (ONE - b2) * slopes[i] * slopes[i]
         first[i], second[i] = m, v

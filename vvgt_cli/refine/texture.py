@@ -3,7 +3,7 @@
 Cells of the pyramid stand on a lattice, and on a smooth face the eye sees its weave long before squared errors do.
 With e the error less its blur, and v the view's variance under the same window, the term is ``sum e^2 C / (C + v)``:
 all of it where the view is smooth, next to nothing of it at edges. It is linear in the error, so that its gradient is
-the same blur once more. SSIM does so too, and to the mean brightness, which costs edges (docs/log/closed-form.md).
+the same blur again. SSIM does so too, and to the mean brightness, which costs edges (docs/log/closed-form.md).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 from vvgt_cli.refine.ssim import KERNEL, blur
 
 f32: Any = np.float32
@@ -21,10 +21,12 @@ SMOOTH = 4e-3  # C, variance of a channel: edges of an eighth of the range and m
 
 
 def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad: np.ndarray) -> float:
-    """``grad`` += gradient of ``weight`` x the term over pixels and RGB; returns the term's sum, unweighted.
+    """Add the gradient of ``weight`` x the term over pixels and RGB to ``grad``; return the term's unweighted sum.
 
     Args:
-        image, target: (h, w, 4) float32 premultiplied.
+        image: (h, w, 4) float32 premultiplied, as drawn.
+        target: (h, w, 4) float32 premultiplied.
+        weight: of the term in the loss.
         grad: (h, w, 4) float32; alpha is left alone.
     """
     h, w = image.shape[:2]
@@ -39,9 +41,9 @@ def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, g
 
 
 @parallel_kernel("f4:3 f4:3 f4:3")
-def part_planes(part: Part, image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
-    """Error of each channel, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
-    for y in turns_of(part, image.shape[0]):
+def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
+    """Write each channel's error, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
+    for y in iterations(thread, image.shape[0]):
         for x in range(image.shape[1]):
             square = f32(0)
             for c in range(3):
@@ -53,13 +55,13 @@ def part_planes(part: Part, image: np.ndarray, target: np.ndarray, planes: np.nd
 
 
 @parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")
-def weigh(part: Part, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray) -> None:
-    """Errors less their blur, times C / (C + v), replace the first three ``planes`` (7, h, w).
+def weigh(thread: ThreadSlice, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray) -> None:
+    """Replace the first three ``planes`` (7, h, w) by the errors less their blur, times C / (C + v).
 
     ``blurred`` (7, h, w) is the blur of what `part_planes` gave; ``sums`` (h,) gets the term's sum of each row.
     """
     smooth, third = f32(SMOOTH), f32(1 / 3)
-    for y in turns_of(part, planes.shape[1]):
+    for y in iterations(thread, planes.shape[1]):
         total = 0.0
         for x in range(planes.shape[2]):
             b0, b1, b2 = blurred[3, y, x], blurred[4, y, x], blurred[5, y, x]
@@ -73,10 +75,10 @@ def weigh(part: Part, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray)
 
 
 @parallel_kernel("f4:3 f4:3 f8 f4:3")
-def add_fine(part: Part, planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
-    """``grad`` (h, w, 4) += 2 ``weight`` x the first three ``planes`` less their blur ``blurred``."""
+def add_fine(thread: ThreadSlice, planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
+    """Add 2 ``weight`` x the first three ``planes`` less their blur ``blurred`` to ``grad`` (h, w, 4)."""
     factor = f32(2 * weight)
-    for y in turns_of(part, grad.shape[0]):
+    for y in iterations(thread, grad.shape[0]):
         for x in range(grad.shape[1]):
             for c in range(3):
                 grad[y, x, c] += factor * (planes[c, y, x] - blurred[c, y, x])

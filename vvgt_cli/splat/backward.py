@@ -14,8 +14,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, take_turn, turns_of
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -39,6 +38,7 @@ from vvgt_cli.splat.buffer import (
     fetch,
     fetch_colors,
     open_tile,
+    prefetch,
     tile_jit,
 )
 from vvgt_cli.splat.kernel import rotate, rotation_column, to_camera, unit_quaternion
@@ -64,7 +64,7 @@ _exact = inlined()
 
 @tile_jit
 def _sweep(fetched: np.ndarray, at: int, rule: tuple[float, ...], buf: np.ndarray, sums: np.ndarray) -> None:
-    """The Gaussian at ``at``: sums a column into the seven rows of ``sums`` (7 x TILE,)."""
+    """Add up a column's terms of the Gaussian at ``at`` into the seven rows of ``sums`` (7 x TILE,)."""
     a, b, c, u, v = fetched[at], fetched[at + U(1)], fetched[at + U(2)], fetched[at + U(3)], fetched[at + U(4)]
     opacity = fetched[at + U(5)]
     red, green, blue = max(fetched[at + RED], ZERO), max(fetched[at + GREEN], ZERO), max(fetched[at + BLUE], ZERO)
@@ -106,7 +106,7 @@ def _moments_tile(
     entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray, ox: int, oy: int,
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``.
+    """Write the nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``.
 
     Rows lie far apart in memory, and a store that waits for its line would hold up the next Gaussian's loads from the
     stack: those of a chunk are written together.
@@ -152,18 +152,18 @@ def _moments_tile(
     error_model="numpy",
 )
 def moments(
-    part: Part,
+    thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     colors: np.ndarray, tiles_x: int, rule: np.ndarray, image: np.ndarray, grad: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
+    """Write each (tile, Gaussian) pair's nine `SUMS` into ``pairs`` (n, 9) float32.
 
     ``image`` (h, w, 4) float32 is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image),
     float32.
     """
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    index = take_turn(part)
+    index = next_iteration(thread)
     while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -180,7 +180,7 @@ def moments(
                 buf[U(AREA + y * TILE + x)] = behind
         span = slice(start[tile], start[tile + 1])
         _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, way, buf, pairs)
-        index = take_turn(part)
+        index = next_iteration(thread)
 
 
 @_exact
@@ -198,7 +198,7 @@ def _total(first: np.ndarray, pairs: np.ndarray, k: int) -> tuple[float, ...]:
 def _screen(
     flat: np.ndarray, k: int, total: tuple[float, ...], dilation: float, compensate: float
 ) -> tuple[float, ...]:
-    """`screen_slope` of Gaussian k."""
+    """Return `screen_slope` of Gaussian k."""
     return screen_slope(
         np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4]), total[0], total[1], total[2], total[3],
         total[4], total[5], dilation, compensate,
@@ -206,9 +206,9 @@ def _screen(
 
 
 @parallel_kernel()
-def screen(part: Part, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
-    """Length of the gradient with respect to each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
-    for k in turns_of(part, flat.shape[0]):
+def screen(thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
+    """Write the length of the gradient by each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
+    for k in iterations(thread, flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
             total = _total(first, pairs, k)
@@ -221,7 +221,7 @@ def _colors_and_logit(
     k: int, flat: np.ndarray, colors: np.ndarray, total: tuple[float, ...], out_logits: np.ndarray,
     out_colors: np.ndarray,
 ) -> None:  # fmt: skip
-    """Row k of ``out_logits`` (K,) and ``out_colors`` (K, 3), float32."""
+    """Write row k of ``out_logits`` (K,) and ``out_colors`` (K, 3), float32."""
     out_logits[k] = total[0] * (1.0 - flat[k, 6])
     out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
     out_colors[k, 1] = total[7] if colors[k, 1] >= 0.0 else 0.0
@@ -232,7 +232,7 @@ def _colors_and_logit(
 def _load_slope(
     buf: np.ndarray, i: int, k: int, flat: np.ndarray, means: np.ndarray, factors: np.ndarray, total: tuple[float, ...]
 ) -> None:
-    """Gaussian k into lane i, for `slope_lanes`."""
+    """Load Gaussian k into lane i, for `slope_lanes`."""
     load_place(buf, U(i), k, means, factors)
     for f in range(3):
         buf[U((CONIC + f) * LANES + i)] = flat[k, 2 + f]
@@ -241,18 +241,18 @@ def _load_slope(
 
 
 @parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2")
-def own_frame(
-    part: Part,
+def own_axes(
+    thread: ThreadSlice,
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
     colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
+    """Write gradients for steps along each Gaussian's own axes: mu += M d, M <- M (I + E), E symmetric.
 
     ``out`` (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for
     both), opacity logit, colour (3). Every row is written.
     """
     count, pose, way = means.shape[0], pose_of(rot, trans), (lens[0], lens[1])
-    for chunk in turns_of(part, (count + LANES - 1) // LANES):
+    for chunk in iterations(thread, (count + LANES - 1) // LANES):
         begin, end = chunk * LANES, min((chunk + 1) * LANES, count)
         buf, seen = np.ones(SLOPED * LANES), np.zeros(LANES, np.bool_)
         for k in range(begin, end):
@@ -277,7 +277,7 @@ def own_frame(
 def _column(
     turn: tuple[float, ...], i: int, log_scale: float, rot: np.ndarray, slopes: tuple[float, ...]
 ) -> tuple[float, tuple[float, float, float], tuple[float, float, float, float]]:
-    """Of axis i: the gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
+    """Return axis i's gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
     jx, jy, jxz, jyz, h00, h01, h11 = slopes
     w, a, b, c = turn
     v0, v1, v2 = rotate(rot, *rotation_column(w, a, b, c, i))
@@ -300,7 +300,7 @@ def _quaternion(
     w: float, a: float, b: float, c: float, n: float, c0: tuple[float, float, float], c1: tuple[float, float, float],
     c2: tuple[float, float, float], out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Gradient with respect to a quaternion of any norm, from those of its rotation's columns."""
+    """Return the gradient by a quaternion of any norm, from those of its rotation's columns."""
     gw = 2 * (a * (c1[2] - c2[1]) + b * (c2[0] - c0[2]) + c * (c0[1] - c1[0]))
     ga = 2 * (w * (c1[2] - c2[1]) + b * (c1[0] + c0[1]) + c * (c2[0] + c0[2]) - 2 * a * (c1[1] + c2[2]))
     gb = 2 * (w * (c2[0] - c0[2]) + a * (c1[0] + c0[1]) + c * (c2[1] + c1[2]) - 2 * b * (c0[0] + c2[2]))
@@ -316,14 +316,14 @@ def _quaternion(
 
 @parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2")
 def standard(
-    part: Part, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
+    thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
     log_scales: np.ndarray, quats: np.ndarray, colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, out_means: np.ndarray, out_scales: np.ndarray, out_quats: np.ndarray, out_logits: np.ndarray,
     out_colors: np.ndarray,
 ) -> None:  # fmt: skip
-    """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
+    """Write gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
     fx, fy = lens[0], lens[1]
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         out_means[k] = 0.0
         out_scales[k] = 0.0
         out_quats[k] = 0.0

@@ -18,10 +18,12 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba import types
 
 from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.jit.decorators import inlined
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.decorators import inlined, intrinsic
+from vvgt_cli.jit.numba_internals import BYTE, CODE, config, get_or_insert_function
 
 f32: Any = np.float32  # its sums are float here: numba keeps them float32
 U: Any = nb.uint64
@@ -42,11 +44,29 @@ _EXP: tuple[float, ...] = tuple(
 tile_jit = inlined(fastmath=True, error_model="numpy")
 
 
+def _prefetch(typingctx: Any, rows: Any, index: Any, column: Any) -> Any:
+    """Ask for the cache line of ``rows[index, column]``, a C-contiguous array (n, m); both in range, not negative."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        width = builder.extract_value(array.shape, 1)
+        at = builder.gep(array.data, [builder.add(builder.mul(args[1], width), args[2])])
+        kind = ir.FunctionType(ir.VoidType(), [BYTE, CODE, CODE, CODE])
+        ask = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(ask, [builder.bitcast(at, BYTE), CODE(0), CODE(3), CODE(1)])  # for reading, to be kept, data
+        return context.get_dummy_value()
+
+    return types.void(rows, types.int64, types.int64), codegen
+
+
+prefetch: Any = (lambda rows, index, column: None) if config.DISABLE_JIT else intrinsic(_prefetch)
+
+
 @tile_jit
 def fetch(
     entries: np.ndarray, begin: int, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int, fetched: np.ndarray
 ) -> int:
-    """Entries from ``begin`` on, at most `CHUNK`, into ``fetched`` (CHUNK x FIELDS,), without colours; their number."""
+    """Copy up to `CHUNK` entries from ``begin`` into ``fetched`` (CHUNK x FIELDS,), no colours; return their number."""
     count: int = min(CHUNK, entries.shape[0] - begin)
     s, left, top = f32(-0.125), f32(ox), f32(oy)
     for i in range(count):
@@ -69,7 +89,7 @@ def fetch(
 
 @tile_jit
 def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray, fetched: np.ndarray) -> None:
-    """The colours of ``count`` entries from ``begin`` on into their places of ``fetched``."""
+    """Copy the colours of ``count`` entries from ``begin`` on into their places of ``fetched``."""
     for i in range(count):
         k, at = entries[begin + i], U(i) * FIELDS
         fetched[at + RED] = colors[k, 0]
@@ -83,7 +103,7 @@ def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray
 def alpha_at(
     dx: float, a: float, h: float, q: float, opacity: float, floor: float, factor: float, offset: float
 ) -> float:
-    """Opacity of a pixel at dx, neither clamped nor cut; 0 beyond the rule's reach.
+    """Return a pixel's opacity at dx, neither clamped nor cut; 0 beyond the rule's reach.
 
     ``h`` = b dy and ``q`` = c dy^2 of its row; ``floor``, ``factor``, ``offset`` of the rule.
     """
@@ -98,14 +118,14 @@ def alpha_at(
 
 @tile_jit
 def open_tile(buf: np.ndarray, width: int, height: int) -> None:
-    """Transmittance 1 where the tile lies inside the image; pixels outside have ended from the start."""
+    """Set transmittance 1 where the tile lies inside the image; pixels outside have ended from the start."""
     for j in range(PLANE_1):
         buf[j] = f32(1) if j % U(TILE) < width and j // U(TILE) < height else f32(-1)
 
 
 @tile_jit
 def all_ended(buf: np.ndarray) -> bool:
-    """Whether no pixel of the tile is open."""
+    """Return whether no pixel of the tile is open."""
     top: float = f32(-1)
     for j in range(PLANE_1):
         top = max(top, buf[j])

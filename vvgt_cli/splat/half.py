@@ -11,10 +11,11 @@ from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def halved(cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> tuple[list[Camera], np.ndarray, Rule]:
-    """Views averaged 2 x 2 where their sides are even, and the rule that stands for the standard one there.
+    """Average views 2 x 2 where their sides are even; return them and the rule that stands for the standard one.
 
     Args:
-        cameras, images: (n, h, w, c) float32.
+        cameras: of the views.
+        images: (n, h, w, c) float32.
         rule: by which these are drawn.
     """
     h, w = images.shape[1:3]

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.harmonics import term_slopes, terms
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 _LARGEST = float(np.finfo(np.float32).max)
 _jit = inlined()
@@ -21,7 +21,7 @@ _terms, _term_slopes = _jit(terms), _jit(term_slopes)
 
 @_jit
 def _toward(means: np.ndarray, k: int, eye: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit direction from the eye to Gaussian k, and 1 / distance; zeros for one at the eye."""
+    """Return the unit direction from the eye to Gaussian k, and 1 / distance; zeros for one at the eye."""
     x, y, z = means[k, 0] - eye[0], means[k, 1] - eye[1], means[k, 2] - eye[2]
     square = x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
@@ -30,10 +30,10 @@ def _toward(means: np.ndarray, k: int, eye: np.ndarray) -> tuple[float, float, f
 
 @parallel_kernel("f4:2 f4:2 f4:3 f8:1 f4:2")
 def view_colors(
-    part: Part, means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray
+    thread: ThreadSlice, means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray
 ) -> None:
-    """Colours (K, 3) float32 as they are seen from the eye into ``out``; not more than float32 holds."""
-    for k in turns_of(part, means.shape[0]):
+    """Write colours (K, 3) float32 as seen from the eye into ``out``, limited to what float32 holds."""
+    for k in iterations(thread, means.shape[0]):
         x, y, z, _ = _toward(means, k, eye)
         found = _terms(x, y, z)
         for c in range(3):
@@ -45,7 +45,7 @@ def view_colors(
 
 @parallel_kernel("f4:2 f4:3 f8:1 f4:2 f4:3 f4:2")
 def view_slopes(
-    part: Part,
+    thread: ThreadSlice,
     means: np.ndarray,
     harmonics: np.ndarray,
     eye: np.ndarray,
@@ -53,11 +53,11 @@ def view_slopes(
     out_harmonics: np.ndarray,
     out_means: np.ndarray,
 ) -> None:
-    """Gradients with respect to ``harmonics`` and, through the direction, to ``means``, float32 of their shapes.
+    """Write gradients by ``harmonics`` and, through the direction, by ``means``, float32 of their shapes.
 
     ``slopes`` (K, 3) float32 is the gradient with respect to the colours that are seen.
     """
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         if slopes[k, 0] == 0.0 and slopes[k, 1] == 0.0 and slopes[k, 2] == 0.0:
             out_harmonics[k] = 0.0
             out_means[k] = 0.0
@@ -79,12 +79,12 @@ def view_slopes(
 
 
 @parallel_kernel("f4:2 f8:1 f8:2 f8:3")
-def deposit(part: Part, means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    """Adjoint of `view_colors`: ``out`` (K, 1 + M, 3) float64 += each term of a colour, 1 first, times ``values``.
+def deposit(thread: ThreadSlice, means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    """Apply `view_colors`' adjoint: ``out`` (K, 1 + M, 3) float64 += each term of a colour, 1 first, x ``values``.
 
     ``values`` (K, 3) float64.
     """
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         if values[k, 0] == 0.0 and values[k, 1] == 0.0 and values[k, 2] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)
@@ -96,9 +96,11 @@ def deposit(part: Part, means: np.ndarray, eye: np.ndarray, values: np.ndarray, 
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f4:3")
-def deposit_squares(part: Part, means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
-    """``out`` (K, 1 + M, 1 + M) float32 += ``weights`` (K,) float64 times the products of two terms of a colour."""
-    for k in turns_of(part, means.shape[0]):
+def deposit_squares(
+    thread: ThreadSlice, means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray
+) -> None:
+    """Add ``weights`` (K,) float64 times products of two colour terms to ``out`` (K, 1 + M, 1 + M) float32."""
+    for k in iterations(thread, means.shape[0]):
         if weights[k] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)

@@ -15,8 +15,8 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.threads import ThreadSlice, iterations
+from vvgt_cli.splat.buffer import prefetch
 from vvgt_cli.splat.lanes import (
     LANES,
     OPACITY,
@@ -37,7 +37,7 @@ AHEAD = 16  # Gaussians whose boxes are asked for before they are read: in the o
 
 @_jit
 def to_camera(means: np.ndarray, k: int, rot: np.ndarray, trans: np.ndarray) -> tuple[float, float, float]:
-    """Gaussian k's centre in camera coordinates, float64."""
+    """Return Gaussian k's centre in camera coordinates, float64."""
     m0, m1, m2 = np.float64(means[k, 0]), np.float64(means[k, 1]), np.float64(means[k, 2])
     return (
         rot[0, 0] * m0 + rot[0, 1] * m1 + rot[0, 2] * m2 + trans[0],
@@ -48,7 +48,7 @@ def to_camera(means: np.ndarray, k: int, rot: np.ndarray, trans: np.ndarray) -> 
 
 @_jit
 def unit_quaternion(quats: np.ndarray, k: int) -> tuple[float, ...]:
-    """Row k of ``quats`` (K, 4) divided by its norm, and 1 / norm, float64."""
+    """Return row k of ``quats`` (K, 4) divided by its norm, and 1 / norm, float64."""
     w, a, b, c = np.float64(quats[k, 0]), np.float64(quats[k, 1]), np.float64(quats[k, 2]), np.float64(quats[k, 3])
     n = 1.0 / math.sqrt(w * w + a * a + b * b + c * c)
     return w * n, a * n, b * n, c * n, n
@@ -56,7 +56,7 @@ def unit_quaternion(quats: np.ndarray, k: int) -> tuple[float, ...]:
 
 @_jit
 def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[float, float, float]:
-    """Column ``axis`` of the rotation matrix of a unit quaternion."""
+    """Return column ``axis`` of the rotation matrix of a unit quaternion."""
     if axis == 0:
         return 1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)
     if axis == 1:
@@ -66,7 +66,7 @@ def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[
 
 @_jit
 def rotate(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, float, float]:
-    """``rot`` (3, 3) times a vector."""
+    """Multiply ``rot`` (3, 3) by a vector."""
     return (
         rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2,
         rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2,
@@ -79,7 +79,7 @@ def _finish(
     buf: np.ndarray, begin: int, count: int, pose: tuple[float, ...], lens: np.ndarray, rule: np.ndarray,
     flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
-    """What `project` and `project_factors` do once ``count`` Gaussians from ``begin`` on are in their lanes."""
+    """Project and store ``count`` Gaussians from ``begin`` on, once they are in their lanes."""
     fx, fy, cx, cy, width, height = lens
     dilation, compensate, min_alpha, farthest, min_variance = rule
     way = dilation, compensate, min_alpha, farthest, min_variance
@@ -90,7 +90,7 @@ def _finish(
 
 @_jit
 def _opacity(logits: np.ndarray, k: int) -> float:
-    """Sigmoid of ``logits`` (K,) of Gaussian k, float64."""
+    """Return the sigmoid of ``logits`` (K,) of Gaussian k, float64."""
     opacity: float = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
     return opacity
 
@@ -99,12 +99,13 @@ def _opacity(logits: np.ndarray, k: int) -> float:
     "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
 )
 def project(
-    part: Part, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
-    trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+    thread: ThreadSlice, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray,
+    rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray,
+    depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
-    """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``: every row is written."""
+    """Project every Gaussian by EWA into ``flat``, ``depth`` and ``extent``: every row is written."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -123,13 +124,13 @@ def project(
     "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
 )
 def project_factors(
-    part: Part,
+    thread: ThreadSlice,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
-    """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
+    """Apply `project` to covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -172,14 +173,14 @@ def stable_order(keys: np.ndarray) -> np.ndarray:
 
 @parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1")
 def count_pairs(
-    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray
+    thread: ThreadSlice, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray
 ) -> None:
-    """How many Gaussians of each of the stretches of ``order`` lie in each tile: ``fill`` (stretches, tiles), zeros.
+    """Count the Gaussians of each stretch of ``order`` in each tile: ``fill`` (stretches, tiles), zeros before.
 
     ``first`` (K + 1,), zeros, gets in how many tiles each Gaussian lies, at the place behind its own.
     """
     workers, total = fill.shape[0], order.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
@@ -196,12 +197,12 @@ def count_pairs(
 
 @parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1 i4:1 i8:1")
 def file_pairs(
-    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray,
+    thread: ThreadSlice, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray,
     members: np.ndarray, slots: np.ndarray,
 ) -> None:  # fmt: skip
     """Fill ``members`` and ``slots`` of `tile_lists` from each stretch's first place in each tile, ``fill``."""
     workers, total = fill.shape[0], order.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
@@ -219,7 +220,7 @@ def file_pairs(
 
 @kernel("i8:2 i8:1 i8:1")
 def sum_pairs(fill: np.ndarray, first: np.ndarray, start: np.ndarray) -> None:
-    """Counts of `count_pairs` become places: ``fill`` and ``first`` in place, ``start`` (tiles + 1,) is filled."""
+    """Turn counts of `count_pairs` into places: ``fill`` and ``first`` in place, ``start`` (tiles + 1,) is filled."""
     pairs = 0
     for tile in range(fill.shape[1]):
         start[tile] = pairs
@@ -235,7 +236,7 @@ def sum_pairs(fill: np.ndarray, first: np.ndarray, start: np.ndarray) -> None:
 def tile_lists(
     order: np.ndarray, extent: np.ndarray, tiles_x: int, tiles_y: int, workers: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
+    """Return the Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
 
     Each of ``workers`` counts, then files, a stretch of ``order``; the result does not depend on how many there are.
 

@@ -28,13 +28,13 @@ _P7, _P8, _P9, _P10, _P11 = U(7 * LANES), U(8 * LANES), U(9 * LANES), U(10 * LAN
 OPACITY = U(12 * LANES)
 PROJECTED = 17  # planes that a projection uses
 TOTALS, CONIC, SLOPED = 12, 21, 24  # first plane of the pairs' sums and of the conic; planes that a gradient uses
-SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
+SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is skipped
 _lane_jit = inlined(error_model="numpy")  # no fastmath, no order of sums of its own
 
 
 @_lane_jit
 def pose_of(rot: np.ndarray, trans: np.ndarray) -> tuple[float, ...]:
-    """``rot`` (3, 3) and ``trans`` (3,) as 12 numbers."""
+    """Return ``rot`` (3, 3) and ``trans`` (3,) as 12 numbers."""
     return (
         rot[0, 0], rot[0, 1], rot[0, 2], rot[1, 0], rot[1, 1], rot[1, 2], rot[2, 0], rot[2, 1], rot[2, 2],
         trans[0], trans[1], trans[2],
@@ -43,7 +43,7 @@ def pose_of(rot: np.ndarray, trans: np.ndarray) -> tuple[float, ...]:
 
 @_lane_jit
 def load_place(buf: np.ndarray, j: int, k: int, means: np.ndarray, factors: np.ndarray) -> None:
-    """Centre and M of Gaussian k, from ``means`` (K, 3) and ``factors`` (K, 3, 3), into lane j of planes 0 to 11."""
+    """Load Gaussian k's centre and M from ``means`` (K, 3), ``factors`` (K, 3, 3) into lane j of planes 0 to 11."""
     buf[j], buf[j + _P1], buf[j + _P2] = means[k, 0], means[k, 1], means[k, 2]
     buf[j + _P3], buf[j + _P4], buf[j + _P5] = factors[k, 0, 0], factors[k, 0, 1], factors[k, 0, 2]
     buf[j + _P6], buf[j + _P7], buf[j + _P8] = factors[k, 1, 0], factors[k, 1, 1], factors[k, 1, 2]
@@ -52,14 +52,14 @@ def load_place(buf: np.ndarray, j: int, k: int, means: np.ndarray, factors: np.n
 
 @_lane_jit
 def put_column(buf: np.ndarray, j: int, axis: int, column: tuple[float, float, float], scale: float) -> None:
-    """Column ``axis`` of M, ``scale`` times a column of a rotation, into lane j."""
+    """Put column ``axis`` of M, ``scale`` times a column of a rotation, into lane j."""
     at = U(j) + U(axis) * _P1
     buf[at + _P3], buf[at + _P6], buf[at + _P9] = column[0] * scale, column[1] * scale, column[2] * scale
 
 
 @_lane_jit
 def _centre(buf: np.ndarray, i: int, pose: tuple[float, ...]) -> tuple[float, float, float]:
-    """Lane i's centre in camera coordinates."""
+    """Return lane i's centre in camera coordinates."""
     m0, m1, m2 = buf[i], buf[i + _P1], buf[i + _P2]
     return (
         pose[0] * m0 + pose[1] * m1 + pose[2] * m2 + pose[9],
@@ -72,7 +72,7 @@ def _centre(buf: np.ndarray, i: int, pose: tuple[float, ...]) -> tuple[float, fl
 def _axis(
     buf: np.ndarray, at: int, pose: tuple[float, ...], jx: float, jy: float, jxz: float, jyz: float
 ) -> tuple[float, float, float, float, float]:
-    """A column of W M (3) and of N = J W M (2); ``at`` the lane in the column's plane less 3 planes."""
+    """Return a column of W M (3) and of N = J W M (2); ``at`` the lane in the column's plane less 3 planes."""
     a, b, c = buf[at + _P3], buf[at + _P6], buf[at + _P9]
     v0 = pose[0] * a + pose[1] * b + pose[2] * c
     v1 = pose[3] * a + pose[4] * b + pose[5] * c
@@ -82,7 +82,7 @@ def _axis(
 
 @_lane_jit
 def project_lanes(buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, ...], rule: tuple[float, ...]) -> None:
-    """EWA projection (Zwicker et al. 2001): centre (px), conic and opacity as drawn replace planes 0 to 5.
+    """Project by EWA (Zwicker et al. 2001): centre (px), conic and opacity as drawn replace planes 0 to 5.
 
     Then opacity over the least that is drawn (0 where nothing is seen), sxx, syy (px^2), and depth, in planes 6 to 9.
     Plane `OPACITY` holds what was given.
@@ -118,7 +118,7 @@ def project_lanes(buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, .
 
 @_lane_jit
 def boxes(buf: np.ndarray, farthest: float, width: float, height: float) -> None:
-    """After `project_lanes`: pixel boxes x0, y0, x1, y1 into planes 10, 11, 13, 14, all 0 where nothing is seen."""
+    """Write pixel boxes x0, y0, x1, y1 into planes 10, 11, 13, 14, after `project_lanes`; 0 where nothing is seen."""
     for i in range(U(LANES)):
         ratio = buf[i + _P6]
         buf[i + _P6] = 2.0 * min(math.log(ratio), farthest) if ratio > 0.0 else -1.0
@@ -139,7 +139,7 @@ def boxes(buf: np.ndarray, farthest: float, width: float, height: float) -> None
 def store_projected(
     buf: np.ndarray, begin: int, count: int, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray
 ) -> None:
-    """The first ``count`` lanes into rows from ``begin`` on of ``flat``, ``depth``, ``extent``; 0 where not seen."""
+    """Store the first ``count`` lanes in rows from ``begin`` on of ``flat``, ``depth``, ``extent``; 0 if unseen."""
     for i in range(count):
         k, j = begin + i, U(i)
         x0, y0, x1, y1 = buf[j + _P10], buf[j + _P11], buf[j + OPACITY + _P1], buf[j + OPACITY + _P2]
@@ -157,7 +157,7 @@ def store_projected(
 def slope_lanes(
     buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, ...], dilation: float, compensate: float
 ) -> None:
-    """Back through the projection: gradients of d (3) and E (6) of each lane replace planes 0 to 8.
+    """Differentiate the projection: gradients of d (3) and E (6) of each lane replace planes 0 to 8.
 
     Planes 0 to 11 hold centre and M, those from `TOTALS` on the nine sums of `splat.backward`, those from `CONIC` on
     the conic as drawn.
@@ -188,7 +188,7 @@ def slope_lanes(
 
 @_lane_jit
 def _screen(buf: np.ndarray, total: int, conic: int, dilation: float, compensate: float) -> tuple[float, ...]:
-    """`screen_slope` of the lane whose sums and conic begin at ``total`` and ``conic``."""
+    """Return `screen_slope` of the lane whose sums and conic begin at ``total`` and ``conic``."""
     return screen_slope(
         buf[conic], buf[conic + _P1], buf[conic + _P2], buf[total], buf[total + _P1], buf[total + _P2],
         buf[total + _P3], buf[total + _P4], buf[total + _P5], dilation, compensate,
@@ -200,7 +200,7 @@ def screen_slope(
     a: float, b: float, c: float, t0: float, t1: float, t2: float, t3: float, t4: float, t5: float, dilation: float,
     compensate: float,
 ) -> tuple[float, ...]:  # fmt: skip
-    """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric).
+    """Return gradients by the projected centre (u, v) and the projected covariance (H, symmetric).
 
     Of the conic a, b, c as drawn and the first six of a Gaussian's sums. Where opacity is compensated by
     sqrt(det S / det S'), half of S^-1 - S'^-1 for each part of its gradient is added.
@@ -212,10 +212,10 @@ def screen_slope(
     det = 1.0 / (a * c - b * b)
     sxx, sxy, syy = c * det - dilation, -b * det, a * det - dilation
     own = sxx * syy - sxy * sxy
-    told = (compensate > 0.0) & (own > SINGULAR * det)
-    h00 += 0.5 * t0 * (syy / own - a) if told else 0.0
-    h01 -= 0.5 * t0 * (sxy / own + b) if told else 0.0
-    h11 += 0.5 * t0 * (sxx / own - c) if told else 0.0
+    valid = (compensate > 0.0) & (own > SINGULAR * det)
+    h00 += 0.5 * t0 * (syy / own - a) if valid else 0.0
+    h01 -= 0.5 * t0 * (sxy / own + b) if valid else 0.0
+    h11 += 0.5 * t0 * (sxx / own - c) if valid else 0.0
     return du, dv, h00, h01, h11
 
 
@@ -224,7 +224,7 @@ def centre_slope(
     x: float, y: float, z: float, fx: float, fy: float, du: float, dv: float, d00: float, d02: float, d11: float,
     d12: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Gradient with respect to the centre in camera coordinates; d is the gradient of the Jacobian J."""
+    """Return the gradient by the centre in camera coordinates; d is the gradient of the Jacobian J."""
     inv = 1.0 / z
     jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
     dx = jx * (du - d02 * inv)

@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(K, 4) quaternions (w, x, y, z) of any norm > 0 -> (K, 3, 3) rotation matrices, float64."""
+    """Return rotation matrices (K, 3, 3) float64 of quaternions (K, 4), (w, x, y, z) of any norm > 0."""
     q = np.asarray(quaternions, np.float64)
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     return np.stack(
@@ -28,14 +28,14 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
-    """``R diag(s^2) R^T``, (K, 3, 3) float64, unit-frame lengths squared."""
+    """Return ``R diag(s^2) R^T``, (K, 3, 3) float64, unit-frame lengths squared."""
     factors = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     result: np.ndarray = factors @ factors.transpose(0, 2, 1)
     return result
 
 
 def project(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """EWA projection (Zwicker et al. 2002; Kerbl et al. 2023, eq. 5), float64.
+    """Project Gaussians by EWA (Zwicker et al. 2002; Kerbl et al. 2023, eq. 5), float64.
 
     Returns:
         centres (K, 2) in pixels, covariances (K, 2, 2) in px^2 with the dilation, depths (K,).
@@ -61,7 +61,7 @@ def project(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> tuple[n
 
 
 def layers(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Front to back in order of the centres' depth: Gaussian k, its alpha and the transmittance T in front of it.
+    """Yield, front to back by the centres' depth, Gaussian k, its alpha and the transmittance T in front of it.
 
     Both (height, width) float64; alpha is 0 where nothing is drawn: below the cut, and in pixels that have ended.
     """
@@ -86,7 +86,7 @@ def layers(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator
 
 
 def drawn_opacity(gaussians: Gaussians, flat: np.ndarray, rule: Rule) -> np.ndarray:
-    """(K,) opacity by a rule, given covariances (K, 2, 2) with the dilation: compensated, 0 for what is left out."""
+    """Return (K,) opacity by a rule for dilated covariances (K, 2, 2): compensated, 0 for what is skipped."""
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     if rule.compensate:
         own = np.linalg.det(flat - rule.dilation * np.eye(2))
@@ -95,13 +95,13 @@ def drawn_opacity(gaussians: Gaussians, flat: np.ndarray, rule: Rule) -> np.ndar
 
 
 def weights(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator[tuple[int, np.ndarray]]:
-    """Gaussian k and its weight T alpha, (height, width), front to back."""
+    """Yield Gaussian k and its weight T alpha, (height, width), front to back."""
     for k, alpha, trans in layers(gaussians, camera, rule):
         yield k, trans * alpha
 
 
 def render_reference(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> np.ndarray:
-    """(height, width, 4) float64 premultiplied RGBA; negative colours are 0."""
+    """Render (height, width, 4) float64 premultiplied RGBA; negative colours are 0."""
     colors = np.maximum(view_colors(gaussians, camera.position), 0)
     image = np.zeros((camera.height, camera.width, 4))
     for k, weight in weights(gaussians, camera, rule):
@@ -110,7 +110,7 @@ def render_reference(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -
 
 
 def gather_reference(gaussians: Gaussians, camera: Camera, fields: np.ndarray) -> np.ndarray:
-    """(K, 5) float64 sums over all pixels of w and of w x ``fields`` (4, height, width), w = T alpha."""
+    """Sum w and w x ``fields`` (4, height, width) over all pixels, w = T alpha: (K, 5) float64."""
     out = np.zeros((len(gaussians), 5))
     for k, weight in weights(gaussians, camera):
         out[k, 0] = weight.sum()
@@ -121,7 +121,7 @@ def gather_reference(gaussians: Gaussians, camera: Camera, fields: np.ndarray) -
 def image_gradients(
     gaussians: Gaussians, camera: Camera, grad: np.ndarray, rule: Rule = INRIA
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients with respect to what is on the screen, of a loss whose gradient to the picture is ``grad`` (h, w, 4).
+    """Return gradients by screen quantities of a loss whose gradient by the picture is ``grad`` (h, w, 4).
 
     Back to front: with B the picture behind a splat, seen without what is in front, the picture is
     ``... + T (alpha (c, 1) + (1 - alpha) B)``, so that dL/dalpha = T ((c, 1) - B) . grad.
@@ -160,7 +160,7 @@ def image_gradients(
 def space_gradients(
     gaussians: Gaussians, camera: Camera, centres: np.ndarray, inverses: np.ndarray, rule: Rule = INRIA
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients with respect to means (K, 3) and covariances (K, 3, 3), given those of `image_gradients`."""
+    """Return gradients by means (K, 3) and covariances (K, 3, 3), given those of `image_gradients`."""
     means, spatial = np.zeros((len(gaussians), 3)), np.zeros((len(gaussians), 3, 3))
     points = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
     local = camera.rotation @ covariances(gaussians) @ camera.rotation.T
@@ -184,7 +184,7 @@ def space_gradients(
 def render_backward_reference(
     gaussians: Gaussians, camera: Camera, grad: np.ndarray, rule: Rule = INRIA
 ) -> dict[str, np.ndarray]:
-    """`render_backward` in float64: dL/d(field) for each field of `Gaussians`; ``grad`` (h, w, 4) dL/d(picture)."""
+    """Return `render_backward` in float64: dL/d(field) for each field; ``grad`` (h, w, 4) is dL/d(picture)."""
     centres, inverses, logits, colors = image_gradients(gaussians, camera, grad, rule)
     means, spatial = space_gradients(gaussians, camera, centres, inverses, rule)
     harmonics, through = view_slopes(gaussians, camera.position, colors)
@@ -206,7 +206,7 @@ def render_backward_reference(
 
 
 def rotation_derivatives(unit: np.ndarray) -> np.ndarray:
-    """(K, 4, 3, 3) derivatives of the rotation matrix by w, x, y, z of unit quaternions (K, 4)."""
+    """Return (K, 4, 3, 3) derivatives of the rotation matrix by w, x, y, z of unit quaternions (K, 4)."""
     w, x, y, z = unit.T
     o = np.zeros_like(w)
     tables = (

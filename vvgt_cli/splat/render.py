@@ -39,7 +39,7 @@ class Projection:
 
 
 def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, *, by_distance: bool = False) -> Projection:
-    """EWA projection and tile lists, sorted by depth or ``by_distance``, by a rule, or the rule of that name.
+    """Project by EWA and list tiles, sorted by depth or ``by_distance``, by a rule, or the rule of that name.
 
     ``rule.at(w / W)`` gives, at a camera's size w, what viewers show at size W, at fewer points.
     """
@@ -54,7 +54,7 @@ def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, *, b
 def project_factors(
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera, rule: str | Rule = INRIA
 ) -> Projection:
-    """`project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
+    """Apply `project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
     from vvgt_cli.splat import kernel
 
     return _projected(kernel.project_factors, (means, factors, logits), camera, rule)
@@ -85,13 +85,13 @@ def _projected(
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (3, 3), translation (3,) and lens (fx, fy, cx, cy, width, height) as kernels take them, float64."""
+    """Return rotation (3, 3), translation (3,) and lens (fx, fy, cx, cy, width, height) for kernels, float64."""
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
     return np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.translation), lens
 
 
 def depth_order(depth: np.ndarray) -> np.ndarray:
-    """Stable order of depths (K,) float32 >= 0, whose bits sort as integers."""
+    """Return the stable order of depths (K,) float32 >= 0, whose bits sort as integers."""
     from vvgt_cli.splat import kernel
 
     return kernel.stable_order(depth.view(np.uint32))
@@ -100,7 +100,7 @@ def depth_order(depth: np.ndarray) -> np.ndarray:
 def blend(
     projection: Projection, colors: np.ndarray, height: int, width: int, blocks: Blocks | None = None
 ) -> np.ndarray:
-    """(height, width, 4) float32 premultiplied RGBA, linear in ``colors`` (K, 3) float32, which may be negative.
+    """Blend (height, width, 4) float32 premultiplied RGBA, linear in ``colors`` (K, 3) float32, perhaps negative.
 
     With ``blocks`` zero elsewhere.
     """
@@ -121,7 +121,7 @@ def render(
     projection: Projection | None = None,
     blocks: Blocks | None = None,
 ) -> np.ndarray:
-    """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negative colours are 0.
+    """Render (height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negatives are 0.
 
     ``projection``, where there is one, was made by a rule of its own; with ``blocks`` zero elsewhere.
     """
@@ -132,7 +132,7 @@ def render(
 
 
 def seen_colors(means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray | None, eye: np.ndarray) -> np.ndarray:
-    """(K, 3) float32 colours as they are seen from ``eye`` (3,), which may be negative; others as of `Gaussians`."""
+    """Return (K, 3) float32 colours as seen from ``eye`` (3,), perhaps negative; other arguments as of `Gaussians`."""
     if harmonics is None:
         return colors
     from vvgt_cli.splat import harmonics as kernels
@@ -145,7 +145,7 @@ def seen_colors(means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray | N
 def seen_slopes(
     means: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, slopes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients with respect to harmonics (K, M, 3) and means (K, 3), from those to `seen_colors`; all float32."""
+    """Return gradients by harmonics (K, M, 3) and means (K, 3), from those by `seen_colors`; all float32."""
     from vvgt_cli.splat import harmonics as kernels
 
     by_harmonics, by_means = np.empty_like(harmonics), np.empty_like(means)
@@ -154,7 +154,7 @@ def seen_slopes(
 
 
 def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
-    """Back-project images: ``out`` (K, 5) float64 += sums of w and of w x ``fields`` (4, h, w) float32, w = T alpha."""
+    """Add sums of w and of w x ``fields`` (4, h, w) float32 to ``out`` (K, 5) float64, w = T alpha."""
     from vvgt_cli.splat import tiles
 
     p = projection
@@ -179,14 +179,16 @@ class Gradients:
 def render_backward(
     gaussians: Gaussians, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray
 ) -> Gradients:
-    """Gradients of a loss with respect to Gaussians, given those with respect to their picture.
+    """Return gradients of a loss by Gaussians, given those by their picture.
 
     Zero where the forward pass does not move: a Gaussian that is not seen, an alpha at its clamp 0.99 or below the cut,
     a pixel that has ended, a colour below 0. Steps of the cut and of the order of depths are not differentiated.
 
     Args:
-        gaussians, camera: as given to `render`.
-        projection, image: of the forward pass.
+        gaussians: as given to `render`.
+        camera: as given to `render`.
+        projection: of the forward pass.
+        image: what the forward pass drew, (height, width, 4).
         grad: (height, width, 4) dL/d(image), premultiplied RGBA.
     """
     g = gaussians
@@ -197,7 +199,7 @@ def render_backward(
 def fields_backward(
     gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray
 ) -> Gradients:
-    """`render_backward` from ``pairs``, its `moments`, and the `seen_colors` (K, 3) that they were made with."""
+    """Return `render_backward` from ``pairs``, its `moments`, and the `seen_colors` (K, 3) behind them."""
     from vvgt_cli.splat import backward
 
     g, p = gaussians, projection
@@ -215,7 +217,7 @@ def fields_backward(
 
 
 def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
-    """Length (K,) float64 of the gradient with respect to the projected centre in pixels, from `moments`."""
+    """Return the length (K,) float64 of the gradient by the projected centre in pixels, from `moments`."""
     from vvgt_cli.splat import backward
 
     out = np.zeros(len(projection.flat))
@@ -224,7 +226,7 @@ def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
 
 
 def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:
-    """(pairs, 9) float32: what the gradient needs of each (tile, Gaussian) pair, see `backward.moments`."""
+    """Return (pairs, 9) float32: what the gradient needs of each (tile, Gaussian) pair, see `backward.moments`."""
     from vvgt_cli.splat import backward
 
     p = projection
@@ -237,8 +239,8 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
 
 
 @dataclass(frozen=True)
-class FrameGradients:
-    """Gradients for steps in each Gaussian's own frame, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
+class AxesGradients:
+    """Gradients for steps along each Gaussian's own axes, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
 
     Attributes:
         rows: (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz, one off the diagonal for both
@@ -250,7 +252,7 @@ class FrameGradients:
     harmonics: np.ndarray | None = None
 
 
-def own_frame_backward(
+def own_axes_backward(
     means: np.ndarray,
     factors: np.ndarray,
     colors: np.ndarray,
@@ -258,8 +260,8 @@ def own_frame_backward(
     projection: Projection,
     pairs: np.ndarray,
     harmonics: np.ndarray | None = None,
-) -> FrameGradients:
-    """The gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, all float32.
+) -> AxesGradients:
+    """Return the gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, all float32.
 
     ``projection`` from `project_factors`, ``pairs`` from `moments` with ``colors`` (K, 3): those of `seen_colors` where
     there are ``harmonics`` (K, M, 3).
@@ -267,11 +269,11 @@ def own_frame_backward(
     from vvgt_cli.splat import backward
 
     p, rows = projection, np.empty((13, len(means)), np.float32)
-    backward.own_frame(
+    backward.own_axes(
         p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera), p.rule.projecting(), rows
     )
     if harmonics is None:
-        return FrameGradients(rows)
+        return AxesGradients(rows)
     by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, np.ascontiguousarray(rows[10:].T))
     rows[:3] += np.einsum("kji,kj->ik", factors, by_means)
-    return FrameGradients(rows, by_harmonics)
+    return AxesGradients(rows, by_harmonics)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, take_turn, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -45,7 +45,7 @@ from vvgt_cli.splat.buffer import (
 def _pixel(
     t: float, dx: float, a: float, h: float, q: float, opacity: float, rule: tuple[float, ...]
 ) -> tuple[float, float]:
-    """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus.
+    """Return a pixel's weight T alpha and its transmittance afterwards; one that has ended keeps T with a minus.
 
     ``t`` is T before; other arguments as of `alpha_at`.
     """
@@ -92,14 +92,14 @@ def _blend_tile(
     error_model="numpy",
 )
 def blend(
-    part: Part,
+    thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray,
     tiles_x: int, rule: np.ndarray, image: np.ndarray,
 ) -> None:  # fmt: skip
-    """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors``."""
+    """Blend front to back into ``image`` (height, width, 4) float32, linear in ``colors``."""
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    index = take_turn(part)
+    index = next_iteration(thread)
     while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -114,7 +114,7 @@ def blend(
                 image[oy + y, ox + x, 1] = buf[j + PLANE_2]
                 image[oy + y, ox + x, 2] = buf[j + PLANE_3]
                 image[oy + y, ox + x, 3] = f32(1) - abs(buf[j])
-        index = take_turn(part)
+        index = next_iteration(thread)
 
 
 @tile_jit
@@ -122,7 +122,7 @@ def _gather_tile(
     entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int,
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """Weights of each Gaussian into plane 1, then their sum and their products with planes 2 to 5 into ``pairs``."""
+    """Write each Gaussian's weights into plane 1, then their sum and products with planes 2 to 5 into ``pairs``."""
     fetched = np.empty(CHUNK * FIELDS, np.float32)
     for begin in range(0, entries.shape[0], CHUNK):
         if begin > 0 and all_ended(buf):
@@ -156,18 +156,18 @@ def _gather_tile(
     error_model="numpy",
 )
 def gather(
-    part: Part,
+    thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     tiles_x: int, rule: np.ndarray, fields: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """For each (tile, Gaussian) pair: sums over its pixels of w and of w x 4 ``fields`` (4, h, w), w = T alpha.
+    """Sum w and w x 4 ``fields`` (4, h, w) over the pixels of each (tile, Gaussian) pair, w = T alpha.
 
     ``fields`` and ``pairs`` (pairs, 5) float32; these must be zero on entry: entries that no open pixel reaches stay
     zero.
     """
     height, width = fields.shape[1:]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    index = take_turn(part)
+    index = next_iteration(thread)
     while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -180,13 +180,13 @@ def gather(
                     buf[U((f + 2) * AREA + y * TILE + x)] = fields[f, oy + y, ox + x]
         span = slice(start[tile], start[tile + 1])
         _gather_tile(members[span], slots[span], extent, flat, ox, oy, way, buf, pairs)
-        index = take_turn(part)
+        index = next_iteration(thread)
 
 
 @parallel_kernel("i8:1 f4:2 f8:2")
-def reduce_pairs(part: Part, first: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
+def reduce_pairs(thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
     """Add each Gaussian's pairs, in a fixed order: ``out`` (K, 5) float64 += sums of rows of ``pairs`` (pairs, 5)."""
-    for k in turns_of(part, first.shape[0] - 1):
+    for k in iterations(thread, first.shape[0] - 1):
         for p in range(first[k], first[k + 1]):
             for c in range(5):
                 out[k, c] += pairs[p, c]

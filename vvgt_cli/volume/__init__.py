@@ -1,43 +1,18 @@
-"""Volumes and their readers."""
+"""Volumes and their readers: a folder a family of formats, and what all of them share beside it.
 
-from vvgt_cli.volume import (  # noqa: F401  each registers its formats
-    amira,
-    analyze,
-    dicom,
-    examples,
-    grid_text,
-    hdf5,
-    inviwo,
-    leica,
-    metaimage,
-    mgh,
-    minc,
-    mrc,
-    n5,
-    netcdf,
-    nibabel_pairs,
-    nifti,
-    nikon,
-    nrrd,
-    numpy_file,
-    openvdb,
-    raw,
-    remote,
-    slc,
-    slices,
-    tiff,
-    vtk_family,
-    vtk_legacy,
-    vtk_pieces,
-    vtk_xml,
-    vtkjs,
-    zarr_store,
-    zarr_zip,
-    zeiss,
-)
+In every folder ``__init__`` is the table of its formats (`readers.Reader`).
+"""
+
+from vvgt_cli.volume import arrays, dicom, examples, maps, medical, microscopy, openvdb, plain, readers, tiff, vtk
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.stats import Statistics, slabs, statistics
 from vvgt_cli.volume.types import UnitFrame, Volume
+
+readers.register_scheme("example", examples.open_example)
+for _scheme in ("http", "https"):
+    readers.register_scheme(_scheme, readers.lazy("arrays.remote.read_scheme", _scheme), times=True)
+for _family in (medical, dicom, maps, plain, microscopy, arrays, openvdb, tiff, vtk):
+    readers.register(*_family.FORMATS)
 
 __all__ = ["ReadOptions", "Statistics", "UnitFrame", "Volume", "read_volume", "slabs", "statistics"]

@@ -1,4 +1,4 @@
-"""Blocks of numbers in files: mapped where stored plainly, unpacked within bounds where compressed.
+"""Blocks of numbers in files: mapped where stored plainly, decompressed within bounds otherwise.
 
 Headers may lie, so every size is checked against the file, and against free memory, before anything is allocated.
 """
@@ -22,16 +22,17 @@ from vvgt_cli.resources import free_memory
 
 # The most that each coding can expand: deflate 258 bytes from 2 bits, bzip2 about 900 kB from some 40 bytes.
 MAX_RATIO = {"gzip": 1040, "zlib": 1040, "bzip2": 25000}
+SHARE = 0.25  # of the free memory: what takes less is decompressed at once
 _CHUNK = 1 << 20
 
 
 def count(shape: tuple[int, ...]) -> int:
-    """Product of a shape in exact integers (headers can overflow 64 bits)."""
+    """Multiply the sizes of a shape in exact integers (headers can overflow 64 bits)."""
     return math.prod(int(n) for n in shape)
 
 
 def size_text(n_bytes: int) -> str:
-    """Bytes for people: ``1234 bytes`` or ``3.2 GiB``."""
+    """Format a number of bytes for people: ``1234 bytes`` or ``3.2 GiB``."""
     return f"{n_bytes} bytes" if n_bytes < 1 << 20 else f"{n_bytes} bytes ({n_bytes / 2**30:.3g} GiB)"
 
 
@@ -51,7 +52,7 @@ def check_memory(need: int, what: str, instead: str = MAPPED) -> None:
 
 
 class _ZlibStream:
-    """``read(n)`` over a zlib stream in a file; never holds more than it was asked for."""
+    """``read(n)`` over a zlib stream in a file; it never holds more than it was asked for."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -75,10 +76,29 @@ _OPENERS: dict[str, Callable[[IO[bytes]], Any]] = {
 }
 
 
+def read_head(path: Path, size: int) -> tuple[bytes, str]:
+    """Read the first bytes of a file, decompressed, and tell how it is compressed: ``raw``, ``gzip`` or ``bzip2``.
+
+    Raises:
+        DataError: damaged compressed data.
+    """
+    with open(path, "rb") as file:
+        head = file.read(size)
+        encoding = "gzip" if head[:2] == b"\x1f\x8b" else "bzip2" if head[:3] == b"BZh" else "raw"
+        if encoding == "raw":
+            return head, encoding
+        file.seek(0)
+        try:
+            return _OPENERS[encoding](file).read(size), encoding
+        except (OSError, EOFError, zlib.error) as error:
+            raise _damaged(path, encoding, error) from error
+
+
 def load_block(
-    path: Path, dtype: np.dtype, shape: tuple[int, ...], *, offset: int = 0, encoding: str = "raw", skip: int = 0
-) -> np.ndarray:
-    """The block of ``shape`` and ``dtype`` at byte ``offset`` of a file.
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], *,
+    offset: int = 0, encoding: str = "raw", skip: int = 0, packed: bool = False,
+) -> np.ndarray:  # fmt: skip
+    """Load the block of ``shape`` and ``dtype`` at byte ``offset`` of a file.
 
     Args:
         path: the file.
@@ -87,12 +107,14 @@ def load_block(
         offset: bytes before the (possibly compressed) block; -1 means that the block ends the file (raw only).
         encoding: ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``, ``bzip2`` or ``text``.
         skip: decompressed bytes to skip.
+        packed: slices are read front to back, so that a large compressed block of three axes may stay in its file.
 
     Returns:
-        `np.memmap` for ``raw``, else an array in memory.
+        `np.memmap` for ``raw``, else an array in memory, or `Packed`.
 
     Raises:
-        DataError: the file is too short, the block cannot come from so few bytes, or memory does not suffice.
+        DataError: the file is too short, the block cannot come from so few bytes, or memory does not suffice; for
+            `Packed` the end is seen when it is read.
     """
     need = count(shape) * dtype.itemsize
     size = path.stat().st_size
@@ -108,7 +130,17 @@ def load_block(
             raise _too_short(path, size, shape, dtype, offset)
         with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             return parse_numbers(text, offset, count(shape), dtype, path.name).reshape(shape)
-    return _unpack(path, dtype, shape, offset, encoding, skip)
+    if size - offset <= 0 or need + skip > (size - offset) * MAX_RATIO[encoding] + 4096:
+        raise DataError(
+            f"{path.name}: {size_text(max(size - offset, 0))} of {encoding} data cannot hold the "
+            f"{size_text(need + skip)} that its header declares; check the header's sizes and type"
+        )
+    free = free_memory()
+    if packed and len(shape) == 3 and free is not None and need > SHARE * free:
+        left: Any = Packed(path, dtype, shape, encoding, (offset, skip))
+        result: np.ndarray = left
+        return result
+    return _decompressed(path, dtype, shape, offset, encoding, skip)
 
 
 def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> DataError:
@@ -120,20 +152,21 @@ def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, o
     )
 
 
-def _unpack(path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int) -> np.ndarray:
+def _decompressed(
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int
+) -> np.ndarray:
     need = count(shape) * dtype.itemsize
-    check_packed(path, need, offset, encoding, skip)
     check_memory(need, path.name)
     with open(path, "rb") as file:
         file.seek(offset)
         try:
-            stream = open_packed(encoding, file)
-            read_discard(stream, skip)
+            stream = _OPENERS[encoding](file)
+            _discard(stream, skip)
             out, filled = fill(stream, need)
             if filled == need:
                 stream.read(1)  # reaches the trailer, and with it the checksum
         except (OSError, EOFError, zlib.error) as error:
-            raise damaged(path, encoding, error) from error
+            raise _damaged(path, encoding, error) from error
     if filled < need:
         raise DataError(
             f"{path.name}: its {encoding} data hold {size_text(filled + skip)}, its header declares "
@@ -142,27 +175,63 @@ def _unpack(path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, en
     return out.view(dtype).reshape(shape)
 
 
-def open_packed(encoding: str, file: IO[bytes]) -> Any:
-    """A stream with ``read(n)`` over what is compressed in a file, from where it stands."""
-    return _OPENERS[encoding](file)
-
-
-def damaged(path: Path, encoding: str, error: Exception) -> DataError:
-    """The error of compressed data that cannot be unpacked."""
+def _damaged(path: Path, encoding: str, error: Exception) -> DataError:
     return DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again")
 
 
-def check_packed(path: Path, need: int, offset: int, encoding: str, skip: int) -> None:
-    """Raise `DataError` if the bytes from ``offset`` on cannot unpack to ``skip`` and ``need`` ones."""
-    packed = path.stat().st_size - offset
-    if packed <= 0 or need + skip > packed * MAX_RATIO[encoding] + 4096:
-        raise DataError(
-            f"{path.name}: {size_text(max(packed, 0))} of {encoding} data cannot hold the {size_text(need + skip)} "
-            "that its header declares; check the header's sizes and type"
-        )
+class Packed:
+    """A compressed array (nz, ny, nx) that stays in its file: type, sizes, and slabs of slices read front to back.
+
+    Slabs that follow each other are decompressed once; an earlier one begins again at the file's start.
+    """
+
+    ndim = 3
+
+    def __init__(self, path: Path, dtype: np.dtype, shape: tuple[int, ...], encoding: str, start: tuple[int, int]):
+        """Describe the block that `load_block` would read; ``start`` are its ``offset`` and ``skip``."""
+        self.path, self.dtype, self.shape, self.encoding, self.start = path, dtype, shape, encoding, start
+        self.size = count(shape)
+        self.nbytes = self.size * dtype.itemsize
+        self._file: IO[bytes] | None = None
+        self._stream: Any = None
+        self._next = 0  # slice
+
+    def __getitem__(self, key: slice) -> np.ndarray:
+        """Read slices ``first:last``, (k, ny, nx).
+
+        Raises:
+            DataError: the file ends early, or is damaged.
+        """
+        first, last, _ = key.indices(self.shape[0])
+        slice_bytes = count(self.shape[1:]) * self.dtype.itemsize
+        need = (last - first) * slice_bytes
+        try:
+            if self._stream is None or first < self._next:
+                self._open()
+            _discard(self._stream, (first - self._next) * slice_bytes)
+            out, filled = fill(self._stream, need)
+            if filled == need and last == self.shape[0]:
+                self._stream.read(1)  # reaches the trailer, and with it the checksum
+        except (OSError, EOFError, zlib.error) as error:
+            raise _damaged(self.path, self.encoding, error) from error
+        if filled < need:
+            raise DataError(
+                f"{self.path.name}: its {self.encoding} data end in slice {first + filled // slice_bytes} of "
+                f"{self.shape[0]}; check the header's sizes and type"
+            )
+        self._next = last
+        return out.view(self.dtype).reshape(last - first, *self.shape[1:])
+
+    def _open(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = open(self.path, "rb")  # noqa: SIM115 - as long as the volume lives
+        self._file.seek(self.start[0])
+        self._stream, self._next = _OPENERS[self.encoding](self._file), 0
+        _discard(self._stream, self.start[1])
 
 
-def read_discard(stream: Any, n: int) -> None:
+def _discard(stream: Any, n: int) -> None:
     """Read and drop ``n`` bytes of a stream (fewer if it ends)."""
     while n > 0:
         got = len(stream.read(min(n, _CHUNK)))
@@ -190,7 +259,7 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
 
 
 def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """``n`` white-space separated words of ``text`` from ``start`` on, in windows.
+    """Split ``n`` white-space separated words from ``text``, from ``start`` on, in windows.
 
     Yields:
         (words, position behind them).
@@ -217,7 +286,7 @@ def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[t
 
 
 def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
-    """``n`` numbers of white-space separated text from ``start`` on, (n,) in native byte order.
+    """Parse ``n`` numbers of white-space separated text from ``start`` on, (n,) in native byte order.
 
     Raises:
         DataError: too few numbers, something that is no number, or one that the type cannot hold; too little memory.
@@ -235,9 +304,9 @@ def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, 
 
 
 def any_case(path: Path) -> Path:
-    """Return a file, or the one beside it whose name differs in upper and lower case alone; where none does, the path.
+    """Return a file, or the one beside it whose name differs in upper and lower case alone; the path where none does.
 
-    Of several, the one with the same stem is taken.
+    Among several, only one with the same stem is returned.
     """
     if path.is_file() or not path.parent.is_dir():
         return path
@@ -247,7 +316,7 @@ def any_case(path: Path) -> Path:
 
 
 def data_file(header: Path, named: str, exact: bool = False) -> Path:
-    """The data file that a detached header names; it must lie in the header's folder.
+    """Find the data file that a detached header names; it must lie in the header's folder.
 
     A file whose name differs in upper and lower case alone is taken with a message, unless ``exact``.
 

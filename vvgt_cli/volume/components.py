@@ -10,10 +10,51 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.headers import printable
 
+LISTED = 12  # arrays, images or channels that an error lists
+
+
+def listed(rows: Sequence[str], between: str = "; ") -> str:
+    """Join the first `LISTED` texts for a message, and say where there are more; "none" for none."""
+    return between.join(map(printable, rows[:LISTED])) + (f"{between}..." if len(rows) > LISTED else "") or "none"
+
+
+def choose(
+    names: Sequence[str], rows: Sequence[str], wanted: str | None, source: str, what: str = "array",
+    how: str = "choose one with --array NAME", option: str = "--array", note: str = "",
+) -> int:  # fmt: skip
+    """Return the index of the array (dataset, grid, ...) that is asked for, or of the only one.
+
+    Args:
+        names: values of the option, one an array.
+        rows: description of each, for messages.
+        wanted: one of the names; None for the only array.
+        source: for messages.
+        what: word for an array, in the singular, for messages.
+        how: how to choose one, for messages.
+        option: flag that chooses one.
+        note: why none of several is chosen without the option, for messages.
+
+    Raises:
+        DataError: there are none.
+        SeveralArrays: several and none chosen.
+        UsageError: none, or several, of the name.
+    """
+    found = [k for k, name in enumerate(names) if wanted in (None, name)]
+    if len(found) == 1:
+        return found[0]
+    many = what.removesuffix("s") + "s"
+    if wanted is not None:
+        number = f"{len(found)} {many}" if found else f"no {what}"
+        raise UsageError(f"{source}: {number} {wanted!r}; it has {listed(rows)}; {how}")
+    if not names:
+        raise DataError(f"{source}: no {what} of numbers; expected a volume")
+    choices = list(dict.fromkeys(names))  # a name may be that of point data and of cell data
+    raise SeveralArrays(f"{source}: several {many}{note}: {listed(rows)}; {how}", option, choices)
+
 
 @dataclass(frozen=True)
 class ArrayInfo:
-    """One array of a file.
+    """Description of an array in a file.
 
     Attributes:
         name: as the file has it (may be empty).
@@ -30,34 +71,28 @@ class ArrayInfo:
     active: bool = False
 
     def __str__(self) -> str:
+        """Describe the array in a listing."""
         plural = "" if self.components == 1 else "s"
         name = printable(self.name) or "(unnamed)"
         return f"{name} ({self.where} data, {self.dtype}, {self.components} component{plural})"
 
 
 def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) -> int:
-    """Index of the array to read: by name, else the active scalars, else the only one; point data before cell data.
+    """Return the index of the array to read: by name, else the active scalars, else the only one.
+
+    Point data come before cell data.
 
     Raises:
         DataError: there are no arrays.
         UsageError: no array of that name, or several and none marked.
     """
-    if not infos:
-        raise DataError(f"{source}: the image has no numeric point or cell array; expected at least one")
     order = sorted(range(len(infos)), key=lambda index: infos[index].where == "cell")
-    listing = "; ".join(str(infos[index]) for index in order)
-    if wanted is not None:
-        for index in order:
-            if infos[index].name == wanted:
-                return index
-        raise UsageError(f"{source}: no array {wanted!r}; it has {listing}; choose one with --array NAME")
-    for index in order:
-        if infos[index].active:
-            return index
-    if len(infos) == 1:
-        return 0
-    text = f"{source}: several arrays and none marked as scalars: {listing}; choose one with --array NAME"
-    raise SeveralArrays(text, "--array", list(dict.fromkeys(infos[index].name for index in order)))
+    fits = (k for k in order if (infos[k].active if wanted is None else infos[k].name == wanted))
+    if (first := next(fits, None)) is not None:
+        return first
+    names = [infos[k].name for k in order]
+    note = " and none marked as scalars"
+    return order[choose(names, [str(infos[k]) for k in order], wanted, source, note=note)]
 
 
 def select_component(
@@ -69,7 +104,7 @@ def select_component(
     scaling: tuple[float, float] = (1.0, 0.0),
     color: bool = False,
 ) -> tuple[np.ndarray, tuple[float, float]]:
-    """One scalar field out of a field with components.
+    """Select one scalar field of a field with components.
 
     Args:
         values: (nz, ny, nx, c) stored values.
@@ -100,16 +135,37 @@ def select_component(
     return contiguous(values[..., int(component)]), scaling
 
 
+def select_from_array(values: np.ndarray, info: ArrayInfo, component: int | str | None, source: str) -> np.ndarray:
+    """Select one scalar field (nz, ny, nx) of a named array's values (nz, ny, nx, c); bytes may be colours.
+
+    Raises:
+        UsageError: as `select_component`.
+    """
+    label, color = f"array {info.name!r}", values.dtype == np.uint8
+    return select_component(values, component, source, label=label, color=color)[0]
+
+
+def selected_dtype(info: ArrayInfo, component: int | str | None, source: str) -> np.dtype:
+    """Return the type of the scalar field that is selected of an array, before the array is read.
+
+    Raises:
+        UsageError: as `select_component`.
+    """
+    return select_from_array(np.zeros((1, 1, 1, info.components), info.dtype), info, component, source).dtype
+
+
 def contiguous(field: np.ndarray) -> np.ndarray:
-    """The field itself (mapped, perhaps), or a C-contiguous copy where it is not one."""
+    """Return the field itself (mapped, perhaps), or a C-contiguous copy where it is not one."""
     return field if field.flags.c_contiguous else np.ascontiguousarray(field)
 
 
 def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Euclidean norm of ``slope * values + intercept`` over the last axis, slice by slice.
+    """Take the Euclidean norm of data values over the last axis, slice by slice.
 
     Args:
-        values: (nz, ny, nx, c).
+        values: (nz, ny, nx, c) stored values.
+        slope: of the data value ``slope * stored + intercept``.
+        intercept: of the data value.
 
     Returns:
         (nz, ny, nx) float32.

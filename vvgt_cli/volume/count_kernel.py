@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 LANES = 4  # tables that neighbours are counted in: equal ones need not wait for each other
 LOW, HIGH, STORED_LOW, STORED_HIGH = range(4)  # of a part's ends
@@ -15,10 +15,10 @@ U = nb.uint64  # an index that cannot be negative needs no test
 
 
 @parallel_kernel("V i8:3")
-def count_values(part: Part, values: np.ndarray, out: np.ndarray) -> None:
-    """Counts of each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
+def count_values(thread: ThreadSlice, values: np.ndarray, out: np.ndarray) -> None:
+    """Count each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
     parts = out.shape[0]
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
                 row = values[z, y]
@@ -55,16 +55,22 @@ def _row_range(
 
 @parallel_kernel("V f8 f8 b1 f8:2 i8:2")
 def range_values(
-    part: Part, values: np.ndarray, slope: float, intercept: float, whole: bool, ends: np.ndarray, numbers: np.ndarray
+    thread: ThreadSlice,
+    values: np.ndarray,
+    slope: float,
+    intercept: float,
+    whole: bool,
+    ends: np.ndarray,
+    numbers: np.ndarray,
 ) -> None:
-    """Range of data values ``slope * stored + intercept`` and of stored ones, and how many of them are finite.
+    """Find the range of data values ``slope * stored + intercept`` and of stored ones; count the finite ones.
 
     ``values`` (nz, ny, nx) float32 or float64; ``whole``: they stand for whole numbers, which all count. ``ends``
     (parts, 4) by `LOW` to `STORED_HIGH`, infinite where there is none; ``numbers`` (parts, 2) by `NAN` and `FINITE`,
     zeros.
     """
     parts = ends.shape[0]
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         lows, highs = np.full((2, values.shape[2]), np.inf), np.full((2, values.shape[2]), -np.inf)
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
@@ -75,16 +81,23 @@ def range_values(
 
 @parallel_kernel("V f8 f8 f8 f8 f8 i8:3")
 def bin_values(
-    part: Part, values: np.ndarray, slope: float, intercept: float, lo: float, hi: float, half: float, out: np.ndarray
+    thread: ThreadSlice,
+    values: np.ndarray,
+    slope: float,
+    intercept: float,
+    lo: float,
+    hi: float,
+    half: float,
+    out: np.ndarray,
 ) -> None:
-    """Histogram of the finite data values ``slope * stored + intercept`` by the bins of `stats.bins_of`, to the bit.
+    """Count the finite data values ``slope * stored + intercept`` in the bins of `stats.bins_of`, to the bit.
 
     ``values`` (nz, ny, nx) float32 or float64; ``lo``, ``hi`` ends of the bins; ``half`` 1, or 0.5 where the
     difference of the ends is infinite. ``out`` (parts, LANES, bins + 1), zeros; the last column counts the rest.
     """
     parts, bins = out.shape[0], out.shape[2] - 1
     first, width = lo * half, hi * half - lo * half
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         number = np.empty(values.shape[2], np.int32)
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):

@@ -10,13 +10,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.stored import Stored, chunks_of, read_block
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, float_dtype
 
 Box = tuple[tuple[int | None, int | None], ...]
 
 
 def parse_crop(text: str) -> Box:
-    """``x0:x1,y0:y1,z0:z1`` in voxels, ends open where they are left out, the last one excluded.
+    """Parse ``x0:x1,y0:y1,z0:z1`` in voxels; omitted ends are open, the last voxel is excluded.
 
     Raises:
         UsageError: anything else.
@@ -31,7 +31,7 @@ def parse_crop(text: str) -> Box:
 
 
 def crop(volume: Volume, box: Box) -> Volume:
-    """The voxels in a box (x, y, z); its ends may lie beyond the volume's last voxel.
+    """Cut the voxels in a box (x, y, z) out; its ends may lie beyond the volume's last voxel.
 
     Raises:
         UsageError: no voxel of the volume is in it.
@@ -48,7 +48,7 @@ def crop(volume: Volume, box: Box) -> Volume:
 
 
 def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
-    """The volume with NaN where a mask is 0 or not finite; of integers as float32 or float64, which hold them exactly.
+    """Set voxels to NaN where a mask is 0 or not finite; integers become float32 or float64, which hold them exactly.
 
     Where it is ``stored``, that is done block by block.
 
@@ -60,8 +60,7 @@ def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
         raise DataError(
             f"--mask {mask.name}: {found} voxels; expected the {wanted} of {volume.name}: resample it onto that grid"
         )
-    small = volume.data.dtype.itemsize <= (4 if volume.data.dtype.kind == "f" else 2)
-    kind = np.dtype(np.float32 if small else np.float64)
+    kind = float_dtype(volume.data.dtype)
 
     def block(slices: tuple[slice, ...]) -> np.ndarray:
         z, y, x = slices

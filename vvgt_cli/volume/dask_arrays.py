@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.stored import Stored, put_overlap
 
 AT_ONCE = 64 << 20  # bytes of chunks that are computed at once, and are kept at the least; one chunk in any case
 KEPT = 0.125  # of the free memory: computed chunks that are kept, as blocks need the voxels around them too
@@ -21,12 +21,12 @@ Number = tuple[int, ...]
 
 
 def is_dask(data: Any) -> bool:
-    """Whether an object is a Dask array; Dask is imported by then."""
+    """Tell whether an object is a Dask array; Dask is imported by then."""
     return hasattr(data, "__dask_graph__") and hasattr(data, "chunks") and hasattr(data, "blocks")
 
 
 def lazy(data: Any, name: str) -> Stored:
-    """A Dask array (nz, ny, nx), of which blocks are computed where they are read.
+    """Wrap a Dask array (nz, ny, nx) whose blocks are computed when they are read.
 
     Raises:
         DataError: another number of axes, or chunks of unknown size.
@@ -45,7 +45,7 @@ class Chunks:
     """
 
     def __init__(self, array: Any, name: str) -> None:
-        """``name`` is for messages.
+        """Take a Dask array; ``name`` is for messages.
 
         Raises:
             DataError: chunks of unknown size.
@@ -61,7 +61,7 @@ class Chunks:
         self._room = max(int(KEPT * (free_memory() or 0)), AT_ONCE)
 
     def __call__(self, index: tuple[Any, ...]) -> np.ndarray:
-        """The values of a slice (step 1) or a number an axis; the caller's own.
+        """Read the values at a slice (step 1) or a number for each axis; the array belongs to the caller.
 
         Raises:
             DataError: a chunk that cannot be computed, or that is not what the array says of it.
@@ -89,7 +89,7 @@ class Chunks:
         return out[tuple(slice(None) if isinstance(i, slice) else 0 for i in index)]
 
     def _computed(self, numbers: list[Number]) -> list[tuple[Number, np.ndarray]]:
-        """Chunks, each with its number."""
+        """Compute chunks; return each with its number."""
         dask: Any = importlib.import_module("dask")
         try:  # delayed: a chunk as it is, where an array's compute() copies it
             found = dask.compute(*[self._array.blocks[number].to_delayed().item() for number in numbers])
@@ -112,12 +112,8 @@ class Chunks:
 
     def _put(self, out: np.ndarray, spans: list[tuple[int, int]], number: Number, chunk: np.ndarray) -> None:
         """Copy the part of a chunk that lies in the box of ``spans``."""
-        there, here = [], []
-        for ends, k, (a, b) in zip(self._ends, number, spans, strict=True):
-            lo, hi = max(ends[k], a), min(ends[k + 1], b)
-            there.append(slice(lo - a, hi - a))
-            here.append(slice(lo - ends[k], hi - ends[k]))
-        out[tuple(there)] = chunk[tuple(here)]
+        at = [ends[k] for ends, k in zip(self._ends, number, strict=True)]
+        put_overlap(out, [a for a, _ in spans], chunk, at)
 
     def _keep(self, number: Number, chunk: np.ndarray) -> None:
         """Keep a chunk, and let go of those that were used longest ago."""

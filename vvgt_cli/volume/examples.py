@@ -8,7 +8,6 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import register_scheme
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.types import Volume
 
@@ -24,7 +23,7 @@ def register_example(name: str, make: Maker) -> None:
 
 
 def example_names() -> list[str]:
-    """Names of all examples."""
+    """List the names of all examples."""
     return sorted(_EXAMPLES)
 
 
@@ -59,4 +58,3 @@ def _bundled(name: str, filename: str) -> Maker:
 
 register_example("frog", _bundled("frog", "frog_tissues.vti"))
 register_example("channels", _bundled("channels", "channels.vti"))
-register_scheme("example", open_example)

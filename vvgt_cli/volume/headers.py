@@ -1,25 +1,36 @@
-"""Text headers: ``key: value`` and ``key = value`` lines, numbers checked as they are taken."""
+"""Text headers: ``key: value`` and ``key = value`` lines, numbers and types checked as they are taken."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
+
+import numpy as np
 
 from vvgt_cli.errors import DataError
 
 MAX_HEADER = 1 << 20
 MARK = b"\xef\xbb\xbf"  # byte order mark that programs of Windows put before text
+DTYPES = (
+    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
+    *("float16", "float32", "float64"),
+)
+_TYPES = {
+    "char": "i1", "byte": "u1", "short": "i2", "int": "i4", "longlong": "i8",
+    "half": "f2", "float": "f4", "double": "f8",
+}  # fmt: skip
 
 
 class Fields(dict[str, str]):
     """The fields of a header, keys in lower case; ``name`` is the file, for messages."""
 
     def __init__(self, name: str) -> None:
+        """Start without fields."""
         super().__init__()
         self.name = name
 
     def need(self, *keys: str) -> str:
-        """The first of these fields that is there.
+        """Return the first of these fields that is there.
 
         Raises:
             DataError: none is.
@@ -50,7 +61,7 @@ class Fields(dict[str, str]):
         return values[:n]
 
     def sizes(self, key: str, text: str) -> list[int]:
-        """Positive whole numbers of a field.
+        """Return the positive whole numbers of a field.
 
         Raises:
             DataError: anything else.
@@ -64,7 +75,7 @@ class Fields(dict[str, str]):
         return values
 
     def integer(self, key: str, default: int) -> int:
-        """A whole number, or the default if the field is missing."""
+        """Return a whole number, or the default if the field is missing."""
         text = self.get(key)
         if text is None:
             return default
@@ -73,17 +84,43 @@ class Fields(dict[str, str]):
         except ValueError:
             raise DataError(f"{self.name}: {key} is {text!r}; expected a whole number") from None
 
+    def dtype(self, key: str, text: str, own: Mapping[str, str] | None = None) -> np.dtype:
+        """Return the type of values that a field names, as C or as numpy does (see `type_of`).
+
+        Raises:
+            DataError: an unknown type.
+        """
+        found = type_of(text, own)
+        if found is None:
+            raise DataError(
+                f"{self.name}: {key} is {text[:40]!r}; expected a type of numbers such as uchar, short, uint16 or float"
+            )
+        return found
+
+
+def type_of(text: str, own: Mapping[str, str] | None = None) -> np.dtype | None:
+    """Return the type of numbers that a name such as ``unsigned short int``, ``uchar`` or ``uint16_t`` stands for.
+
+    Args:
+        text: the name, in any case, words separated by blanks or underscores.
+        own: numpy's code of names that a format has for itself, without blanks, in lower case; they come first.
+
+    Returns:
+        The type in native byte order; None for an unknown name. A ``char`` is signed, a ``byte`` is not.
+    """
+    words = text.lower().replace("_", " ").split()
+    words = words[:-1] if words[-1:] == ["t"] else words
+    unsigned = words[:1] == ["unsigned"]
+    word = "".join(words[1:] if words[:1] in (["unsigned"], ["signed"]) else words)
+    word = word.removesuffix("int") if word not in ("int", "uint") else word
+    codes = {**_TYPES, **(own or {})}
+    if word.startswith("u") and word[1:] in codes and word not in codes:
+        unsigned, word = True, word[1:]
+    if word in codes:
+        return np.dtype(codes[word].replace("i", "u") if unsigned else codes[word])
+    return np.dtype(word) if word in DTYPES and not unsigned else None
+
 
 def printable(text: str) -> str:
-    """``text`` as a message can hold it: what cannot be printed (a line break, say) is a question mark."""
+    """Return ``text`` as a message can hold it: what cannot be printed (a line break, say) is a question mark."""
     return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def unit_rows(vectors: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Lengths of three axis vectors, and the row-major direction matrix whose columns are their unit vectors."""
-    lengths = tuple(math.hypot(*v) for v in vectors)
-    unit = [
-        [c / n if n > 0 else float(i == k) for k, c in enumerate(v)]
-        for i, (v, n) in enumerate(zip(vectors, lengths, strict=True))
-    ]
-    return lengths, tuple(unit[column][row] for row in range(3) for column in range(3))

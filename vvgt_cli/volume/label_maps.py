@@ -18,7 +18,7 @@ MOST = 1 << 21  # labels that are counted
 
 
 def labels_in(volume: Volume) -> list[int]:
-    """The labels of a volume, ascending; voxels that are NaN have none.
+    """List the labels of a volume, ascending; voxels that are NaN have none.
 
     Raises:
         DataError: data values that are no whole numbers, or more than `MOST` of them.
@@ -44,21 +44,21 @@ def labels_in(volume: Volume) -> list[int]:
 
 
 def named_so(volume: Volume) -> bool:
-    """Whether a volume may be a label map: integers, and named so."""
+    """Tell whether a volume holds integers and its name suggests a label map."""
     return volume.data.dtype.kind in "iu" and NAMED.search(volume.name) is not None
 
 
 def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in) -> bool:
-    """Whether a volume is a label map: integers, few of them, and named so; ``labels`` finds those that it holds."""
+    """Tell whether a volume is a label map: few different integers, and a name that says so; ``labels`` lists them."""
     if not named_so(volume):
         return False
     middle = len(volume.data) // 2
-    first = np.unique(volume.data[middle : middle + 1])  # most are told by one slice
+    first = np.unique(volume.data[middle : middle + 1])  # one slice decides for most
     return len(first) <= FEW and len(labels(volume)) <= FEW
 
 
 def counts_of(volume: Volume) -> dict[float, int]:
-    """Voxels of each data value, slice by slice."""
+    """Count the voxels of each data value, slice by slice."""
     found: dict[float, int] = {}
     for plane in planes(volume):
         values, many = np.unique(plane, return_counts=True)

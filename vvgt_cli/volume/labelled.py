@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
-from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.types import Volume, float_dtype, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
@@ -57,7 +57,8 @@ class Axis:
         centres: (size,) coordinates of the values, or None.
         units: of the coordinates, or "".
         role: ``x``, ``y``, ``z``, ``t``, ``c`` (channels), or "" where nothing says.
-        labels, colors: names and RGB of channels, where there are any.
+        labels: names of channels, where there are any.
+        colors: RGB of channels, where there are any.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Axis:
     colors: tuple[tuple[float, float, float] | None, ...] = ()
 
     def __str__(self) -> str:
+        """Describe the axis in a message."""
         return f"{printable(self.name) or 'unnamed'} ({self.size})"
 
 
@@ -121,20 +123,15 @@ def described_by(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def labelled_volume(
-    stored: np.ndarray | Callable[[tuple[Any, ...]], np.ndarray],
-    dtype: np.dtype,
-    axes: Sequence[Axis],
-    attributes: Mapping[str, Any],
-    options: ReadOptions,
-    source: str,
-    name: str,
-    chunks: Sequence[int] | None = None,
-) -> Volume:
-    """The volume of an array with named axes.
+    stored: np.ndarray | Callable[[tuple[Any, ...]], np.ndarray], dtype: np.dtype, axes: Sequence[Axis],
+    attributes: Mapping[str, Any], options: ReadOptions, source: str, name: str, chunks: Sequence[int] | None = None,
+) -> Volume:  # fmt: skip
+    """Make a volume of an array with named axes.
 
     Args:
-        stored, dtype: the stored values (mapped, perhaps), or what reads a part: from a slice or a number an axis.
-        axes: of the array, slowest first.
+        stored: stored values (mapped, perhaps), or a function that reads a part, by a slice or a number for each axis.
+        dtype: of the stored values.
+        axes: slowest first.
         attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
         options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
             a single such axis, either.
@@ -154,6 +151,7 @@ def labelled_volume(
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
     _warn_of_unread(axes, attributes, options, source)
     space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
+    zyx = _zyx(space, axes)
     chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
@@ -162,16 +160,16 @@ def labelled_volume(
                 raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
             index[k] = slice(None) if value is None else value
     if callable(stored) and options.stored and chunks is not None and len(space) == 3:
-        return _left(stored, dtype, axes, index, _zyx(space, axes), attributes, options, source, name, chunks)
+        return _left(stored, dtype, axes, index, zyx, attributes, options, source, name, chunks)
     if callable(stored):
-        sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
-        check_memory(count(tuple(sizes)) * dtype.itemsize, source, IN_BLOCKS)
+        size = math.prod(n.size for n, i in zip(axes, index, strict=True) if i == slice(None))
+        check_memory(size * dtype.itemsize, source, IN_BLOCKS)
         values = np.asarray(stored(tuple(index)))
     else:
         values = stored[tuple(index)]
     values, slope, intercept = decode(values, attributes, source)
-    kept, spatial = [k for k in range(len(axes)) if index[k] == slice(None)], [axes[k] for k in _zyx(space, axes)]
-    order = [kept.index(k) for k in _zyx(space, axes)]
+    kept = [k for k in range(len(axes)) if index[k] == slice(None)]
+    order, spatial = [kept.index(k) for k in zyx], [axes[k] for k in zyx]
     if extra is not None and chosen is None:  # the magnitude over an axis of components
         values = np.transpose(values, [*order, kept.index(extra)])
         field, (slope, intercept) = select_component(values, "magnitude", source, scaling=(slope, intercept))
@@ -190,7 +188,7 @@ def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options
 
 
 def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
-    """The options with the number of a channel in place of its name."""
+    """Replace the name of a channel in the options by its number."""
     for one in axes:
         if isinstance(options.component, str) and one.labels.count(options.component) == 1:
             return replace(options, component=one.labels.index(options.component))
@@ -198,7 +196,7 @@ def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
 
 
 def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
-    """Indices of the axes of space, of the one that a component is chosen along, and of the one that a time is."""
+    """Return the indices of the spatial axes, of the axis of components and of the axis of time."""
     left = list(range(len(axes)))
     for k in [k for k in left if axes[k].size == 1]:  # of time steps and the like there may be one
         if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
@@ -240,7 +238,7 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
 
 
 def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
-    """The axes of space in the order z, y, x: by role, those without one in the order of the file."""
+    """Order the spatial axes as z, y, x: by role; those without one stay in file order."""
     slots: dict[str, int] = {}
     for k in space:
         if axes[k].role in "xyz" and axes[k].role not in ("", *slots):
@@ -267,8 +265,7 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
         return values, slope, intercept
     check_memory(values.size * max(values.itemsize, 4), source)
     if values.dtype.kind != "f":
-        wide = np.float32 if values.dtype.itemsize <= 2 else np.float64
-        values = (values * slope + intercept).astype(wide)
+        values = (values * slope + intercept).astype(float_dtype(values.dtype))
         slope, intercept = 1.0, 0.0
     elif not values.flags.writeable:
         values = np.array(values)
@@ -289,7 +286,7 @@ def _number(attributes: Mapping[str, Any], key: str, default: float, source: str
 
 
 def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | None:
-    """Mask of the stored values that the attributes call missing, or None."""
+    """Return a mask of the stored values that the attributes call missing, or None."""
     mask: np.ndarray | None = None
     marks = [m for key in ("_FillValue", "missing_value") if key in attributes for m in _stored(attributes[key])]
     tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
@@ -304,7 +301,7 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | 
 
 
 def _stored(value: Any) -> list[Any]:
-    """Numbers of an attribute; nothing where it is text."""
+    """Return the numbers of an attribute; nothing where it is text."""
     found = np.asarray(value).reshape(-1)
     return [] if found.dtype.kind not in "iuf" else found.tolist()
 
@@ -312,7 +309,7 @@ def _stored(value: Any) -> list[Any]:
 def _placed(
     field: np.ndarray, axes: list[Axis], scaling: tuple[float, float], options: ReadOptions, source: str, name: str
 ) -> Volume:
-    """The volume with spacing and origin from the coordinates of its axes (z, y, x), which are made ascending."""
+    """Make the volume, with spacing and origin from the coordinates of its axes (z, y, x), made ascending."""
     flips = [_descends(a, source) for a in axes]
     if not isinstance(field, Stored):  # it turns its blocks itself
         field = contiguous(field[tuple(slice(None, None, -1 if flip else 1) for flip in flips)])
@@ -346,7 +343,7 @@ def _placed(
             f"{source}: {steps_text}; expected evenly spaced values: try --dims X Y Z to resample to a regular grid, "
             "or --spacing X Y Z to take the values as evenly spaced"
         )
-    from vvgt_cli.volume.resample import rectilinear, resample
+    from vvgt_cli.volume.vtk.resample import rectilinear, resample
 
     points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
     data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
@@ -357,7 +354,7 @@ def _left(
     stored: Callable[[tuple[Any, ...]], np.ndarray], dtype: np.dtype, axes: Sequence[Axis], index: list[Any],
     zyx: list[int], attributes: Mapping[str, Any], options: ReadOptions, source: str, name: str, chunks: Sequence[int],
 ) -> Volume:  # fmt: skip
-    """The volume of an array that stays in its file; values that may be missing make every block floats.
+    """Make the volume of an array that stays in its file; values that may be missing make every block floats.
 
     ``index`` chooses along the axes that are not of space; ``zyx`` are those that are.
     """
@@ -368,7 +365,7 @@ def _left(
     unsigned = dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true"
     kind = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
     wide = marked and kind.kind != "f"
-    final = np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64) if wide else kind
+    final = float_dtype(kind) if wide else kind
     scale = _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
     inner = [sorted(zyx).index(k) for k in zyx]
 
@@ -388,7 +385,7 @@ def _left(
 
 
 def _descends(a: Axis, source: str) -> bool:
-    """Whether an axis runs downwards.
+    """Tell whether an axis runs downwards.
 
     Raises:
         DataError: it does neither run up nor down.
@@ -402,7 +399,7 @@ def _descends(a: Axis, source: str) -> bool:
 
 
 def even(centres: np.ndarray) -> bool:
-    """Whether coordinates lie within `EVEN` steps of equal distances."""
+    """Tell whether coordinates lie within `EVEN` steps of equal distances."""
     if centres.size < 3:
         return True
     line = np.linspace(centres[0], centres[-1], centres.size)

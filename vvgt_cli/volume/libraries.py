@@ -11,7 +11,7 @@ from vvgt_cli.errors import DataError, VvgtError
 
 
 def need(module: str, extra: str, source: str, what: str) -> Any:
-    """Import a module that comes with an extra.
+    """Import a module that an extra installs.
 
     Raises:
         DataError: it is not installed; the error names the extra.

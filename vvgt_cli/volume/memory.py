@@ -11,10 +11,9 @@ import numpy as np
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
-from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.labelled import axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import SPACES
+from vvgt_cli.volume.space import SPACES, unit_rows
 from vvgt_cli.volume.types import Volume
 
 
@@ -26,7 +25,7 @@ def volume_in_memory(
     affine: Any = None,
     name: str = "array",
 ) -> Volume:
-    """The volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
+    """Make a volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
 
     Args:
         data: array of three axes, (nz, ny, nx) as slices are stacked; an xarray.DataArray, whose coordinates say where
@@ -55,8 +54,8 @@ def volume_in_memory(
 
 
 def dataset_volume(data: Any, options: ReadOptions, name: str) -> Volume:
-    """As `vvgt_cli.volume.vtk_grids.dataset_volume`; VTK is imported by then."""
-    from vvgt_cli.volume import vtk_grids
+    """Call `vvgt_cli.volume.vtk.grids.dataset_volume`, which imports VTK."""
+    from vvgt_cli.volume.vtk import grids as vtk_grids
 
     return vtk_grids.dataset_volume(data, options, name, name)
 
@@ -67,7 +66,7 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
-    """Of an xarray.DataArray; one of Dask is computed block by block, or as a whole for a magnitude or another grid."""
+    """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
     axes = []
     for dim, size in zip(data.dims, data.shape, strict=True):
         coordinate = data.coords.get(dim)

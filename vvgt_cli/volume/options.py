@@ -1,4 +1,4 @@
-"""`ReadOptions`: what a caller may say about a volume beyond its file."""
+"""`ReadOptions`: how to read a volume, where its file does not say or a caller wants something else."""
 
 from __future__ import annotations
 
@@ -10,33 +10,8 @@ import numpy as np
 
 from vvgt_cli.errors import SeveralSteps, UsageError
 from vvgt_cli.volume.cut import parse_crop
+from vvgt_cli.volume.headers import DTYPES, type_of
 from vvgt_cli.volume.types import Volume
-
-DTYPES = (
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float16",
-    "float32",
-    "float64",
-)
-_ALIASES = {
-    "char": "int8",
-    "uchar": "uint8",
-    "byte": "uint8",
-    "short": "int16",
-    "ushort": "uint16",
-    "int": "int32",
-    "uint": "uint32",
-    "half": "float16",
-    "float": "float32",
-    "double": "float64",
-}
 
 
 @dataclass(frozen=True)
@@ -45,7 +20,7 @@ class ReadOptions:
 
     Attributes:
         dims: voxels along (x, y, z) of a raw file, or of the grid that a mesh is resampled to.
-        dtype: a name of `DTYPES` (or a C-like alias such as ``ushort``) for a raw file.
+        dtype: type of a raw file's values, as ``uint16`` or ``ushort`` (`vvgt_cli.volume.headers.type_of`).
         byte_order: ``little`` or ``big`` for a raw file (default little).
         header_bytes: bytes to skip at the start of a raw file.
         spacing: voxel edges (x, y, z) along the index axes, in the file's unit, in place of the file's; the first
@@ -57,8 +32,8 @@ class ReadOptions:
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
         crop: ``x0:x1,y0:y1,z0:z1``, the voxels to keep, as `vvgt_cli.volume.cut.parse_crop` has it.
         mask: file or `Volume` of the same size (before or after ``crop``); where it is 0 nothing is shown.
-        packed: values are read front to back only: where they are compressed and a format can, they stay so
-            (`vvgt_cli.volume.packed`).
+        packed: values are read front to back only, so that compressed ones may stay in the file
+            (`vvgt_cli.volume.blocks.Packed`).
         stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
         level: of a file with several resolutions (OME-Zarr), from 0, the finest.
 
@@ -82,33 +57,31 @@ class ReadOptions:
     level: int | None = None
 
     def __post_init__(self) -> None:
-        if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):
-            raise UsageError(f"--dims {self.dims}: expected three whole numbers of at least 1, as --dims 256 256 128")
+        """Check the values one by one."""
         if self.dtype is not None:
             parse_dtype(self.dtype)
-        if self.byte_order not in (None, "little", "big"):
-            raise UsageError(f"--byte-order {self.byte_order}: expected little or big")
-        if self.header_bytes < 0:
-            raise UsageError(f"--header-bytes {self.header_bytes}: expected 0 or more")
-        if self.spacing is not None and not (
-            len(self.spacing) == 3 and all(math.isfinite(s) and s > 0 for s in self.spacing)
-        ):
-            raise UsageError(f"--spacing {self.spacing}: expected three positive numbers, as --spacing 1 1 2.5")
-        if self.space not in (None, "RAS", "LPS"):
-            raise UsageError(f"--space {self.space}: expected RAS or LPS")
-        component = self.component
-        if component == "" or (isinstance(component, int) and component < 0):
-            raise UsageError(f"--component {component}: expected an index (0, 1, ...), a channel's name or magnitude")
         if self.crop is not None:
             parse_crop(self.crop)
-        if self.level is not None and self.level < 0:
-            raise UsageError(f"--level {self.level}: expected full, or the number of a level (0, 1, ...)")
-        if self.time is not None and self.time < 0:
-            raise UsageError(f"--time {self.time}: expected the index of a time step (0, 1, ...)")
+        dims, edges, part = self.dims, self.spacing, self.component
+        positive = edges is None or (len(edges) == 3 and all(math.isfinite(s) and s > 0 for s in edges))
+        for flag, value, good, expected in (
+            ("dims", dims, dims is None or (len(dims) == 3 and min(dims) >= 1),
+             "three whole numbers of at least 1, as --dims 256 256 128"),
+            ("byte-order", self.byte_order, self.byte_order in (None, "little", "big"), "little or big"),
+            ("header-bytes", self.header_bytes, self.header_bytes >= 0, "0 or more"),
+            ("spacing", edges, positive, "three positive numbers, as --spacing 1 1 2.5"),
+            ("space", self.space, self.space in (None, "RAS", "LPS"), "RAS or LPS"),
+            ("component", part, part != "" and not (isinstance(part, int) and part < 0),
+             "an index (0, 1, ...), a channel's name or magnitude"),
+            ("level", self.level, (self.level or 0) >= 0, "full, or the number of a level (0, 1, ...)"),
+            ("time", self.time, (self.time or 0) >= 0, "the index of a time step (0, 1, ...)"),
+        ):  # fmt: skip
+            if not good:
+                raise UsageError(f"--{flag} {value}: expected {expected}")
 
     @property
     def raw_flags(self) -> list[str]:
-        """The flags in use that only a raw file takes."""
+        """Flags in use that describe the layout of a raw file."""
         given = {
             "--dims": self.dims is not None,
             "--dtype": self.dtype is not None,
@@ -123,8 +96,8 @@ class ReadOptions:
         Args:
             steps: how many there are.
             source: for messages.
-            what: they are called.
-            **facts: ``times``, ``unit`` and ``names``, as of `SeveralSteps`.
+            what: the steps are called.
+            **facts: ``times``, ``unit`` and ``names`` for `SeveralSteps`.
 
         Raises:
             SeveralSteps: several and none chosen.
@@ -139,19 +112,19 @@ class ReadOptions:
         return self.time or 0
 
     def spacing_or(self, declared: tuple[float, ...]) -> tuple[float, float, float]:
-        """The spacing asked for, else the file's (x, y, z): signs are orientation and dropped."""
+        """Return the spacing that is asked for, else the file's (x, y, z) without signs, which are orientation."""
         if self.spacing is not None:
             return self.spacing
         return tuple(abs(float(s)) for s in declared)  # type: ignore[return-value]  # `Volume` counts them
 
 
 def parse_dtype(name: str, byte_order: str | None = None) -> np.dtype:
-    """numpy dtype for a name of `DTYPES` or an alias; little-endian unless told.
+    """Return the numpy type for a name of `DTYPES`, or for its name in C; little-endian by default.
 
     Raises:
         UsageError: unknown name.
     """
-    key = _ALIASES.get(name.strip().lower(), name.strip().lower())
-    if key not in DTYPES:
+    found = type_of(name)
+    if found is None:
         raise UsageError(f"--dtype {name}: expected one of {', '.join(DTYPES)}")
-    return np.dtype(key).newbyteorder(">" if byte_order == "big" else "<")
+    return found.newbyteorder(">" if byte_order == "big" else "<")

@@ -1,7 +1,7 @@
-"""The table of readers: what a format is, and how one is added.
+"""The table of readers: what a volume format is, and how one is added.
 
-A reader is a module that ends in one ``register(Reader(...))``; a scheme (``example:``) is one
-``register_scheme(name, function)``. `registry` finds the reader of a file.
+A family of formats is a folder whose ``__init__`` lists a `Reader` for each of them. A reader says how its files are
+recognised; the module that reads them is imported when such a file comes. `registry` finds the reader of a file.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,60 +20,80 @@ from vvgt_cli.volume.types import Volume
 HEAD_BYTES = 4096
 
 
+def lazy(name: str, *first: Any) -> Callable[..., Any]:
+    """Make a function that stands for another one and imports its module when it is called.
+
+    Args:
+        name: ``family.module.function`` in this room.
+        *first: arguments that go before those of the call.
+    """
+    return partial(_call, name, *first)
+
+
+def _call(name: str, *arguments: Any) -> Any:
+    module, _, function = name.rpartition(".")
+    return getattr(import_module(f"vvgt_cli.volume.{module}"), function)(*arguments)
+
+
 @dataclass(frozen=True)
 class Reader:
     """A volume format.
 
     Attributes:
         name: for messages.
-        suffixes: lower-case endings of file names, with the dot.
-        sniff: does a file with these first `HEAD_BYTES` (unzipped) bytes have this format?
+        suffixes: lower-case endings of file names, with the dot; one that ends in ``gz`` means that compressed files of
+            the format are read.
         read: path and options to volume.
-        unzips: reads gzip-compressed files by itself.
-        named_arrays: takes ``--array``.
-        times: takes ``--time``.
-        raw_layout: takes dims, dtype, byte order and header bytes.
-        by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
-        resamples: takes ``--dims`` as the grid to sample on.
-        holds: does this folder hold the format? Of formats that are folders.
-        by_whole: such a folder is one volume whatever else lies in it.
-        within: formats that its files are recognised as; a file's name decides for it.
-        empty: a file may be empty: others beside it hold the values.
-        contents: steps, arrays and blocks of a file, each a list of rows, for `vvgt info`.
+        sniff: tells whether a file with these first `HEAD_BYTES`, decompressed, has the format; None where files begin
+            in no certain way, so that the name decides.
+        takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order`` and ``header_bytes`` it
+            takes; all readers take the others.
+        by_name: also tried on files that `sniff` does not recognise.
+        holds: tells whether a folder holds the format.
+        whole: a folder that holds it is one volume, whatever other files lie in it.
+        within: formats that its files are recognised as; the file's name decides between them.
+        levels: path and options to the shapes of its resolutions, slowest axis first and finest first.
+        contents: path and options to lists of steps, arrays and blocks, for `vvgt info`.
     """
 
     name: str
     suffixes: tuple[str, ...]
-    sniff: Callable[[bytes], bool]
     read: Callable[[Path, ReadOptions], Volume]
-    unzips: bool = False
-    named_arrays: bool = False
-    times: bool = False
-    raw_layout: bool = False
+    sniff: Callable[[bytes], bool] | None = None
+    takes: tuple[str, ...] = ()
     by_name: bool = False
-    resamples: bool = False
     holds: Callable[[Path], bool] | None = None
-    by_whole: bool = False
+    whole: bool = False
     within: tuple[str, ...] = ()
-    empty: bool = False
+    levels: Callable[[Path, ReadOptions], list[tuple[int, ...]]] | None = None
     contents: Callable[[Path, ReadOptions], dict[str, Any]] | None = None
+
+    @property
+    def nameable(self) -> bool:
+        """Whether the name of a file alone says that it has the format: its files begin in no certain way."""
+        return self.sniff is None and self.holds is None
+
+    @property
+    def resamples(self) -> bool:
+        """Whether ``dims`` is the grid to sample values on, rather than the layout of a raw file."""
+        return "dims" in self.takes and "dtype" not in self.takes
 
 
 Scheme = Callable[[str, ReadOptions], Volume]
 
 READERS: list[Reader] = []
 SCHEMES: dict[str, Scheme] = {}
-STEPPED: set[str] = set()  # of these, what may have time steps
+STEPPED: set[str] = set()  # schemes whose volumes may have time steps
 
 
-def register(reader: Reader) -> Reader:
-    """Add a reader; the earlier one wins where two recognise a file."""
-    if any(not s.startswith(".") or s != s.lower() for s in reader.suffixes):
-        raise ValueError(f"{reader.name}: suffixes must be lower case and start with a dot")
-    if reader.name in (r.name for r in READERS):
-        raise ValueError(f"{reader.name}: registered twice")
-    READERS.append(reader)
-    return reader
+def register(*readers: Reader) -> None:
+    """Add readers; of several that recognise a file, the one added first reads it."""
+    for reader in readers:
+        if any(not s.startswith(".") or s != s.lower() for s in reader.suffixes):
+            raise ValueError(f"{reader.name}: suffixes must be lower case and start with a dot")
+        if reader.name in (r.name for r in READERS):
+            raise ValueError(f"{reader.name}: registered twice")
+        READERS.append(reader)
 
 
 def register_scheme(name: str, open_scheme: Scheme, times: bool = False) -> None:
@@ -82,12 +104,12 @@ def register_scheme(name: str, open_scheme: Scheme, times: bool = False) -> None
 
 
 def known_suffixes() -> list[str]:
-    """Every file-name ending that a reader is registered for."""
+    """List the file name endings of all readers."""
     return [suffix for reader in READERS for suffix in reader.suffixes]
 
 
 def volume_name(path: Path) -> str:
-    """Short name of a file: without folder, known endings and the raw layout in its name."""
+    """Return the short name of a file: without folder, known endings and the raw layout in its name."""
     name = path.name
     for suffix in sorted(known_suffixes(), key=len, reverse=True):
         if name.lower().endswith(suffix):

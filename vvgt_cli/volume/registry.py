@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import os
 import re
 import struct
@@ -14,11 +13,15 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
+from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.plain import RAW
+from vvgt_cli.volume.plain.raw import parse_name, read_stdin
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader
 from vvgt_cli.volume.space import in_space
+from vvgt_cli.volume.tiff import SLICES
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.unread import way_out
 
@@ -51,10 +54,11 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
 
 
 def cut(volume: Volume, options: ReadOptions) -> Volume:
-    """What the options' mask and crop leave of a volume.
+    """Apply the options' mask and crop to a volume.
 
     Raises:
-        DataError, UsageError: a mask of another size, a crop outside.
+        DataError: a mask of another size.
+        UsageError: a crop outside of the volume.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     how = ReadOptions(stored=options.stored)
@@ -66,10 +70,8 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
 
 
 def _read(source: str, options: ReadOptions) -> Volume:
-    """The volume in its format's own space."""
+    """Read a volume in its format's own space."""
     if source == "-":
-        from vvgt_cli.volume.raw import read_stdin
-
         return read_stdin(options)
     scheme, colon, rest = source.partition(":")
     if colon and scheme in SCHEMES:
@@ -92,7 +94,7 @@ def _read(source: str, options: ReadOptions) -> Volume:
 
 
 def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Volume:
-    """The volume that came through the pipe ``path`` and lies in ``kept``."""
+    """Read the volume that came through the pipe ``path`` and was saved in ``kept``."""
     try:
         return replace(_read(str(kept), options), name=path.name)
     except VvgtError as error:
@@ -101,7 +103,7 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
 
 
 def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | None]:
-    """Time and unit of each step of a source, where ``options`` choose none; None where it does not say.
+    """List time and unit of each step of a source where ``options`` choose none; None where the source states no times.
 
     Raises:
         DataError, UsageError: as `read_volume`.
@@ -116,7 +118,7 @@ def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | No
 
 
 def contents(source: str, options: ReadOptions) -> dict[str, Any]:
-    """Steps, arrays and blocks of a file, each a list of rows with the option that chooses it; empty of most formats.
+    """List steps, arrays and blocks of a file, rows with the option that chooses each; empty for most formats.
 
     Raises:
         DataError: no such file, or a damaged one.
@@ -128,8 +130,26 @@ def contents(source: str, options: ReadOptions) -> dict[str, Any]:
     return {} if reader.contents is None else reader.contents(path, options)
 
 
+def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes of a source's resolutions, slowest axis first and finest first; empty for most formats.
+
+    Raises:
+        DataError, UsageError: as `read_volume`, of an address on a server.
+    """
+    if source.partition(":")[0] in STEPPED:
+        from vvgt_cli.volume.arrays.remote import level_shapes as remote
+
+        return remote(source, options)
+    path = Path(source)
+    if path.is_dir():
+        found = next((r for r in READERS if r.levels is not None and r.holds is not None and r.holds(path)), None)
+    else:
+        found = _recognised(path, _head(path, source))[0] if path.is_file() else None
+    return [] if found is None or found.levels is None else found.levels(path, options)
+
+
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
-    """Path of ``PATH:/inner/path``, and the options with the inner path as their array."""
+    """Split ``PATH:/inner/path`` into the path, and the options with the inner path as their array."""
     head, _, inner = source.rpartition(":/")
     if not head or os.path.exists(source) or not os.path.exists(head):
         return Path(source), options
@@ -139,26 +159,26 @@ def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
 
 
 def _slices(source: str, options: ReadOptions) -> Volume | None:
-    """The volume of a glob of slices, or None where the source is none."""
+    """Read a glob of slices; None where the source is none."""
     if not set(source) & set("*?[") or "\0" in source or os.path.exists(source):
         return None
-    from vvgt_cli.volume.slices import READER, read_glob
+    from vvgt_cli.volume.tiff.slices import read_glob
 
     volume = read_glob(source, options)
     if volume is not None:
-        _check_options(READER, source, options)
+        _check_options(SLICES, source, options)
     return volume
 
 
 def _folder(path: Path, source: str) -> Reader:
-    """The reader of a folder; none where more of its files are volumes of other formats."""
+    """Find the reader of a folder; none where more of its files are volumes of other formats."""
     lying = _volumes_in(path)
     for reader in READERS:
         if reader.holds is not None and reader.holds(path):
             mine = (reader.name, *reader.within)
             own = sum(len(lying.get(kind, [])) / (PREVIEWS if kind == "picture" else 1) for kind in mine)
             others = sum(len(names) for kind, names in lying.items() if kind not in (*mine, "picture"))
-            if reader.by_whole or own >= others:
+            if reader.whole or own >= others:
                 return reader
     if lying:
         listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
@@ -169,7 +189,7 @@ def _folder(path: Path, source: str) -> Reader:
 
 
 def _volumes_in(path: Path) -> dict[str, list[str]]:
-    """The volume files in a folder (not in those in it), by format: of their name, else of their content."""
+    """Group the volume files in a folder (not in its folders) by format, known by their names or else their content."""
     found: dict[str, list[str]] = {}
     for name in sorted(entry.name for entry in islice(os.scandir(path), LOOKED_AT) if entry.is_file()):
         reader = _by_name(path / name)
@@ -179,14 +199,14 @@ def _volumes_in(path: Path) -> dict[str, list[str]]:
                     head = file.read(HEAD_BYTES)
             except OSError:
                 continue
-            reader = next((r for r in READERS if r.holds is not None and head and r.sniff(head)), None)
+            reader = next((r for r in READERS if r.holds is not None and head and r.sniff and r.sniff(head)), None)
         if reader is not None:
             found.setdefault(reader.name, []).append(name)
     return found
 
 
 def _head(path: Path, source: str) -> bytes:
-    """First bytes of a file; raises `DataError` if there are none to be had."""
+    """Read the first bytes of a file; raise `DataError` where there are none."""
     try:
         with open(path, "rb") as file:
             head = file.read(HEAD_BYTES)
@@ -196,21 +216,20 @@ def _head(path: Path, source: str) -> bytes:
     except (OSError, ValueError) as error:
         raise DataError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     named = _by_name(path)
-    if not head and not (named and named.empty):
+    if not head and not (named and named.nameable):
         raise DataError(f"{source}: the file is empty; expected a volume")
     return head.removeprefix(MARK)
 
 
-def _by_content(path: Path, head: bytes) -> tuple[Reader | None, bool]:
-    """The first reader that recognises the head, and whether the file is gzip-compressed."""
+def _recognised(path: Path, head: bytes) -> tuple[Reader | None, bool]:
+    """Find the first reader that recognises a file's content, and tell whether the file is compressed by gzip."""
     zipped = head[:2] == b"\x1f\x8b"
     if zipped:
         try:
-            with gzip.open(path, "rb") as file:
-                head = file.read(HEAD_BYTES)
-        except (OSError, EOFError, zlib.error):
+            head, _ = read_head(path, HEAD_BYTES)
+        except DataError:
             return None, True
-    return next((r for r in READERS if r.sniff(head)), None), zipped
+    return next((r for r in READERS if r.sniff is not None and r.sniff(head)), None), zipped
 
 
 def _by_name(path: Path) -> Reader | None:
@@ -220,24 +239,23 @@ def _by_name(path: Path) -> Reader | None:
 
 
 def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
-    from vvgt_cli.volume import raw
-
+    """Find the reader of a file, or raise `DataError` with what else to do with it."""
     named = _by_name(path)
-    found, zipped = _by_content(path, head)
+    found, zipped = _recognised(path, head)
     if found is not None and named is not None and found.name in named.within:
         found = named
-    raw_layout = options.dtype or raw.parse_name(path.name) or (options.dims and not (found and found.resamples))
+    raw_layout = options.dtype or parse_name(path.name) or (options.dims and not (found and found.resamples))
     if found is not None and found is not named and raw_layout:
-        return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
+        return RAW  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
-        if zipped and not found.unzips:
+        if zipped and not any(suffix.endswith("gz") for suffix in found.suffixes):
             raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
         return found
     if options.dims and (options.dtype or named is None or not named.resamples):
-        return raw.READER
+        return RAW
     if known := way_out(path, head, by_name=named is None):
         raise DataError(f"{path}: {known}")
-    if named is not None and named.by_name:
+    if named is not None and (named.by_name or named.nameable):
         return named
     if named is not None:
         raise DataError(
@@ -248,18 +266,18 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 
 
 def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
-    needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
-    if not reader.raw_layout and needless:
+    needless = [flag for flag in options.raw_flags if flag.strip("-").replace("-", "_") not in reader.takes]
+    if needless:
         raise UsageError(
             f"{source}: {reader.name}, which states its own layout; leave out {' '.join(needless)} (--spacing is "
             "taken; to read its bytes as raw values, pipe them in, with - as the source)"
         )
-    if options.time is not None and not reader.times:
+    if options.time is not None and "time" not in reader.takes:
         raise UsageError(
-            f"{source}: a {reader.name} file, of which no time steps are known; leave out --time {options.time} (along "
-            "a fourth axis of any kind --component N chooses)"
+            f"{source}: a {reader.name} file, which has no known time steps; leave out --time {options.time} (along a "
+            "fourth axis of any kind --component N chooses)"
         )
-    if options.array is not None and not reader.named_arrays:
+    if options.array is not None and "array" not in reader.takes:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"
         )

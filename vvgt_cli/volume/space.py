@@ -1,4 +1,4 @@
-"""Anatomical spaces: bringing volumes to one, and axes in words.
+"""Positions of volumes: index axes, anatomical spaces and units of length.
 
 A space is named by where its axes point: RAS+ (right, anterior, superior; NIfTI) or LPS+ (left, posterior, superior;
 DICOM and ITK). The two differ by half a turn about the third axis.
@@ -6,19 +6,22 @@ DICOM and ITK). The two differ by half a turn about the third axis.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
 SPACES = ("RAS", "LPS")
 _OPPOSITE = {"R": "L", "L": "R", "A": "P", "P": "A", "S": "I", "I": "S"}
 _WORDS = {"right": "R", "left": "L", "anterior": "A", "posterior": "P", "superior": "S", "inferior": "I"}
-METRES = {  # of a unit's name, its long names, and what the page and files call it
+METRES = {  # length of a unit in metres, its short name, and others
     1e3: ("km", "kilometer", "kilometre"), 1.0: ("m", "meter", "metre"), 1e-2: ("cm", "centimeter", "centimetre"),
     1e-3: ("mm", "millimeter", "millimetre"), 1e-6: ("um", "µm", "micron", "micrometer", "micrometre"),
     1e-9: ("nm", "nanometer", "nanometre"), 1e-10: ("angstrom", "Å"), 1e-12: ("pm", "picometer", "picometre"),
@@ -27,8 +30,40 @@ MILLIMETRE = 1e-3
 _LENGTHS = {name: metres for metres, names in METRES.items() for name in names}
 
 
+def unit_rows(vectors: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Split three axis vectors into lengths and directions.
+
+    Args:
+        vectors: (3, 3) numbers, one axis a row.
+
+    Returns:
+        The lengths, and the row-major matrix whose columns are the unit vectors.
+    """
+    rows = np.asarray(vectors).tolist()
+    lengths = tuple(math.hypot(*row) for row in rows)
+    unit = [[c / n if n > 0 else float(i == k) for k, c in enumerate(row)]
+            for i, (row, n) in enumerate(zip(rows, lengths, strict=True))]  # fmt: skip
+    return lengths, tuple(unit[column][row] for row in range(3) for column in range(3))
+
+
+def placed(field: Any, steps: Any, origin: Any, options: ReadOptions, name: str, **facts: Any) -> Volume:
+    """Make the volume of a field whose index axes step along given vectors.
+
+    Args:
+        field: (nz, ny, nx) stored values.
+        steps: (3, 3) world vectors of a step along x, y and z, one a row.
+        origin: (3,) world position of the first voxel's centre.
+        options: ``spacing`` replaces the lengths of the steps.
+        name: of the volume.
+        **facts: other attributes of `Volume`.
+    """
+    spacing, direction = unit_rows(steps)
+    first = tuple(np.asarray(origin, np.float64).tolist())
+    return Volume(field, options.spacing_or(spacing), first, direction, name, **facts)
+
+
 def in_space(volume: Volume, wanted: str | None) -> Volume:
-    """The volume with direction and origin in an anatomical space; as it is where its file states none.
+    """Bring direction and origin of a volume to an anatomical space; leave them where its file states none.
 
     Args:
         volume: in the space that its format is in.
@@ -74,7 +109,7 @@ def one_unit(units: Sequence[str], source: str, spacing_given: bool) -> tuple[np
 
     Returns:
         Factors (n,) float64, and the short name of the unit of the first axis that states one, "" if none does or it is
-        not a length, which a warning says.
+        not a length (with a warning).
 
     Raises:
         UsageError: units that do not compare.
@@ -92,7 +127,7 @@ def one_unit(units: Sequence[str], source: str, spacing_given: bool) -> tuple[np
 
 
 def world_axis(name: str, space: str | None) -> str:
-    """The signed axis (x, -x, ...) of a world direction: an anatomical word, or such an axis itself.
+    """Return the signed axis (x, -x, ...) of a world direction: an anatomical word, or such an axis itself.
 
     Raises:
         UsageError: an anatomical word where the space is not.
@@ -109,7 +144,7 @@ def world_axis(name: str, space: str | None) -> str:
 
 
 def axis_facts(affine: np.ndarray, space: str | None) -> dict[str, object]:
-    """What `vvgt info` says of an affine (3 or 4, 4): where index axes run, their handedness, the numbers."""
+    """Describe an affine (3 or 4, 4) for `vvgt info`: where index axes run, their handedness, the numbers."""
     axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
     return {
         "axes": dict(zip("ijk", axis_words(axes, space), strict=True)),
@@ -119,7 +154,7 @@ def axis_facts(affine: np.ndarray, space: str | None) -> dict[str, object]:
 
 
 def axis_words(axes: np.ndarray, space: str | None) -> list[str]:
-    """Where index axes i, j, k run: "L-R" is from left to right, "-y" against world y.
+    """Describe where index axes i, j, k run: "L-R" is from left to right, "-y" against world y.
 
     An axis that is more than half a degree off the world axis nearest to it says by how many degrees.
 
@@ -142,6 +177,6 @@ def axis_words(axes: np.ndarray, space: str | None) -> list[str]:
 
 
 def shear_text(axes: np.ndarray) -> str:
-    """The least angle between index axes, (3, 3) unit vectors as columns, as a line says it."""
+    """Describe the least angle between index axes, (3, 3) unit vectors as columns."""
     cosines = [abs(float(axes[:, a] @ axes[:, b])) for a, b in ((0, 1), (0, 2), (1, 2))]
     return f"index axes {np.degrees(np.arccos(min(max(cosines), 1.0))):.1f} degrees apart"

@@ -53,7 +53,7 @@ def slabs(volume: Volume, max_voxels: int = SLAB_VOXELS) -> Iterator[tuple[int, 
 
 
 def statistics(volume: Volume) -> Statistics:
-    """Statistics of a volume's data values; memory stays within a few slabs.
+    """Compute statistics of a volume's data values; memory stays within a few slabs.
 
     Raises:
         DataError: no voxel has a finite value, or the scaling makes values infinite.
@@ -80,7 +80,7 @@ def check_range(lo: float, hi: float, volume: Volume) -> None:
 
 
 def edges_of(lo: float, hi: float) -> np.ndarray:
-    """(257,) bin edges over [lo, hi]."""
+    """Return (257,) bin edges over [lo, hi]."""
     if lo == hi:
         half = max(0.5, abs(lo) * 2.0**-40)
         lo, hi = lo - half, hi + half
@@ -92,14 +92,14 @@ def edges_of(lo: float, hi: float) -> np.ndarray:
 
 
 def bins_of(values: np.ndarray, lo: float, hi: float) -> np.ndarray:
-    """Bin of each value; the last bin is closed."""
+    """Return the bin of each value; the last bin is closed."""
     width = hi - lo
     t = (values - lo) / width if np.isfinite(width) else (values / 2 - lo / 2) / (hi / 2 - lo / 2)
     return np.minimum((t * BINS).astype(np.int64), BINS - 1)
 
 
 def integer_statistics(counts: np.ndarray, volume: Volume) -> Statistics:
-    """Statistics from ``counts`` (256 or 65536,) of every stored value of an 8- or 16-bit type, as its bytes, unsigned.
+    """Compute statistics from ``counts`` (256 or 65536,) of every stored 8- or 16-bit value, as unsigned bytes.
 
     Raises:
         DataError: the scaling makes values infinite.
@@ -117,19 +117,19 @@ def integer_statistics(counts: np.ndarray, volume: Volume) -> Statistics:
 
 
 def count_integers(volume: Volume) -> tuple[np.ndarray, int]:
-    """Counts of every stored value of an 8- or 16-bit type, and the value that the first count is of."""
+    """Count every stored value of an 8- or 16-bit type; return the counts and the value of the first one."""
     return _in_order(_byte_counts(volume), volume)
 
 
 def _in_order(counts: np.ndarray, volume: Volume) -> tuple[np.ndarray, int]:
-    """Counts of values as their bytes, unsigned, in the order of the values, and the first of these."""
+    """Order counts by unsigned bytes by value; return them and the value of the first one."""
     if volume.data.dtype.kind == "i":  # two's complement: the upper half are the negative values
         return np.roll(counts, len(counts) // 2), -(len(counts) // 2)
     return counts, 0
 
 
 def _byte_counts(volume: Volume) -> np.ndarray:
-    """Counts of every stored value of an 8- or 16-bit type, as its bytes, unsigned."""
+    """Count every stored value of an 8- or 16-bit type, as its bytes, unsigned."""
     dtype = volume.data.dtype.newbyteorder("=")
     unsigned = np.dtype(f"u{dtype.itemsize}")
     size = 256**dtype.itemsize
@@ -140,7 +140,7 @@ def _byte_counts(volume: Volume) -> np.ndarray:
 
 
 def finite_values(slab: np.ndarray, volume: Volume) -> np.ndarray:
-    """Finite data values of a slab, (n,) float64."""
+    """Return the finite data values of a slab, (n,) float64."""
     with np.errstate(over="ignore", invalid="ignore"):
         values = slab.ravel().astype(np.float64)
         if (volume.slope, volume.intercept) != (1.0, 0.0):

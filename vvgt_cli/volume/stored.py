@@ -1,6 +1,6 @@
 """`Stored`: a (nz, ny, nx) array that stays in its file (Zarr, HDF5), or lazy (Dask), and is read block by block.
 
-It stands where a `Volume` has its array, and gives parts of it to whoever asks for them by three slices.
+It takes the place of a `Volume`'s array: indexed by three slices, it reads that part.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.bricks import BrickArray
-from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.blocks import IN_BLOCKS, Packed, check_memory
 from vvgt_cli.volume.types import Volume
 
 Slices = tuple[slice, ...]
@@ -26,7 +24,7 @@ MAPPED = 32 << 20  # bytes of a mapped file that are held at once
 
 
 class Stored:
-    """See the module.
+    """A (nz, ny, nx) array whose values stay in a file, or are computed when they are read.
 
     Attributes:
         shape: (nz, ny, nx).
@@ -44,17 +42,18 @@ class Stored:
         chunks: Sequence[int],
         source: str,
     ) -> None:
-        """Take what reads the block of three slices with start, stop and step 1, (z, y, x); ``source`` is its name."""
+        """Take a function that reads three slices (z, y, x) with start, stop and step 1; ``source`` is for messages."""
         self._read, self.dtype, self.shape, self.source = read, np.dtype(dtype), tuple(map(int, shape)), source
         self.chunks = tuple(max(min(int(c), n), 1) for c, n in zip(chunks, self.shape, strict=True))
         self.size = math.prod(self.shape)
         self.nbytes = self.size * self.dtype.itemsize
 
     def __len__(self) -> int:
+        """Return the number of slices."""
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """The block of one to three slices.
+        """Read the block of one to three slices.
 
         Raises:
             DataError: a chunk that cannot be read, with its index.
@@ -70,7 +69,7 @@ class Stored:
             raise self._damaged(slices, error) from error
 
     def part(self, index: Slices) -> Stored:
-        """What three slices with step 1 leave of it, still in its file."""
+        """Return the part that three slices with step 1 leave, still in its file."""
         spans = [k.indices(n)[:2] for k, n in zip(index, self.shape, strict=True)]
 
         def read(slices: Slices) -> np.ndarray:
@@ -79,7 +78,7 @@ class Stored:
         return Stored(read, self.dtype, tuple(b - a for a, b in spans), self.chunks, self.source)
 
     def _damaged(self, slices: Slices, error: Exception) -> DataError:
-        """The error of the first chunk in the block that cannot be read."""
+        """Make the error of the first chunk in the block that cannot be read."""
         spans = [range(s.start // c, -(-s.stop // c)) for s, c in zip(slices, self.chunks, strict=True)]
         for index in itertools.product(*spans):
             part = tuple(
@@ -97,13 +96,40 @@ class Stored:
         return DataError(f"{self.source}: cannot be read ({error}); try again")
 
 
+def stored_or_held(
+    read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
+    stored: bool, instead: str = IN_BLOCKS,
+) -> Any:  # fmt: skip
+    """Return a `Stored`, or its values in memory where ``stored`` is False; other arguments as `Stored`.
+
+    Raises:
+        DataError: the values do not fit in memory; ``instead`` is what else may be done.
+    """
+    found = Stored(read, dtype, tuple(shape), chunks, source)
+    if stored:
+        return found
+    check_memory(found.nbytes, source, instead)
+    return found[:]
+
+
+def put_overlap(out: np.ndarray, first: Sequence[int], block: np.ndarray, at: Sequence[int]) -> None:
+    """Copy into ``out`` the values of ``block`` that lie in it; both say where their first values lie in the whole."""
+    begin = [max(a, b) for a, b in zip(first, at, strict=True)]
+    end = [min(a + n, b + m) for a, n, b, m in zip(first, out.shape, at, block.shape, strict=True)]
+    if all(a < b for a, b in zip(begin, end, strict=True)):
+        there, here = (
+            tuple(slice(a - o, b - o) for a, b, o in zip(begin, end, origin, strict=True)) for origin in (first, at)
+        )
+        out[there] = block[here]
+
+
 def readable_in_blocks(volume: Volume) -> bool:
-    """Whether parts of a volume's array can be had without the rest: mapped, `Stored`, bricks, or in memory."""
+    """Tell whether parts of a volume's array can be read without the rest: mapped, `Stored`, bricks, or in memory."""
     return not isinstance(volume.data, Packed)
 
 
 def held(volume: Volume) -> Volume:
-    """The volume with its values in memory.
+    """Load the values of a volume into memory.
 
     Raises:
         DataError: they do not fit.
@@ -116,26 +142,26 @@ def held(volume: Volume) -> Volume:
 
 
 def chunks_of(volume: Volume) -> tuple[int, ...]:
-    """Voxels (z, y, x) of what a volume's file packs together; of plain values a slice."""
+    """Return the voxels (z, y, x) that a volume's file packs together; a slice of plain values."""
     return volume.data.chunks if isinstance(volume.data, Stored) else (1, *volume.data.shape[1:])
 
 
 def is_file_backed(volume: Volume) -> bool:
-    """Whether a volume's values lie in a file, mapped or `Stored`."""
+    """Tell whether a volume's values lie in a file, mapped or `Stored`."""
     return isinstance(volume.data, Stored) or _map_under(volume.data) is not None
 
 
 def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """The stored values of voxels ``lo`` to ``hi`` (3,) int, x first, the latter not in it: (z, y, x), native.
+    """Read the stored values of voxels ``lo`` to ``hi`` (3,) int, x first, ``hi`` excluded: (z, y, x), native.
 
-    The caller's own; pages of a mapped file that it came from are given back to the system.
+    The array belongs to the caller; pages of a mapped file that it came from are given back to the system.
 
     Raises:
         DataError: the file ends early, or a chunk is damaged.
     """
     (x0, y0, z0), (x1, y1, z1) = lo, hi
     data: Any = volume.data
-    if isinstance(data, Stored):  # what it gives is nobody else's
+    if isinstance(data, Stored):  # nobody else holds what it returns
         part = data[z0:z1, y0:y1, x0:x1]
         return np.require(part, part.dtype.newbyteorder("="), ["C", "A", "W"])
     out = np.empty((z1 - z0, y1 - y0, x1 - x0), data.dtype.newbyteorder("="))
@@ -144,14 +170,14 @@ def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
 
 
 def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
-    """Write what a box of an array (not `Stored`) from ``lo`` (3,), x first, on holds into ``out`` (z, y, x).
+    """Copy the box of an array (not `Stored`) that begins at ``lo`` (3,), x first, into ``out`` (z, y, x).
 
     Pages of a mapped file that it came from are given back to the system.
     """
     (x0, y0, z0), (z1, y1, x1) = lo, np.asarray(lo)[::-1] + out.shape
     under = _map_under(data)
     if under is None or not hasattr(mmap, "MADV_DONTNEED"):
-        out[...] = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
+        out[...] = data[z0:z1][:, y0:y1, x0:x1]  # bricks are laid out slab by slab
         return
     slab = max(MAPPED // max(out[0].nbytes, 1), 1)
     for z in range(0, len(out), slab):
@@ -160,14 +186,14 @@ def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
 
 
 def give_back(data: np.ndarray) -> None:
-    """Give the pages of a mapped file that an array is of back to the system."""
+    """Give the pages of an array's mapped file back to the system."""
     under = _map_under(data)
     if under is not None and hasattr(mmap, "MADV_DONTNEED"):
         under.madvise(mmap.MADV_DONTNEED)
 
 
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
-    """Data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
+    """Read the data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
     found = np.empty(len(index))
     edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]]) if isinstance(volume.data, Stored) else None
     if edge is None:
@@ -186,7 +212,7 @@ def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
 
 
 def planes(volume: Volume) -> Iterator[np.ndarray]:
-    """The stored values of each slice (ny, nx), one after the other."""
+    """Yield the stored values of each slice (ny, nx)."""
     nx, ny, nz = volume.dims
     depth = chunks_of(volume)[0]
     for z in range(0, nz, depth):
@@ -194,7 +220,7 @@ def planes(volume: Volume) -> Iterator[np.ndarray]:
 
 
 def _map_under(data: Any) -> mmap.mmap | None:
-    """The map that an array is a view of, None where it is of none that is only read."""
+    """Return the read-only map that an array is a view of, None where there is none."""
     while data is not None and not isinstance(data, mmap.mmap):
         if isinstance(data, np.memmap) and data.mode != "r":
             return None

@@ -19,7 +19,7 @@ PARTS = 4  # of a block, counted at once
 
 @dataclass(frozen=True)
 class Tally:
-    """What is counted of some blocks.
+    """Counts over some blocks.
 
     Attributes:
         counts: (256 or 65536,) of every stored value of an 8- or 16-bit type (as its bytes, unsigned), (0,) of others.
@@ -38,7 +38,7 @@ class Tally:
     histogram: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def plus(self, other: Tally) -> Tally:
-        """Of both."""
+        """Add another tally to this one."""
         return Tally(
             self.counts + other.counts,
             min(self.lo, other.lo),
@@ -51,12 +51,12 @@ class Tally:
 
 
 def counted(volume: Volume) -> bool:
-    """Whether every value of the volume's type is counted, so that no second pass is needed for a histogram."""
+    """Tell whether every value of the volume's type is counted, so that a histogram needs no second pass."""
     return volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2
 
 
 def tally(values: np.ndarray, volume: Volume, limits: tuple[float, float] | None = None) -> Tally:
-    """Of a block of stored values (z, y, x), native, C-contiguous; with ``limits`` (data values) its histogram alone.
+    """Tally a block of stored values (z, y, x), native, C-contiguous; with ``limits`` (data values) only a histogram.
 
     The block is made read-only.
     """
@@ -73,7 +73,7 @@ def tally(values: np.ndarray, volume: Volume, limits: tuple[float, float] | None
 
 
 def _range(values: np.ndarray, volume: Volume) -> Tally:
-    """Range and finite voxels of ``values``, float32 or float64."""
+    """Find the range and count the finite voxels of ``values``, float32 or float64."""
     from vvgt_cli.volume.count_kernel import FINITE, HIGH, LOW, NAN, STORED_HIGH, STORED_LOW, range_values
 
     ends, numbers = np.empty((PARTS, 4)), np.zeros((PARTS, 2), np.int64)
@@ -85,7 +85,7 @@ def _range(values: np.ndarray, volume: Volume) -> Tally:
 
 
 def _binned(values: np.ndarray, volume: Volume, limits: tuple[float, float]) -> Tally:
-    """Histogram of ``values``, float32 or float64, over ``limits``."""
+    """Make a histogram of ``values``, float32 or float64, over ``limits``."""
     from vvgt_cli.volume.count_kernel import LANES, bin_values
 
     edges = edges_of(*limits)
@@ -96,7 +96,7 @@ def _binned(values: np.ndarray, volume: Volume, limits: tuple[float, float]) -> 
 
 
 def with_limits(whole: Tally, volume: Volume) -> Tally:
-    """The sum over all blocks, checked.
+    """Check the sum over all blocks and complete it with its limits.
 
     Raises:
         Unsuitable: no voxel has a finite value, or the scaling makes values infinite.
@@ -116,7 +116,7 @@ def with_limits(whole: Tally, volume: Volume) -> Tally:
 
 
 def statistics_of(whole: Tally, volume: Volume, histogram: np.ndarray | None = None) -> Statistics:
-    """The statistics that `with_limits` of all blocks, and the histogram of a second pass over them, amount to.
+    """Return the statistics of `with_limits` of all blocks and of the histogram of a second pass over them.
 
     Without ``histogram`` (a function is given, in data values) all values count in the lowest bin.
     """

@@ -19,8 +19,13 @@ RIGHT = 1e-4  # cosine up to which axes are at right angles
 T = TypeVar("T")
 
 
+def float_dtype(dtype: np.dtype) -> np.dtype:
+    """Return the type of floats that holds all values of a type, and NaN."""
+    return np.dtype(np.float32 if dtype.itemsize <= (4 if dtype.kind == "f" else 2) else np.float64)
+
+
 def triple(values: Iterable[T]) -> tuple[T, T, T]:
-    """Three values as a tuple of known length."""
+    """Return three values as a tuple of known length."""
     x, y, z = values
     return x, y, z
 
@@ -82,6 +87,7 @@ class Volume:
     unit: str = ""
 
     def __post_init__(self) -> None:
+        """Check the attributes."""
         if self.data.ndim != 3 or min(self.data.shape) < 1:
             raise DataError(f"{self.name}: array of shape {self.data.shape}; expected three axes (z, y, x), none empty")
         if self.data.dtype.kind not in "iufb":
@@ -133,7 +139,7 @@ class Volume:
         return bool(np.abs(axes.T @ axes - np.eye(3)).max() > RIGHT)
 
     def unit_frame(self) -> UnitFrame:
-        """The frame that cameras and Gaussians of a run live in (conventions: Space)."""
+        """Return the frame that cameras and Gaussians of a run live in (conventions: Space)."""
         extent = self.extent
         scale = 2.0 / max(extent)
         half = triple(e * scale / 2 for e in extent)

@@ -14,7 +14,7 @@ from vvgt_cli.conversion.shards.plan import Plan
 from vvgt_cli.gaussians.ply import as_stored
 
 if TYPE_CHECKING:
-    from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.dvr.layout import Light
     from vvgt_cli.field.forest import Forest

@@ -33,7 +33,7 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
-    from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.dvr.layout import Light
     from vvgt_cli.field.forest import Coarse, Forest
     from vvgt_cli.gaussians import Gaussians
@@ -109,7 +109,7 @@ def pyramid(parts: Parts, plan: Plan, light: Light | None = None) -> tuple[Fores
 
 
 def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
-    from vvgt_cli.closed_form.inset import SURFACE, nowhere, smoothed
+    from vvgt_cli.closed_form.surface_offset import SURFACE, nowhere, smoothed
 
     grid, half = plan.grid, np.array(plan.grid.half)
     edge = grid.cell_edge * 2.0**grid.field

@@ -1,4 +1,4 @@
-"""What an OpenVDB file says around its trees: header, metadata, grid descriptors, transforms.
+"""The parts of an OpenVDB file around its trees: header, metadata, grid descriptors, transforms.
 
 Layout as openvdb/io/Archive.cc, GridDescriptor.cc, MetaMap.cc and math/Maps.h have it, format versions 222 to 224.
 """
@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import printable, unit_rows
+from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
 from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT
 
-MAGIC = b" BDV\0\0\0\0"
 VERSIONS = range(222, 225)
 _UUID = 36
 _HALF = "_HalfFloat"
@@ -41,7 +42,7 @@ class Grid:
     """A grid's descriptor.
 
     Attributes:
-        name: without the number that tells apart grids of one name.
+        name: without the number that distinguishes grids of one name.
         number: that number, or None.
         parent: unique name of the grid whose tree this one shares, or "".
         kind: value type, a key of `TYPES` if it can be read.
@@ -70,20 +71,23 @@ class Grid:
 
     @property
     def readable(self) -> bool:
+        """Whether values and tree are of kinds that are read."""
         return self.kind in TYPES and self.levels == _LEVELS
 
     @property
     def components(self) -> int:
+        """Numbers in a value; 0 for an unknown kind."""
         return TYPES[self.kind][1] if self.kind in TYPES else 0
 
     def __str__(self) -> str:
+        """Describe the grid in a listing."""
         tree = "" if self.levels == _LEVELS else f", tree {self.levels.replace('_', '-') or 'unknown'}"
         text = f"{self.label or '(unnamed)'} ({self.kind}{', stored as half' if self.half else ''}{tree})"
         return printable(text[:100])
 
 
 def read_header(cursor: Cursor) -> list[Grid]:
-    """The grids of a file; the cursor stands at its beginning.
+    """Read the descriptors of a file's grids; the cursor stands at its beginning.
 
     Raises:
         DataError: no OpenVDB file, another version, one that was written as a stream, or damage.
@@ -94,12 +98,12 @@ def read_header(cursor: Cursor) -> list[Grid]:
     if version not in VERSIONS:
         raise DataError(
             f"{cursor.name}: OpenVDB format version {version}; expected {VERSIONS[0]} to {VERSIONS[-1]}; write the "
-            "file anew with OpenVDB 3 or newer"
+            "file again with OpenVDB 3 or newer"
         )
     _, _, offsets = cursor.unpack("IIB")
     if not offsets:
         raise DataError(
-            f"{cursor.name}: written as an OpenVDB stream, without offsets of its grids; write it anew with "
+            f"{cursor.name}: written as an OpenVDB stream, without offsets of its grids; write it again with "
             "openvdb::io::File"
         )
     cursor.take(_UUID)
@@ -116,7 +120,7 @@ def read_header(cursor: Cursor) -> list[Grid]:
 
 
 def _descriptor(cursor: Cursor) -> tuple[Grid, int]:
-    """A grid's descriptor, and where the next one begins."""
+    """Read a grid's descriptor, and where the next one begins."""
     unique, type_name, parent = cursor.text(), cursor.text(), cursor.text()
     start, _, end = cursor.unpack("qqq")
     half = type_name.endswith(_HALF)
@@ -129,7 +133,7 @@ def _descriptor(cursor: Cursor) -> tuple[Grid, int]:
 
 
 def skip_metadata(cursor: Cursor) -> dict[str, bytes]:
-    """Metadata by name; values as they are stored."""
+    """Read metadata by name; values as they are stored."""
     (count,) = cursor.unpack("I")
     found = {}
     for _ in range(count):
@@ -149,12 +153,12 @@ class Placement:
     translation: np.ndarray
 
     def at(self, index: np.ndarray) -> tuple[float, ...]:
-        """World position of a voxel centre (x, y, z)."""
+        """Return the world position of a voxel centre (x, y, z)."""
         return tuple(float(v) for v in index @ self.axes + self.translation)
 
 
 def read_grid_head(cursor: Cursor) -> tuple[int, bool, Placement]:
-    """Compression flags, whether floats are stored in 16 bits, and the transform; the cursor stands at a grid's start.
+    """Read compression flags, whether floats have 16 bits, and the transform; the cursor stands at a grid's start.
 
     Raises:
         DataError: unknown flags, a transform that does not take boxes to boxes, or damage.

@@ -19,7 +19,7 @@ _MAX_SPLITS, _MIN_SPLIT = 16, 128  # blosc.c
 
 
 def read_block(cursor: Cursor, need: int, compression: int) -> bytes | memoryview:
-    """The next ``need`` bytes of values.
+    """Read the next ``need`` bytes of values.
 
     Raises:
         DataError: cut short, damaged, or of another length.
@@ -74,7 +74,7 @@ def _unblosc(data: memoryview, need: int, cursor: Cursor) -> bytes:
 
 
 def _unsplit(data: memoryview, start: int, length: int, splits: int, cursor: Cursor) -> bytes:
-    """One block of ``length`` bytes: streams of equal lengths, each behind its compressed length."""
+    """Decompress one block of ``length`` bytes: streams of equal lengths, each behind its compressed length."""
     import lz4.block
 
     each, out = length // splits, []
@@ -98,7 +98,7 @@ def _unsplit(data: memoryview, start: int, length: int, splits: int, cursor: Cur
 
 
 def _unshuffle(block: bytes, typesize: int) -> bytes:
-    """Undo the byte shuffle: first bytes of all values, then the second ones; a rest stays as it is."""
+    """Undo the byte shuffle: first bytes of all values, then the second ones; the rest stays as it is."""
     n = len(block) // typesize
     body = np.frombuffer(block, np.uint8, n * typesize).reshape(typesize, n).T.tobytes()
     return body + block[n * typesize :]

@@ -17,14 +17,15 @@ class Cursor:
     """
 
     def __init__(self, data: memoryview, name: str) -> None:
+        """Begin at the start of ``data``."""
         self.data, self.name, self.at = data, name, 0
 
     def bad(self, what: str) -> DataError:
-        """The error to raise for what was found here."""
+        """Make the error for what was found here."""
         return DataError(f"{self.name}: {what} (near byte {self.at}); check that the file is whole")
 
     def take(self, n: int) -> memoryview:
-        """The next ``n`` bytes.
+        """Take the next ``n`` bytes.
 
         Raises:
             DataError: there are fewer.
@@ -35,11 +36,11 @@ class Cursor:
         return self.data[self.at - n : self.at]
 
     def unpack(self, form: str) -> tuple[Any, ...]:
-        """The next little-endian numbers, as `struct` has them."""
+        """Take the next little-endian numbers, by a format of `struct`."""
         return struct.unpack("<" + form, self.take(struct.calcsize("<" + form)))
 
     def text(self) -> str:
-        """A string behind its length."""
+        """Take a string behind its length."""
         (n,) = self.unpack("I")
         return str(self.take(n), "utf-8", "replace")
 

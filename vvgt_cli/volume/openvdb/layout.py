@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.bricks import EDGE, BrickArray, brick_grid
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.openvdb.bricks import EDGE, BrickArray, brick_grid
 from vvgt_cli.volume.openvdb.tree import Node, Tree
 
 
 def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """First and last active voxel, (3,) int64 each (x, y, z).
+    """Find the first and last active voxel, (3,) int64 each (x, y, z).
 
     Raises:
         DataError: none is active.
@@ -46,7 +46,7 @@ def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:
 def brick_array(
     tree: Tree, lo: np.ndarray, hi: np.ndarray, component: int | str | None, source: str, label: str
 ) -> BrickArray:
-    """The voxels ``lo`` to ``hi`` (3,) (x, y, z), both in it, active or not; of vectors one component.
+    """Lay out the voxels ``lo`` to ``hi`` (3,) (x, y, z), both included; of vectors one component.
 
     Raises:
         DataError: more than the free memory, or a box that is too large.

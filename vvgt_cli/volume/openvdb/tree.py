@@ -62,10 +62,10 @@ class Tree:
 
 
 class TreeReader:
-    """Reads one tree; see the module."""
+    """A reader of one tree, which checks sizes before it allocates."""
 
     def __init__(self, cursor: Cursor, kind: str, half: bool, compression: int) -> None:
-        """``kind`` is a key of `TYPES`; the cursor stands behind the grid's transform."""
+        """Take a cursor behind the grid's transform; ``kind`` is a key of `TYPES`."""
         code, components = TYPES[kind]
         self.cursor, self.kind, self.compression = cursor, kind, compression
         self.dtype = np.dtype(code)
@@ -74,7 +74,7 @@ class TreeReader:
         self.room = free_memory()
 
     def read(self) -> Tree:
-        """The tree.
+        """Read the tree.
 
         Raises:
             DataError: cut short, damaged, or more than the free memory.
@@ -110,36 +110,36 @@ class TreeReader:
         return tree
 
     def spend(self, n: int) -> None:
-        """Note ``n`` bytes of memory; what counts is that many small things do not add up to more than there is."""
+        """Count ``n`` bytes of memory, so that many small things do not add up to more than there is."""
         if self.room is not None:
             self.room -= n
             if self.room < 0:
                 raise DataError(f"{self.cursor.name}: the tree's nodes alone do not fit the free memory")
 
     def corner(self) -> np.ndarray:
-        """Origin of the root's child or tile."""
+        """Read the origin of a child or tile of the root."""
         origin = np.array(self.cursor.unpack("3i"), np.int64)
         if (origin % UPPER).any():
             raise self.cursor.bad(f"a node at {origin.tolist()}, which is no multiple of {UPPER}")
         return origin
 
     def one(self) -> np.ndarray:
-        """One value, (c,)."""
+        """Read one value, (c,)."""
         return self.numbers(self.cursor.take(self.dtype.itemsize * max(sum(self.shape), 1)), self.dtype)
 
     def numbers(self, data: bytes | memoryview, dtype: np.dtype) -> np.ndarray:
-        """Values of bytes, in native order and full precision."""
+        """Convert bytes to values in native order and full precision."""
         if dtype.kind == "b":
             result: np.ndarray = np.frombuffer(data, np.uint8) != 0
             return result
         return np.frombuffer(data, dtype).astype(self.dtype.newbyteorder("="))
 
     def bits(self, n: int) -> np.ndarray:
-        """A mask of ``n`` bits, (n,) bool."""
+        """Read a mask of ``n`` bits, (n,) bool."""
         return np.unpackbits(np.frombuffer(self.cursor.take(n // 8), np.uint8), bitorder="little").view(bool)
 
     def node(self, origin: np.ndarray, width: int, step: int) -> Node:
-        """Masks and tiles of an inner node of ``width`` entries along its edge."""
+        """Read masks and tiles of an inner node of ``width`` entries along its edge."""
         n = width**3
         cube = (width, width, width)
         child, active = self.bits(n), self.bits(n)
@@ -150,7 +150,7 @@ class TreeReader:
         )
 
     def values(self, n: int, active: np.ndarray, count: int) -> np.ndarray:
-        """``n`` values of a node, (n, ...), of which those that are not ``active`` may be left out of the file.
+        """Read ``n`` values of a node, (n, ...); the file may lack those that are not ``active``.
 
         ``count`` is how many are. The byte before the values says how to restore the others: openvdb/io/Compression.h.
         """
@@ -178,7 +178,7 @@ class TreeReader:
         return out
 
     def leaves(self, masks: np.ndarray) -> np.ndarray:
-        """Values of all leaves, (n, 8, 8, 8, ...)."""
+        """Read the values of all leaves, (n, 8, 8, 8, ...)."""
         n = len(masks)
         cube = (n, LEAF, LEAF, LEAF)
         if self.kind in ("bool", "mask"):  # mask again, origin, and for bool the values as bits

@@ -1,0 +1,103 @@
+"""A volume's values under Gaussians: samples at the points of each."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+
+from vvgt_cli.dvr.kernel import FLAGS, sample
+from vvgt_cli.dvr.layout import TUPLES, Voxels
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.threads import ThreadSlice, iterations
+
+POINTS = 48  # a Gaussian
+NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
+PRIMES = 2, 3, 5
+
+
+def offsets() -> np.ndarray:
+    """Return (POINTS, 3) points of a Gaussian in its standard deviations: a Halton sequence and its mirror image.
+
+    They have the covariance of the law, so that the spread of a linear field is exact.
+    """
+    law = NormalDist()
+    half = np.array([[law.inv_cdf(_radical(k, base)) for base in PRIMES] for k in range(1, POINTS // 2 + 1)])
+    half = half @ np.linalg.inv(np.linalg.cholesky(half.T @ half / len(half))).T * NARROW
+    return np.concatenate([half, -half])
+
+
+def reach() -> float:
+    """Return the standard deviations within which all `offsets` lie."""
+    return float(np.linalg.norm(offsets(), axis=1).max())
+
+
+def _radical(k: int, base: int) -> float:
+    """Return the digits of k after the point, in reverse (van der Corput)."""
+    found, share = 0.0, 1.0 / base
+    while k:
+        k, digit = divmod(k, base)
+        found, share = found + digit * share, share / base
+    return found
+
+
+@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f4:2", TUPLES, fastmath=FLAGS, error_model="numpy")
+def sample_points(
+    thread: ThreadSlice,
+    voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
+    hi: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Write ``voxels`` at ``centres`` (n, 3) + ``arms`` (n, 3, 3) ``points`` (m, 3) into ``out`` (n, m).
+
+    All in voxel coordinates of the volume, of which ``begin`` (3,) is the first of ``voxels``. Written are values of
+    points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre.
+    """
+    for k in iterations(thread, len(centres)):
+        for m in range(len(points)):
+            p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
+            x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)
+            y = centres[k, 1] + (arms[k, 1, 0] * p0 + arms[k, 1, 1] * p1 + arms[k, 1, 2] * p2)
+            z = centres[k, 2] + (arms[k, 2, 0] * p0 + arms[k, 2, 1] * p1 + arms[k, 2, 2] * p2)
+            inside = x >= lo[0] - 0.5 and y >= lo[1] - 0.5 and z >= lo[2] - 0.5
+            if inside and x < hi[0] - 0.5 and y < hi[1] - 0.5 and z < hi[2] - 0.5:
+                out[k, m] = sample(voxels.values, x - begin[0], y - begin[1], z - begin[2])
+
+
+def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres (K, 3) and axes of a standard deviation (K, 3, 3), columns, of box-frame Gaussians, in voxels."""
+    axes = rotations(gaussians.quaternions.astype(np.float64))
+    arms = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :] / step[:, None]
+    return (gaussians.means.astype(np.float64) + half) / step - 0.5, np.ascontiguousarray(arms)
+
+
+def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept: float) -> np.ndarray:
+    """Return (K, 5) float32 of ``samples`` (K, POINTS) at points of Gaussians: mean, spread and direction of values.
+
+    The direction is that of the gradient, fitted by least squares, as long as the share of the spread that it explains.
+    Samples that are not finite do not count; a row without any has NaN.
+
+    Args:
+        samples: (K, POINTS) as kernels read them.
+        gaussians: in the box frame, as is the direction.
+        slope: of the data value ``slope * sample + intercept``.
+        intercept: of the data value.
+    """
+    known = np.isfinite(samples)
+    count = known.sum(axis=1)
+    values = np.where(known, samples, 0).astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = values.sum(axis=1) / count
+        differences = np.where(known, values - mean[:, None], 0)
+        spread = np.sqrt((differences**2).sum(axis=1) / count)
+    points = offsets()
+    rise = (
+        differences @ points @ np.linalg.inv(points.T @ points) * np.sign(slope)
+    )  # a standard deviation along each axis
+    explained = np.sqrt(((rise @ points.T) ** 2).mean(axis=1)) / np.maximum(spread, 1e-30)
+    axes = rotations(gaussians.quaternions.astype(np.float64))
+    gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
+    gradient *= (explained.clip(0, 1) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30))[:, None]
+    found = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
+    return np.concatenate([found, gradient], axis=1).astype(np.float32)

@@ -1,0 +1,321 @@
+"""The kernels that cast rays: through a volume's values or an optics grid, whole or in blocks, lit or not.
+
+Rays are p + t d: p, d (x, y, z) in voxels from the first voxel's centre, t in unit-frame lengths. A ray is cut into
+segments of equal length dt between its entry into the box at t0 and its exit; segment i goes from t0 + i dt on. Blocks
+of a volume cut rays into the same segments, and the block in which a segment's middle lies owns it, so that what the
+blocks show of a ray composes, front to back, to what the whole ray shows.
+
+Arguments: ``voxels`` and ``optics`` are `layout.Voxels` and `layout.Optics`; ``texels`` (`layout.Texels`) is an optics
+grid or None, and then ``voxels`` and ``optics`` hold the grid's extinction; ``light`` (`layout.Light`) or None;
+``empty`` (bz, by, bx) uint8 as `Scene.empty`. Which of them are None is known when a kernel is compiled: each of the
+eight kernels holds one loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec
+
+import numpy as np
+
+from vvgt_cli.dvr.kernel import (
+    FLAGS,
+    OPAQUE,
+    TILE,
+    U,
+    Vector,
+    any_light,
+    blend_texels,
+    box_span,
+    inverse,
+    is_flat,
+    pass_segment,
+    skip,
+    texel_at,
+    values_met,
+)
+from vvgt_cli.dvr.layout import LIT_GRID, Light, Optics, Texels, Voxels
+from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
+from vvgt_cli.dvr.shading import shading
+from vvgt_cli.dvr.vectors import Quad, lane, zeros4
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
+
+P = ParamSpec("P")
+LEAP = 8  # samples of a grid between two looks at the empty-space map
+
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
+_exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides of a face of blocks: no fast mathematics
+
+
+@_jit
+def _shade(
+    own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float
+) -> tuple[float, float, float]:
+    """Shade a segment's ``own`` (r, g, b, alpha) at p + s d, seen along ``look``; no colour exceeds its alpha."""
+    factor, white = shading(
+        values, light, p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2], look[0], look[1], look[2]
+    )  # fmt: skip
+    most = lane(own, 3)
+    white *= most
+    red, green = min(factor * lane(own, 0) + white, most), min(factor * lane(own, 1) + white, most)
+    return red, green, min(factor * lane(own, 2) + white, most)
+
+
+@_jit
+def _through_values(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+    t0: float, dt: float, first: int, last: int, step: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Return premultiplied (r, g, b, alpha) of the segments from ``first`` to before ``last`` of a volume's values."""
+    (px, py, pz), (dx, dy, dz) = p, d
+    run, seen, flat = stack_run(), zeros4(), is_flat(optics)
+    trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
+    opaque = OPAQUE * min(step * step, 1.0)
+    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
+    look = d if light is None else (dx * light.edge[0], dy * light.edge[1], dz * light.edge[2])
+    before = u0 = -1.0  # -1: no sample there, or not finite
+    i = max(first - 1, 0)
+    while i <= last and trans >= opaque:
+        at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
+        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
+        if start >= last:
+            break
+        if start > at:
+            before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
+        t = t0 + i * dt
+        sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
+        if any_light(run, u0, optics.dark, flat):
+            for n in range(min(RUN, last + 1 - i)):
+                u1 = run[n]
+                met = values_met(before, u0, u1, flat)
+                if i + n > first and met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+                    here = t + (n - 1) * dt
+                    if light is None:
+                        seen, trans, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
+                    else:
+                        own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
+                        if lane(own, 3) > 0.0:
+                            r, g, b_ = _shade(own, light, voxels.values, p, d, look, s)
+                            red, green, blue = red + r, green + g, blue + b_
+                    if trans < opaque:
+                        break
+                before, u0 = u0, u1
+        before, u0 = run[RUN - 2], run[RUN - 1]
+        i += RUN
+    if light is None:
+        red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)
+    return red, green, blue, 1.0 - trans
+
+
+@_jit
+def _through_texels(
+    texels: Texels, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+    t0: float, dt: float, first: int, last: int, step: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Return `_through_values` of an optics grid: along a segment extinction times (r, g, b, 1) is linear."""
+    (px, py, pz), (dx, dy, dz) = p, d
+    nz, ny, nx, _ = texels.values.shape
+    seen: Quad = zeros4()
+    trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
+    opaque = OPAQUE * min(step * step, 1.0)
+    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
+    look = d if light is None else (dx * light.edge[0], dy * light.edge[1], dz * light.edge[2])
+    a, known = zeros4(), False
+    i, stop = first, first
+    while i <= last and trans >= opaque:
+        if i >= stop:
+            at = i - 1 if known else i
+            start = skip((nz, ny, nx), empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
+            if start >= last:
+                break
+            if start > at:
+                known, i = False, start
+            stop = i + LEAP
+        t = t0 + i * dt
+        b = texel_at(texels.values, px + t * dx, py + t * dy, pz + t * dz)
+        if known and lane(a, 3) + lane(b, 3) > 0.0:
+            if light is None:
+                seen, trans = blend_texels(a, b, dt, seen, trans)
+            else:
+                own, trans = blend_texels(a, b, dt, zeros4(), trans)
+                r, g, b_ = _shade(own, light, voxels.values, p, d, look, t - 0.5 * dt)
+                red, green, blue = red + r, green + g, blue + b_
+        a, known = b, True
+        i += 1
+    if light is None:
+        red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)
+    return red, green, blue, 1.0 - trans
+
+
+@_jit
+def _march(
+    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector,
+    t0: float, dt: float, first: int, last: int, step: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Return premultiplied (r, g, b, alpha) of the segments from ``first`` to before ``last`` of a ray."""
+    if texels is None:
+        return _through_values(voxels, optics, empty, light, p, d, t0, dt, first, last, step)
+    else:  # noqa: RET505 - numba leaves out the branch that is not taken
+        return _through_texels(texels, voxels, empty, light, p, d, t0, dt, first, last, step)
+
+
+@_jit
+def _whole(
+    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, p: Vector, d: Vector, step: float
+) -> tuple[float, float, float, float]:
+    """Return premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels."""
+    nz, ny, nx = voxels.values.shape
+    (px, py, pz), (dx, dy, dz) = p, d
+    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if not t1 > t0:
+        return 0.0, 0.0, 0.0, 0.0
+    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
+    return _march(voxels, optics, texels, empty, light, p, d, t0, (t1 - t0) / count, 0, count, step)
+
+
+@_jit
+def _pixel(
+    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
+    lens: np.ndarray, step: float, col: int, row: int, offsets: np.ndarray,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Sum (r, g, b, alpha) over the rays at ``offsets`` from the centre of pixel (``col``, ``row``)."""
+    acc0 = acc1 = acc2 = acc3 = 0.0
+    for ray in range(len(offsets)):
+        a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
+        b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
+        norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
+        dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
+        dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
+        dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+        p = eye[0], eye[1], eye[2]
+        red, green, blue, alpha = _whole(voxels, optics, texels, empty, light, p, (dx, dy, dz), step)
+        acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
+    return acc0, acc1, acc2, acc3
+
+
+def _tiles(
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, texels: Texels | None, empty: np.ndarray, light: Light | None,
+    eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, order: np.ndarray, offsets: np.ndarray,
+    mask: np.ndarray, known: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
+
+    ``eye`` (3,) voxels and ``basis`` (3, 3: rows right, down, forward) in voxels per unit-frame length;
+    ``lens`` is (1/fx, 1/fy, cx, cy), pixels; ``order`` (tiles,) of the tiles (row-major); ``mask`` (h, w) bool;
+    ``step`` in voxels along a ray; ``known``: number of rays whose mean ``out`` holds already.
+    """
+    height, width = out.shape[:2]
+    across, share = (width + TILE - 1) // TILE, 1.0 / (known + len(offsets))
+    index = next_iteration(thread)
+    while index < len(order):
+        top, left = order[index] // across * TILE, order[index] % across * TILE
+        for line in range(top, min(top + TILE, height)):
+            for col in range(left, min(left + TILE, width)):
+                if not mask[line, col]:
+                    continue
+                red, green, blue, alpha = _pixel(
+                    voxels, optics, texels, empty, light, eye, basis, lens, step, col, line, offsets
+                )  # fmt: skip
+                pixel = out[line, col]
+                if known > 0:
+                    red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
+                    alpha += known * pixel[3]
+                pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
+        index = next_iteration(thread)
+
+
+@_exact
+def _owned(p: float, d: float, lo: float, hi: float, t0: float, dt: float, count: int) -> tuple[int, int]:
+    """Return the first segment with its middle from face ``lo`` to ``hi`` along one axis, and that after the last."""
+    if d == 0.0:
+        return (0, count) if lo <= p < hi else (0, 0)
+    a, b = ((lo - p) / d - t0) / dt - 0.5, ((hi - p) / d - t0) / dt - 0.5
+    first, last = math.ceil(min(max(a, 0.0), float(count))), math.ceil(min(max(b, 0.0), float(count)))
+    return (first, last) if d > 0.0 else (last, first)
+
+
+@_exact
+def _ray(
+    faces: np.ndarray, p: Vector, basis: np.ndarray, lens: np.ndarray, step: float, column: float, row: float
+) -> tuple[Vector, float, float, int, int]:
+    """Return a ray's direction, where its segments begin, their length, the first and last.
+
+    The latter two are the block's own, as ``faces`` (3, 3) of `cast_segments` say; none where they are the same.
+    """
+    nx, ny, nz = int(faces[2, 0]), int(faces[2, 1]), int(faces[2, 2])
+    px, py, pz = p
+    a, b = (column - lens[2]) * lens[0], (row - lens[3]) * lens[1]
+    norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
+    dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
+    dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
+    dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if not t1 > t0:
+        return (dx, dy, dz), 0.0, 1.0, 0, 0
+    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
+    dt = (t1 - t0) / count
+    first, last = _owned(px, dx, faces[0, 0], faces[1, 0], t0, dt, count)
+    low, high = _owned(py, dy, faces[0, 1], faces[1, 1], t0, dt, count)
+    first, last = max(first, low), min(last, high)
+    low, high = _owned(pz, dz, faces[0, 2], faces[1, 2], t0, dt, count)
+    return (dx, dy, dz), t0, dt, max(first, low), min(last, high)
+
+
+@_jit
+def _pixel_segments(
+    voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, faces: np.ndarray, begin: np.ndarray,
+    eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, pixel: np.ndarray, offsets: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill ``out`` (m, 4) of one ``pixel`` (2,)."""
+    p = (eye[0], eye[1], eye[2])
+    local = (eye[0] - begin[0], eye[1] - begin[1], eye[2] - begin[2])
+    for m in range(len(offsets)):
+        x, y = pixel[0] + 0.5 + offsets[m, 0], pixel[1] + 0.5 + offsets[m, 1]
+        d, t0, dt, first, last = _ray(faces, p, basis, lens, step, x, y)
+        if first < last:
+            red, green, blue, alpha = _march(
+                voxels, optics, texels, empty, light, local, d, t0, dt, first, last, step
+            )  # fmt: skip
+            out[m, 0], out[m, 1], out[m, 2], out[m, 3] = red, green, blue, alpha
+
+
+def _segments(
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, texels: Texels | None, empty: np.ndarray, light: Light | None,
+    faces: np.ndarray, begin: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float,
+    pixels: np.ndarray, offsets: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Write what a block shows of rays into ``out`` (n, m, 4) float32 premultiplied, which holds zeros.
+
+    Everything up to ``light`` is of the block with a voxel around it, two where it is lit, whose first voxel is
+    ``begin`` (3,) of the whole volume; ``faces`` (3, 3): the block's lower and upper faces, infinite where the volume
+    ends, and the volume's voxels, each (x, y, z); ``pixels`` (n, 2: column, row), ``offsets`` (m, 2), ``eye``,
+    ``basis`` and ``lens`` as in `_tiles`, in voxels of the whole volume; ``step`` at most 1.
+    """
+    for n in iterations(thread, len(pixels)):
+        _pixel_segments(
+            voxels, optics, texels, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
+        )  # fmt: skip
+
+
+VIEW, BLOCK = "f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3", "f8:2 f8:1 f8:1 f8:2 f8:1 f8 i8:2 f8:2 f4:3"
+
+
+def _kernel(
+    body: Callable[Concatenate[ThreadSlice, P], None], name: str, more: str, grid: str, light: str
+) -> Callable[P, None]:
+    """Make the kernel ``name`` of a ``body``, for arguments of which ``grid`` and ``light`` may be none."""
+    types = f"Voxels Optics {grid} u1:3 {light} {more}"
+    return parallel_kernel(types, LIT_GRID, name=name, fastmath=FLAGS, error_model="numpy")(body)
+
+
+render_tiles = _kernel(_tiles, "render_tiles", VIEW, "none", "none")
+render_lit_tiles = _kernel(_tiles, "render_lit_tiles", VIEW, "none", "Light")
+render_grid_tiles = _kernel(_tiles, "render_grid_tiles", VIEW, "Texels", "none")
+render_lit_grid_tiles = _kernel(_tiles, "render_lit_grid_tiles", VIEW, "Texels", "Light")
+cast_segments = _kernel(_segments, "cast_segments", BLOCK, "none", "none")
+cast_lit_segments = _kernel(_segments, "cast_lit_segments", BLOCK, "none", "Light")
+cast_grid_segments = _kernel(_segments, "cast_grid_segments", BLOCK, "Texels", "none")
+cast_lit_grid_segments = _kernel(_segments, "cast_lit_grid_segments", BLOCK, "Texels", "Light")

@@ -1,0 +1,125 @@
+"""Axes that conventions on top of HDF5 state: openPMD, NeXus, ilastik, and voxel sizes as Fiji's plugin writes them.
+
+Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standard), NXdata of the NeXus manual
+(https://manual.nexusformat.org), vigra's ``axistags``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, Axis, axis
+
+
+def text_of(value: Any) -> str:
+    """Return an attribute as text, the first of several."""
+    value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, str]]:
+    """Read a dataset of coordinates along an axis, float64, and the attributes that describe the axis."""
+    stated = {key: text_of(dataset.attrs[key]) for key in AXIS_ATTRIBUTES if key in dataset.attrs}
+    scale, offset = (
+        float(np.ravel(dataset.attrs.get(key, plain))[0]) for key, plain in (("scale_factor", 1), ("add_offset", 0))
+    )
+    return np.asarray(dataset[()], np.float64) * scale + offset, stated
+
+
+def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:
+    """Find the axes of a dataset without dimension scales.
+
+    Args:
+        file: the open h5py.File.
+        dataset: h5py.Dataset.
+        source: for messages.
+
+    Returns:
+        Its axes, slowest first, and CF attributes for the scaling of its values; None where no convention is followed.
+
+    Raises:
+        DataError: a geometry that is stated and cannot be read.
+    """
+    group, sizes = dataset.parent, dataset.attrs.get("element_size_um", ())  # z, y, x
+    if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):
+        return _openpmd(dataset, source)
+    found: list[Axis] = []
+    if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
+        found = _nexus(group, dataset)
+    elif "axistags" in dataset.attrs:
+        found = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
+    elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
+        steps = [*[None] * (len(dataset.shape) - 3), *np.asarray(sizes, np.float64).reshape(-1)]
+        names = ["", "", *"zyx"][-len(dataset.shape) :]
+        found = [
+            Axis(name, n, None if step is None else step * np.arange(n), "um" if name else "", name)
+            for name, n, step in zip(names, dataset.shape, steps, strict=True)
+        ]
+    return (found, {}) if found else None
+
+
+def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
+    """Return the axes of a mesh record, in metres, and the factor to SI units of its values.
+
+    Labels, spacing and offset are in the order of the array's indices, reversed for a Fortran code, whose arrays HDF5
+    shows the other way round.
+    """
+    mesh = dataset.attrs if "axisLabels" in dataset.attrs else dataset.parent.attrs
+    geometry, n = text_of(mesh.get("geometry", "cartesian")), len(dataset.shape)
+    if geometry != "cartesian":
+        raise DataError(
+            f"{source}: openPMD geometry {geometry[:40]!r}; expected cartesian: resample it first (openPMD-viewer's "
+            "get_field(theta=None) gives a cartesian grid)"
+        )
+    labels = [text_of(label) for label in np.asarray(mesh["axisLabels"]).reshape(-1)]
+    spacing, offset, position, unit = (
+        np.broadcast_to(np.asarray(where.get(key, default), np.float64).reshape(-1), n)
+        if np.size(where.get(key, default)) in (1, n)
+        else np.empty(0)
+        for where, key, default in (
+            (mesh, "gridSpacing", 1.0), (mesh, "gridGlobalOffset", 0.0), (dataset.attrs, "position", 0.0),
+            (mesh, "gridUnitSI", 1.0),
+        )
+    )  # fmt: skip
+    if len(labels) != n or min(map(np.size, (spacing, offset, position, unit))) != n:
+        raise DataError(f"{source}: openPMD axes {', '.join(labels)} for {n} axes of values; expected as many")
+    order = slice(None, None, -1 if text_of(mesh.get("dataOrder", "C")) == "F" else 1)
+    step, start = (spacing * unit)[order], ((offset + position * spacing) * unit)[order]
+    axes = [
+        axis(label, size, first + each * np.arange(size), {"units": "m"})
+        for label, size, first, each in zip(labels[order], dataset.shape, start, step, strict=True)
+    ]
+    return axes, {"scale_factor": dataset.attrs["unitSI"]} if "unitSI" in dataset.attrs else {}
+
+
+def _nexus(group: Any, dataset: Any) -> list[Axis]:
+    """Return the axes of an NXdata group's signal, by the coordinates beside it; none where they do not fit."""
+    names = [text_of(name) for name in np.asarray(group.attrs["axes"]).reshape(-1)]
+    names = names[0].split(":") if len(names) == 1 and len(dataset.shape) > 1 else names
+    if len(names) != len(dataset.shape):
+        return []
+    axes = []
+    for name, size in zip(names, dataset.shape, strict=True):
+        beside = group.get(name)
+        if beside is None or getattr(beside, "shape", None) != (size,) or beside.dtype.kind not in "iuf":
+            axes.append(axis("" if name == "." else name, size))
+            continue
+        axes.append(axis(name, size, *coordinates_of(beside)))
+    return axes
+
+
+def _vigra(tags: Sequence[Any], dataset: Any) -> list[Axis]:
+    """Return the axes of vigra's ``axistags``; none where they do not fit."""
+    if len(tags) != len(dataset.shape):
+        return []
+    axes = []
+    for tag, size in zip(tags, dataset.shape, strict=True):
+        name, step = str(tag.get("key", "")), float(tag.get("resolution") or 0.0)
+        centres = step * np.arange(size) if step > 0 and name in "xyz" else None
+        axes.append(Axis(name, size, centres, "", name if name in ("x", "y", "z", "t", "c") else ""))
+    return axes

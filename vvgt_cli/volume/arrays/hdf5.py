@@ -1,0 +1,168 @@
+"""HDF5 (``.h5``, ``.hdf5``): one dataset, ``FILE:/path/to/dataset``; a contiguous one is memory-mapped. Read by h5py.
+
+Axes come from dimension scales where there are any (https://docs.hdfgroup.org, "HDF5 Dimension Scales"), else from the
+conventions of `conventions`; CF attributes of scaling and missing values are applied.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, text_of
+from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.components import choose
+from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.labelled import CF_ATTRIBUTES, DESCRIBES, GEOMETRY, Axis, axis, described_by, labelled_volume
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.types import Volume
+
+MOST_VISITED = 100_000
+
+
+def read_hdf5(path: Path, options: ReadOptions) -> Volume:
+    """Read one dataset of an HDF5 file.
+
+    Raises:
+        DataError: h5py is not installed, no dataset of numbers, a damaged file, values in files elsewhere.
+        UsageError: several datasets and none chosen, or choices that `labelled_volume` asks for.
+    """
+    h5py = need("h5py", "hdf5", str(path), "HDF5")
+    with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
+        if is_imaris(file):
+            return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
+        if options.level is not None:
+            raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
+        dataset = _choose(h5py, file, options.array, path)
+        source = f"{path}:{printable(dataset.name)}"
+        check_storage(h5py, dataset, path, source)
+        mapped = _mapped(dataset, path)
+        stored = mapped if mapped is not None else lambda index: dataset[index]
+        name = f"{volume_name(path)}:{dataset.name.strip('/')}"
+        attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY) if key in dataset.attrs}
+        axes = scaled_axes(dataset)
+        if not any(a.name or a.centres is not None for a in axes):
+            axes, more = conventional_axes(file, dataset, source) or (axes, {})
+            attributes |= more
+        chunks = dataset.chunks or dataset.shape
+        if mapped is None and options.stored:
+            stored = partial(read_part, path, dataset.name)
+        return labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
+
+
+def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
+    """Return a dataset whose values can be read, by a path that leads into no file elsewhere."""
+    _check_links(h5py, file, name, path)
+    if not isinstance(file.get(name), h5py.Dataset):
+        raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
+    check_storage(h5py, file[name], path, f"{path}:/{name}")
+    return file[name]
+
+
+def read_part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
+    """Read a part of a dataset from a file that is open no longer than that."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][index])
+
+
+def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
+    if wanted is not None:
+        _check_links(h5py, file, wanted, path)
+        found = file.get(wanted)
+        if isinstance(found, h5py.Dataset):
+            return found
+        file, wanted = (found, None) if isinstance(found, h5py.Group) else (file, wanted)
+    fits = datasets(h5py, file)
+    rows = [f"{d.name} {d.shape} {d.dtype}" for d in fits]
+    first = printable(fits[0].name) if fits else "/path"
+    how = f"choose one as {path}:{first} (or with --array)"
+    return fits[choose([d.name for d in fits], rows, wanted, str(path), "dataset", how)]
+
+
+def datasets(h5py: Any, group: Any) -> list[Any]:
+    """List the datasets of numbers with 2 to 5 axes; only those with three or more if there are any.
+
+    Datasets that describe others, such as bounds of cells, are skipped.
+    """
+    found: list[Any] = []
+    described: set[str] = set()
+    seen = 0
+
+    def visit(name: str, item: Any) -> bool | None:
+        nonlocal seen
+        seen += 1
+        described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and item.shape and 2 <= len(item.shape) <= 5:
+            found.append(item)
+        return True if seen >= MOST_VISITED else None
+
+    group.visititems(visit)
+    data = [d for d in found if d.name.rpartition("/")[2] not in described] or found
+    return [d for d in data if sum(n > 1 for n in d.shape) >= 3] or data
+
+
+def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
+    """Refuse a path that leads into another file outside of this one's folder."""
+    place = file
+    for part in wanted.strip("/").split("/"):
+        link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
+        if isinstance(link, h5py.ExternalLink):
+            data_file(path, link.filename, exact=True)
+        place = place.get(part) if link is not None else None
+
+
+def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
+    """Refuse values in files outside of this one's folder, filters that are not there, and chunks beyond all bounds."""
+    if dataset.external:
+        raise DataError(f"{source}: its values lie in other files (external storage); try h5repack to bring them in")
+    if dataset.is_virtual:
+        for part in dataset.virtual_sources():
+            if part.file_name != ".":
+                data_file(path, part.file_name, exact=True)
+    if dataset.chunks and int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK:
+        raise DataError(f"{source}: chunks of {dataset.chunks} values; expected at most {size_text(MAX_CHUNK)} each")
+    plan = dataset.id.get_create_plist()
+    for k in range(plan.get_nfilters()):
+        code, _, _, label = plan.get_filter(k)
+        if h5py.h5z.filter_avail(code):
+            continue
+        try:
+            import hdf5plugin  # noqa: F401  registers its filters
+        except ImportError:
+            name = label.decode("utf-8", "replace") or "unnamed"
+            raise DataError(
+                f"{source}: packed with filter {code} ({name}), which h5py does not have; try: pip install hdf5plugin"
+            ) from None
+
+
+def _mapped(dataset: Any, path: Path) -> np.ndarray | None:
+    """Return the values memory-mapped, where they lie in the file in one piece as they are."""
+    offset = None if dataset.chunks or dataset.is_virtual else dataset.id.get_offset()
+    if offset is None or dataset.dtype.kind not in "iuf" or not dataset.size:
+        return None
+    return load_block(path, dataset.dtype, dataset.shape, offset=offset)
+
+
+def scaled_axes(dataset: Any) -> list[Axis]:
+    """Return the axes of a dataset by its dimension scales, slowest first; without any they have no name."""
+    axes = []
+    for size, dimension in zip(dataset.shape, dataset.dims, strict=True):
+        scales = [scale for scale in dimension.values() if scale.shape == (size,) and scale.dtype.kind in "iuf"]
+        if not scales:
+            names = list(dimension.keys())
+            axes.append(axis(dimension.label or (names[0] if names else ""), size))
+            continue
+        scale = scales[0]
+        bare = text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")
+        axes.append(axis(scale.name.rpartition("/")[2], size, *((None, {}) if bare else coordinates_of(scale))))
+    return axes

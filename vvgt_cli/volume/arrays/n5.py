@@ -1,0 +1,303 @@
+"""N5: a folder (``STORE.n5``, ``STORE.n5:/path/to/array``) of blocks, pyramids (``s0``, ``s1``, ...) among them.
+
+Format: https://github.com/saalfeldlab/n5, version 4. zarr no longer reads it. Blocks are unpacked to their size and no
+further: gzip, bzip2, xz and LZ4 by what is here anyway, Blosc and Zstandard by numcodecs. Place and units: those of
+n5-viewer, BigDataViewer and COSEM.
+"""
+
+from __future__ import annotations
+
+import bz2
+import itertools
+import json
+import lzma
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.arrays.zarr import MAX_METADATA
+from vvgt_cli.volume.components import choose
+from vvgt_cli.volume.labelled import Axis, labelled_volume
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy.image import EXTRA
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.stored import put_overlap
+from vvgt_cli.volume.types import Volume
+
+METADATA = "attributes.json"
+TYPES = {f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64)} | {"float32", "float64"}
+MOST_AXES = 5
+MOST_VISITED = 10_000  # folders
+LZ4_BLOCK = struct.Struct("<8sBiiI")  # of Java's LZ4BlockOutputStream
+
+
+@dataclass(frozen=True)
+class N5Array:
+    """An array of a store.
+
+    Attributes:
+        place: its folder.
+        shape, blocks: slowest axis first, as numpy has them: the file's are the other way round.
+        dtype: of the values, as stored.
+        compression: as the file has it.
+        attributes: all of its metadata.
+    """
+
+    place: Path
+    shape: tuple[int, ...]
+    blocks: tuple[int, ...]
+    dtype: np.dtype
+    compression: dict[str, Any]
+    attributes: dict[str, Any]
+
+    def read(self, index: tuple[Any, ...]) -> np.ndarray:
+        """Read a part, by a number or a slice with step 1 for each axis; missing blocks are 0."""
+        spans = [(k, k + 1) if isinstance(k, int) else k.indices(n)[:2] for k, n in zip(index, self.shape, strict=True)]
+        out = np.zeros([b - a for a, b in spans], self.dtype.newbyteorder("="))
+        grid = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self.blocks, strict=True)]
+        for at in itertools.product(*grid):
+            if (block := self._block(at)) is not None:
+                put_overlap(out, [a for a, _ in spans], block, [k * c for k, c in zip(at, self.blocks, strict=True)])
+        return out[tuple(0 if isinstance(k, int) else slice(None) for k in index)]
+
+    def _block(self, at: Sequence[int]) -> np.ndarray | None:
+        file = self.place.joinpath(*(str(k) for k in reversed(at)))
+        try:
+            packed = file.read_bytes()
+        except FileNotFoundError:
+            return None
+        mode, axes = struct.unpack_from(">HH", packed)
+        sizes = struct.unpack_from(f">{axes}I", packed, 4) if axes == len(self.shape) else ()
+        if (
+            mode not in (0, 1)
+            or not sizes
+            or any(not 0 < n <= c for n, c in zip(sizes[::-1], self.blocks, strict=True))
+        ):
+            raise DataError(f"{file}: a block of mode {mode} and {sizes} values; expected at most {self.blocks[::-1]}")
+        need_bytes = math.prod(sizes) * self.dtype.itemsize
+        found = unpack(self.compression, packed[4 + 4 * axes + 4 * (mode == 1) :], need_bytes, str(file))
+        if len(found) != need_bytes:
+            raise DataError(f"{file}: {len(found)} bytes; its {sizes} values need {need_bytes}; fetch the block again")
+        return np.frombuffer(found, self.dtype).reshape(sizes[::-1])
+
+
+def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> bytes:
+    """Unpack ``data`` to at most ``size`` bytes.
+
+    Raises:
+        DataError: a compression that is not known, numcodecs missing, data that would be longer.
+    """
+    kind = compression.get("type", "raw")
+    if kind == "raw":
+        return data[:size]
+    if kind == "gzip":
+        return zlib.decompressobj(15 if compression.get("useZlib") is True else 31).decompress(data, size)
+    if kind == "bzip2":
+        return bz2.BZ2Decompressor().decompress(data, size)
+    if kind == "xz":
+        return lzma.LZMADecompressor(memlimit=256 << 20).decompress(data, size)
+    if kind == "lz4":
+        return _lz4(data, size)
+    if kind in ("blosc", "zstd"):
+        codecs = need(f"numcodecs.{kind}", EXTRA, source, f"N5 with {kind}")
+        stated = struct.unpack_from("<I", data, 4)[0] if kind == "blosc" else size
+        if stated != size or (kind == "zstd" and len(data) < 4):
+            raise DataError(f"{source}: a block of {stated} bytes; expected {size}; fetch the block again")
+        out = bytearray(size)
+        codecs.decompress(data, out)
+        return bytes(out)
+    raise DataError(f"{source}: compression {str(kind)[:40]!r}; expected raw, gzip, bzip2, xz, lz4, blosc or zstd")
+
+
+def _lz4(data: bytes, size: int) -> bytes:
+    import lz4.block
+
+    out, at = bytearray(), 0
+    while len(out) < size:
+        magic, token, packed, length, _ = LZ4_BLOCK.unpack_from(data, at)
+        at += LZ4_BLOCK.size
+        if magic != b"LZ4Block" or not 0 < length <= size - len(out) or not 0 <= packed <= len(data) - at:
+            raise ValueError("an LZ4 block that does not fit")
+        part = data[at : at + packed]
+        out += part if token & 0xF0 == 0x10 else lz4.block.decompress(part, uncompressed_size=length)
+        at += packed
+    return bytes(out)
+
+
+def holds_n5(path: Path) -> bool:
+    """Tell whether a folder is an N5 store, or an array in one."""
+    if not (path / METADATA).is_file():
+        return path.suffix == ".n5"
+    try:
+        facts = _metadata(path)
+    except (OSError, ValueError, DataError):
+        return True
+    return path.suffix == ".n5" or "n5" in facts or "dimensions" in facts
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    file = folder / METADATA
+    if not file.is_file():
+        return {}
+    if file.stat().st_size > MAX_METADATA:
+        raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
+    found = json.loads(file.read_text("utf-8"))
+    if not isinstance(found, dict):
+        raise DataError(f"{file}: expected a JSON object of metadata")
+    return found
+
+
+def read_n5(path: Path, options: ReadOptions) -> Volume:
+    """Read one array of an N5 store, of a pyramid its finest or ``options.level``.
+
+    Raises:
+        DataError: no array of numbers, a damaged store, a compression that is not known.
+        UsageError: several arrays and none chosen, or choices that `labelled_volume` asks for.
+    """
+    with library_errors(str(path), "N5"):
+        place = _choose(path, options)
+        array = _array(place)
+        stem = path.name.removesuffix(".n5") or path.name
+        inner = place.relative_to(path).as_posix()
+        name = stem if inner == "." else f"{stem}:{inner}"
+        return labelled_volume(
+            array.read, array.dtype.newbyteorder("="), _axes(array), {}, options, str(place), name, array.blocks
+        )
+
+
+def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes of the levels of a pyramid, finest first; none where there is none."""
+    if not path.is_dir() or not holds_n5(path):
+        return []
+    try:
+        return [_array(place).shape for place in _levels(_inside(path, options.array))]
+    except (OSError, ValueError, TypeError, KeyError, DataError, UsageError):
+        return []  # said where it is read
+
+
+def _inside(path: Path, wanted: str | None) -> Path:
+    here = path / (wanted or "").strip("/")
+    if not here.resolve().is_relative_to(path.resolve()):
+        raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
+    return here
+
+
+def _levels(group: Path) -> list[Path]:
+    """List the folders ``s0``, ``s1``, ... of arrays in a group that is no array itself."""
+    if "dimensions" in _metadata(group):
+        return []
+    found: list[Path] = []
+    while "dimensions" in _metadata(group / f"s{len(found)}") and len(found) < 64:
+        found.append(group / f"s{len(found)}")
+    return found
+
+
+def _choose(path: Path, options: ReadOptions) -> Path:
+    """Return the folder of the array asked for, or of the only one; for a pyramid, that of the level."""
+    here = _inside(path, options.array)
+    if "dimensions" in _metadata(here):
+        if options.level is not None:
+            raise UsageError(f"{path}: an array without levels; leave out --level {options.level}")
+        return here
+    fits = _arrays(here) if here.is_dir() else []
+    wanted, known = (None, fits) if fits else (options.array, _arrays(path))
+    names = [place.relative_to(path).as_posix() for place in known]
+    chosen = known[choose(names, names, wanted, str(path), how=f"choose one as {path}:/PATH (or with --array)")]
+    levels = _levels(chosen)
+    if (options.level or 0) >= max(len(levels), 1):
+        raise UsageError(f"{path}: --level {options.level}: expected full, or 0 to {max(len(levels), 1) - 1}")
+    return levels[options.level or 0] if levels else chosen
+
+
+def _arrays(root: Path) -> list[Path]:
+    """List the arrays and pyramids in a group and the groups below it."""
+    found: list[Path] = []
+    groups, seen = [root], 0
+    while groups and seen < MOST_VISITED:
+        group, seen = groups.pop(0), seen + 1
+        facts = _metadata(group)
+        if _levels(group) or len(facts.get("dimensions", ())) >= 2:
+            found.append(group)
+        elif "dimensions" not in facts:
+            groups += sorted(p for p in group.iterdir() if p.is_dir() and not p.is_symlink())
+    return found
+
+
+def _array(place: Path) -> N5Array:
+    facts = _metadata(place)
+    sizes, blocks = facts.get("dimensions"), facts.get("blockSize")
+    kind, packed = facts.get("dataType"), facts.get("compression", facts.get("compressionType", "raw"))
+    compression = {"type": packed} if isinstance(packed, str) else packed
+    good = all(
+        isinstance(some, list) and 2 <= len(some) <= MOST_AXES and all(type(n) is int and 0 < n < 1 << 62 for n in some)
+        for some in (sizes, blocks)
+    )
+    if not good or len(sizes) != len(blocks) or kind not in TYPES or not isinstance(compression, dict):  # type: ignore[arg-type]
+        raise DataError(
+            f"{place}: dimensions {str(sizes)[:80]}, blocks {str(blocks)[:80]} of {str(kind)[:40]}; expected 2 to "
+            f"{MOST_AXES} sizes of each, and a type such as uint16"
+        )
+    dtype = np.dtype(str(kind)).newbyteorder(">")
+    if math.prod(blocks) * dtype.itemsize > MAX_CHUNK:  # type: ignore[arg-type]
+        raise DataError(f"{place}: blocks of {blocks} values; expected at most 2 GiB each")
+    return N5Array(place, tuple(sizes[::-1]), tuple(blocks[::-1]), dtype, compression, facts)  # type: ignore[index]
+
+
+def _axes(array: N5Array) -> list[Axis]:
+    """Return the axes, slowest first; the first three in the file are x, y and z unless it names them."""
+    n = len(array.shape)
+    names, units, scale, shift = _transform(array, n)
+    axes = []
+    for name, unit, step, start, size in zip(names, units, scale, shift, array.shape, strict=True):
+        role = name.lower() if name.lower() in ("x", "y", "z", "t", "c") else ""
+        centres = start + step * np.arange(size) if role in ("x", "y", "z") and size <= 1 << 24 else None
+        axes.append(Axis(name, size, centres, unit, role))
+    return axes
+
+
+def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float], list[float]]:
+    """Return names, units, spacing and first position of the axes, slowest first."""
+    facts = array.attributes
+    stated = facts.get("transform")  # COSEM: in numpy's order
+    if isinstance(stated, dict) and all(len(_list(stated.get(k), n)) == n for k in ("axes", "scale")):
+        units = [str(u) for u in _list(stated.get("units"), n)] or [""] * n
+        shift = _floats(stated.get("translate"), n) or [0.0] * n
+        return [str(a) for a in stated["axes"]], units, _floats(stated["scale"], n) or [1.0] * n, shift
+    above = _metadata(array.place.parent) if array.place.name.startswith("s") else {}
+    size: Any = next((f[k] for f in (facts, above) for k in ("pixelResolution", "resolution") if k in f), None)
+    unit = next((f["units"] for f in (facts, above) if isinstance(f.get("units"), list)), None)
+    if isinstance(size, dict):
+        stated_unit = size.get("unit")
+        size, unit = size.get("dimensions"), [stated_unit] * 3
+    spatial = min(n, 3)
+    steps = _floats(size, spatial) or [1.0] * spatial
+    factors = _floats(facts.get("downsamplingFactors"), spatial) or [1.0] * spatial
+    named = _list(facts.get("axes"), n)  # fastest first, as the sizes
+    names = [str(a) for a in named] if named else ["x", "y", "z", *[""] * n][:n]
+    units = [str(u or "") for u in _list(unit, spatial)] or [""] * spatial
+    rest = n - spatial
+    shift = [
+        s * (f - 1) / 2 for s, f in zip(steps, factors, strict=True)
+    ]  # a mean of as many voxels lies in their middle
+    scale = [s * f for s, f in zip(steps, factors, strict=True)]
+    return names[::-1], ([*units, *[""] * rest])[::-1], ([*scale, *[1.0] * rest])[::-1], ([*shift, *[0.0] * rest])[::-1]
+
+
+def _list(value: Any, n: int) -> list[Any]:
+    """Return the first ``n`` items of a list that has as many, else nothing."""
+    return value[:n] if isinstance(value, list) and len(value) >= n else []
+
+
+def _floats(value: Any, n: int) -> list[float]:
+    """Return ``n`` finite numbers, else nothing."""
+    some = _list(value, n)
+    good = all(isinstance(v, int | float) and math.isfinite(v) and abs(v) < 1e30 for v in some)
+    return [float(v) for v in some] if good else []

@@ -1,0 +1,205 @@
+"""Zarr and OME-Zarr on a server: ``http://HOST/x.ome.zarr``, ``https://HOST/x.zarr:/array``, by fsspec.
+
+Chunks are read as they are needed; every other format has to be a file of this machine. No answer is read beyond
+`MAX_METADATA`, or a chunk's size once an array is open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import weakref
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple, cast
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
+from vvgt_cli.volume.arrays.zarr import level_shapes as zarr_levels
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume
+
+SCHEMES = ("http", "https")
+
+
+class _Size(NamedTuple):
+    st_size: int
+
+
+class _Server:
+    """Answers of bounded size, for us and (asynchronous) for zarr."""
+
+    def __init__(self, url: str) -> None:
+        aiohttp, http = (need(name, "remote", url, "an address") for name in ("aiohttp", "fsspec.implementations.http"))
+        self.failures = OSError, aiohttp.ClientError
+        self.most = most = [MAX_METADATA]  # bytes of an answer
+
+        class Bounded(aiohttp.ClientResponse):  # type: ignore[misc,name-defined]
+            _body: bytes | None
+
+            async def read(self) -> bytes:
+                if self._body is None:
+                    parts: list[bytes] = []
+                    left = most[0]
+                    async for part in self.content.iter_any():
+                        left -= len(part)
+                        if left < 0:
+                            self.close()
+                            raise DataError(
+                                f"{self.url}: more than the {most[0]} bytes expected; try a copy of the store"
+                            )
+                        parts.append(part)
+                    self._body = b"".join(parts)
+                return cast(bytes, await super().read())
+
+        class System(http.HTTPFileSystem):  # type: ignore[misc,name-defined]
+            async def set_session(self) -> Any:
+                opened, session = self._session is None, await super().set_session()
+                if opened and self.asynchronous:  # fsspec closes others only
+                    weakref.finalize(self, self.close_session, asyncio.get_running_loop(), session)
+                return session
+
+        how = {"client_kwargs": {"response_class": Bounded}, "skip_instance_cache": True}
+        self.ours, self.zarrs = (System(asynchronous=other, **how) for other in (False, True))
+
+
+class Remote:
+    """A place, with the methods that `zarr` calls on a path; it keeps what has been read."""
+
+    def __init__(
+        self, server: _Server, root: str, inner: str = "", kept: dict[str, bytes | None] | None = None
+    ) -> None:
+        """Take the server, the address of the store, the path in it, and what has been read so far."""
+        self._server, self._root, self._inner = server, root, PurePosixPath(inner)
+        self._kept: dict[str, bytes | None] = {} if kept is None else kept
+
+    def __str__(self) -> str:
+        """Return the address."""
+        return self._root if self._inner == PurePosixPath() else f"{self._root}/{self._inner}"
+
+    def __truediv__(self, name: str) -> Remote:
+        """Return the place ``name`` below this one."""
+        return self._at(self._inner / name.lstrip("/"))
+
+    def _at(self, inner: PurePosixPath) -> Remote:
+        return Remote(self._server, self._root, str(inner), self._kept)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare addresses."""
+        return str(self) == str(other)
+
+    def __hash__(self) -> int:
+        """Hash the address."""
+        return hash(str(self))
+
+    def __lt__(self, other: Remote) -> bool:
+        """Order by address."""
+        return str(self) < str(other)
+
+    @property
+    def name(self) -> str:
+        """Return the last part of the address."""
+        return str(self).rpartition("/")[2]
+
+    @property
+    def parent(self) -> Remote:
+        """Return the place above, which may lie above the store."""
+        if self._inner == PurePosixPath():
+            return Remote(self._server, self._root.rpartition("/")[0], "", self._kept)
+        return self._at(self._inner.parent)
+
+    def resolve(self) -> PurePosixPath:
+        """Resolve "..", as if the store were "/store"."""
+        parts = ["store"]
+        for part in self._inner.parts:
+            parts = parts[:-1] if part == ".." else [*parts, part]
+        return PurePosixPath("/", *parts)
+
+    def relative_to(self, other: Remote) -> PurePosixPath:
+        """Return the path from ``other`` to this place."""
+        return self._inner.relative_to(other._inner)
+
+    @cached_property
+    def _content(self) -> bytes | None:
+        url = str(self)
+        if url not in self._kept:
+            try:
+                self._kept[url] = self._server.ours.cat_file(url)
+            except self._server.failures as error:
+                if getattr(error, "status", 404) >= 500:  # it may be there
+                    raise
+                self._kept[url] = None
+        return self._kept[url]
+
+    def is_file(self) -> bool:
+        """Tell whether the server has a file here."""
+        return self._content is not None
+
+    def is_symlink(self) -> bool:
+        """Return False: a server has no links."""
+        return False
+
+    def is_dir(self) -> bool:
+        """Return True: a server does not say what is a folder."""
+        return True
+
+    def iterdir(self) -> list[Remote]:
+        """List the places that the server lists below this one."""
+        return [self / Path(entry["name"].rstrip("/")).name for entry in self._server.ours.ls(str(self))]
+
+    def stat(self) -> _Size:
+        """Return the size of the file here."""
+        return _Size(len(self._content or b""))
+
+    def store(self) -> dict[str, Any]:
+        """Return the arguments by which zarr opens the same place."""
+        storage = need("zarr.storage", "zarr", str(self), "Zarr")
+        return {"store": storage.FsspecStore(self._server.zarrs, True, str(self))}
+
+    def allow(self, size: int) -> None:
+        """Allow answers as long as a packed chunk of so many bytes."""
+        self._server.most[0] = max(self._server.most[0], MAX_METADATA + size + size // 8)
+
+    def read_text(self, encoding: str) -> str:
+        """Read the file here as text; "" where there is none."""
+        return (self._content or b"").decode(encoding)
+
+
+def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
+    """Return the store at an address, as `read_zarr` takes paths, and the options with the part after ``:/`` as array.
+
+    Raises:
+        DataError: a library is not installed, no answer, or no Zarr.
+        UsageError: two arrays.
+    """
+    head, _, inner = url.rpartition(":/")
+    if head in SCHEMES:
+        head, inner = url, ""
+    if inner and options.array is not None:
+        raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
+    with library_errors(url, "Zarr"):
+        place = cast(Path, Remote(_Server(url), head.rstrip("/")))
+        if not holds_zarr(place):
+            raise DataError(
+                f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
+            )
+    return place, replace(options, array=inner or options.array)
+
+
+def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
+    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored.
+
+    Raises:
+        DataError, UsageError: as `read_zarr`, or an address with nothing behind it.
+    """
+    return read_zarr(*_opened(f"{scheme}:{rest}", options))
+
+
+def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
+
+    Raises:
+        DataError, UsageError: as `read_scheme`.
+    """
+    return zarr_levels(*_opened(url, options))

@@ -1,0 +1,251 @@
+"""Zarr 2 and 3: a folder (``STORE.zarr``, ``STORE.zarr:/path/to/array``), OME-Zarr images among them. Read by zarr.
+
+Axes: coordinate arrays of the dimensions' names beside the array, as xarray writes them, or the scale and translation
+of OME-Zarr (https://ngff.openmicroscopy.org). Codecs are compared with a list before zarr sees them: one of numcodecs'
+unpickles.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.components import choose
+from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy.image import hex_color
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume
+
+_CODECS = {
+    *("blosc", "zstd", "gzip", "zlib", "lz4", "bz2", "lzma", "shuffle", "delta", "fixedscaleoffset", "quantize"),
+    *("packbits", "astype", "bitround", "crc32", "crc32c", "adler32", "fletcher32", "bytes", "transpose"),
+    "sharding_indexed",
+}
+_METADATA = ("zarr.json", ".zarray", ".zgroup")
+MAX_METADATA = 16 << 20
+
+
+def holds_zarr(path: Path) -> bool:
+    """Tell whether a folder is a Zarr array or group."""
+    return any((path / name).is_file() for name in _METADATA)
+
+
+def read_zarr(path: Path, options: ReadOptions) -> Volume:
+    """Read one array of a Zarr store.
+
+    Raises:
+        DataError: zarr is not installed, no array of numbers, a codec that is not on the list, a damaged store.
+        UsageError: several arrays and none chosen, or choices that `labelled_volume` asks for.
+    """
+    zarr = need("zarr", "zarr", str(path), "Zarr")
+    with library_errors(str(path), "Zarr"):
+        place, facts = _choose(path, options.array, options.level)
+        _check_codecs(place, facts)
+        array = _array(zarr, place)
+        attributes = dict(array.attrs)
+        axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
+        return labelled_volume(
+            lambda index: np.asarray(array[index]),
+            array.dtype,
+            axes,
+            attributes,
+            options,
+            str(place),
+            _name(path, place),
+            array.chunks,
+        )
+
+
+def _array(zarr: Any, place: Path) -> Any:
+    """Open an array and check its codecs again, as a server may have sent zarr other metadata."""
+    server: Any = None if isinstance(place, Path) else place  # `remote.Remote`
+    array = zarr.open_array(**(server.store() if server else {"store": place}), mode="r")
+    _check_codecs(place, array.metadata.to_dict())
+    if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
+        raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
+    if server:
+        server.allow(min(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize, MAX_CHUNK))
+    return array
+
+
+def _name(path: Path, place: Path) -> str:
+    stem = path.name.removesuffix(".zip").removesuffix(".ozx").removesuffix(".zarr").removesuffix(".ome") or path.name
+    inner = place.relative_to(path).as_posix()
+    return stem if inner == "." else f"{stem}:{inner}"
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    """Read the metadata of an array or a group; empty where there are none."""
+    for name in _METADATA:
+        file = folder / name
+        if file.is_file():
+            if file.stat().st_size > MAX_METADATA:
+                raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
+            found = json.loads(file.read_text("utf-8"))
+            if not isinstance(found, dict):
+                raise DataError(f"{file}: expected a JSON object of metadata")
+            if name == ".zarray":
+                return {"node_type": "array", **found}
+            return {"node_type": "group", **found} if name == ".zgroup" else found
+    return {}
+
+
+def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes of the levels of an OME-Zarr image, finest first; none where a store is no such image."""
+    here = path / (options.array or "").strip("/")
+    if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
+        return []
+    places = [here / str(entry.get("path")) for entry in _multiscale(here).get("datasets", [])]
+    inside = [place for place in places if place.resolve().is_relative_to(path.resolve())]
+    return [tuple(_metadata(place).get("shape", ())) for place in inside]
+
+
+def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
+    """Return folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
+    here = path
+    if wanted is not None:
+        here = path / wanted.strip("/")
+        if not here.resolve().is_relative_to(path.resolve()):
+            raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
+    facts = _metadata(here)
+    if facts.get("node_type") == "array":
+        return here, facts
+    level = _multiscale(here)
+    if number is not None and not level:
+        raise UsageError(f"{path}: no OME-Zarr image, which alone has levels; leave out --level {number}")
+    if level:
+        if (number or 0) >= len(level["datasets"]):
+            raise UsageError(f"{path}: --level {number}: expected full, or 0 to {len(level['datasets']) - 1}")
+        place = here / str(level["datasets"][number or 0]["path"])
+        if place.resolve().is_relative_to(path.resolve()):
+            return place, _metadata(place)
+    fits = _arrays(here if facts else path)
+    names = [p.relative_to(path).as_posix() for p, _ in fits]
+    rows = [f"{name} {facts['shape']}" for name, (_, facts) in zip(names, fits, strict=True)]
+    how = f"choose one as {path}:/PATH (or with --array)"
+    return fits[choose(names, rows, None if facts else wanted, str(path), how=how)]
+
+
+def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """List the arrays below a group with three axes or more (with two where none has three)."""
+    found: list[tuple[Path, dict[str, Any]]] = []
+    groups = [root]
+    while groups:
+        for folder in sorted(p for p in groups.pop(0).iterdir() if p.is_dir() and not p.is_symlink()):
+            facts = _metadata(folder)
+            if facts.get("node_type") == "array" and len(facts.get("shape", ())) >= 2:
+                found.append((folder, facts))
+            elif facts.get("node_type") == "group":
+                groups.append(folder)
+    deep = [(p, f) for p, f in found if sum(n > 1 for n in f["shape"]) >= 3]
+    return deep or found
+
+
+def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
+    """Refuse codecs that are not known to be harmless, wherever the metadata name them."""
+    named = []
+    waiting: list[Any] = [facts.get(key) for key in ("compressor", "filters", "codecs")]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, list):
+            waiting += item
+        elif isinstance(item, dict):
+            named.append(str(item.get("id", item.get("name", ""))))
+            inner = item.get("configuration", {})
+            waiting += [inner.get(key) for key in ("codecs", "index_codecs")] if isinstance(inner, dict) else []
+        elif isinstance(item, str):
+            named.append(item)
+    for name in named:
+        if name.removeprefix("numcodecs.") not in _CODECS:
+            raise DataError(f"{place}: codec {name!r}; expected one of {', '.join(sorted(_CODECS))}")
+
+
+def _attributes(folder: Path) -> dict[str, Any]:
+    """Read the attributes of a node of either version."""
+    old = folder / ".zattrs"
+    if old.is_file() and old.stat().st_size <= MAX_METADATA:
+        found = json.loads(old.read_text("utf-8"))
+    else:
+        found = _metadata(folder).get("attributes")
+    return found if isinstance(found, dict) else {}
+
+
+def _axes(
+    zarr: Any, place: Path, facts: dict[str, Any], attributes: dict[str, Any], shape: tuple[int, ...]
+) -> list[Axis]:
+    names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * len(shape)
+    axes = []
+    for label, size in zip(names, shape, strict=True):
+        name = str(label or "")
+        beside = place.parent / name
+        coordinate = _metadata(beside) if name and "/" not in name and name not in (".", "..") else {}
+        if coordinate.get("node_type") != "array" or list(coordinate.get("shape", [])) != [size] or beside == place:
+            axes.append(axis(name, size))
+            continue
+        _check_codecs(beside, coordinate)
+        centres = np.asarray(_array(zarr, beside)[:size])
+        numbers = centres.dtype.kind in "iuf"
+        axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
+    return axes
+
+
+def _multiscale(group: Path) -> dict[str, Any]:
+    """Return the first image of an OME-Zarr group; empty where it has none."""
+    attributes = _attributes(group)
+    inner = attributes.get("ome")
+    images = (inner if isinstance(inner, dict) else attributes).get("multiscales")
+    if isinstance(images, list) and images and isinstance(images[0], dict) and images[0].get("datasets"):
+        return images[0]
+    return {}
+
+
+def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
+    """Return the axes of a level of an OME-Zarr image; none where the array is not one.
+
+    Images of versions before 0.3 state no axes: they are t, c, z, y, x.
+
+    Raises:
+        DataError: axes that do not fit the array.
+    """
+    image = _multiscale(place.parent)
+    level = next((d for d in image.get("datasets", []) if str(d.get("path")) == place.name), None)
+    if level is None:
+        return []
+    described = image.get("axes") or list("tczyx")
+    if len(described) != len(shape):
+        raise DataError(
+            f"{place}: OME-Zarr {image.get('version', 'of no version')} with {len(shape)} axes of values; expected "
+            f"{len(described)} ({'as its metadata list' if image.get('axes') else 't, c, z, y, x'})"
+        )
+    scale, shift = np.ones(len(shape)), np.zeros(len(shape))
+    for step in [*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]:
+        factor = np.asarray(step.get("scale", np.ones(len(shape))), np.float64)
+        scale, shift = scale * factor, shift * factor + np.asarray(step.get("translation", np.zeros(len(shape))))
+    roles = {"time": "t", "channel": "c"}
+    axes = []
+    for k, (entry, size) in enumerate(zip(described, shape, strict=True)):
+        facts = entry if isinstance(entry, dict) else {"name": str(entry)}
+        name = str(facts.get("name", "")).lower()
+        role = roles.get(str(facts.get("type", "")), name if name in ("x", "y", "z", "t", "c") else "")
+        centres = shift[k] + scale[k] * np.arange(size) if role not in ("t", "c") else None
+        labels, colors = _rendering(place.parent, size) if role == "c" else ((), ())
+        axes.append(Axis(name, size, centres, str(facts.get("unit", "") or ""), role, labels, colors))
+    return axes
+
+
+def _rendering(group: Path, count: int) -> tuple[tuple[str, ...], tuple[tuple[float, float, float] | None, ...]]:
+    """Return names and RGB of the channels by the rendering settings (``omero``); none where their number differs."""
+    attributes = _attributes(group)
+    inner = attributes.get("ome")
+    omero = (inner if isinstance(inner, dict) else attributes).get("omero")
+    channels = omero.get("channels") if isinstance(omero, dict) else None
+    if not isinstance(channels, list) or len(channels) != count or not all(isinstance(c, dict) for c in channels):
+        return (), ()
+    names = tuple(str(c.get("label") or "")[:80] for c in channels)
+    return names if any(names) else (), tuple(hex_color(c.get("color")) for c in channels)

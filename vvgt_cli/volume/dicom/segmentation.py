@@ -1,0 +1,152 @@
+"""DICOM segmentations (SEG and Label Map Segmentation; PS3.3, A.51, A.92 and C.8.20), read by highdicom as label maps.
+
+A file holds bits a segment and slice, or numbers of segments; frames without any may be left out of it. RTSTRUCT is
+another thing, contours, and not read: no library that is kept fills them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, SeveralComponents, UsageError
+from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume
+
+CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
+EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A segment as a header describes it.
+
+    Attributes:
+        number: its voxels' value.
+        name: its label.
+        color: RGB in [0, 1]; None where the file says none.
+    """
+
+    number: int
+    name: str
+    color: tuple[float, float, float] | None
+
+
+def is_segmentation(header: Any) -> bool:
+    """Tell whether a DICOM header is that of a segmentation."""
+    return str(header.get("SOPClassUID", "")) in CLASSES
+
+
+def is_segmentation_file(source: str) -> bool:
+    """Tell whether a path is a file with a segmentation; False where pydicom is not installed."""
+    path = Path(source)
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            if file.read(132)[128:] != b"DICM":
+                return False
+        import pydicom
+
+        return is_segmentation(pydicom.dcmread(path, stop_before_pixels=True, specific_tags=["SOPClassUID"]))
+    except Exception:  # whatever it is, who reads it says so
+        return False
+
+
+def names_of(header: Any) -> str:
+    """List the segments of a header, for a message."""
+    names = [str(segment.get("SegmentLabel", "?")) for segment in header.get("SegmentSequence", [])]
+    return f"{len(names)} segments ({listed(names, ', ')})"
+
+
+def segments(source: str) -> list[Segment]:
+    """Read number, label and colour of every segment: the recommended CIELab colour, or the palette's.
+
+    Raises:
+        DataError: pydicom or highdicom is not installed, no segmentation, or a damaged one.
+    """
+    pydicom, highdicom = need("pydicom", EXTRA, source, WHAT), need("highdicom", EXTRA, source, WHAT)
+    with library_errors(source, WHAT):
+        header = pydicom.dcmread(source, stop_before_pixels=True)
+        if not is_segmentation(header):
+            raise DataError(f"{source}: DICOM of modality {header.get('Modality', '?')}; expected a segmentation (SEG)")
+        found = []
+        for one in header.get("SegmentSequence", []):
+            number, lab = int(one.SegmentNumber), one.get("RecommendedDisplayCIELabValue")
+            color: tuple[float, float, float] | None
+            if lab is not None:
+                red, green, blue = highdicom.color.CIELabColor.from_dicom_value(lab).to_rgb(clip=True)
+                color = (red / 255, green / 255, blue / 255)
+            else:
+                color = _palette_color(header, number)
+            found.append(Segment(number, str(one.get("SegmentLabel", f"segment {number}")), color))
+    return found
+
+
+def _palette_color(header: Any, number: int) -> tuple[float, float, float] | None:
+    """Return the RGB of a segment by the palette (PS3.3, C.7.6.3.1.5 and 6); None without one."""
+    if header.get("PhotometricInterpretation") != "PALETTE COLOR":
+        return None
+    found = []
+    for name in ("Red", "Green", "Blue"):
+        count, first, bits = header[f"{name}PaletteColorLookupTableDescriptor"].value
+        kind = np.dtype("u1" if bits == 8 else "<u2")
+        entries = np.frombuffer(header[f"{name}PaletteColorLookupTableData"].value, kind)[: count or 1 << 16]
+        found.append(float(entries[min(max(number - first, 0), len(entries) - 1)]) / np.iinfo(kind).max)
+    return found[0], found[1], found[2]
+
+
+def read_segmentation(path: Path, options: ReadOptions) -> Volume:
+    """Read a file as a label map, (slices, rows, columns) numbers of segments; positions are LPS.
+
+    Raises:
+        DataError: highdicom is not installed, fractions in place of segments, planes that make no even stack.
+        SeveralComponents: segments overlap and none was chosen (``component`` counts them from 0).
+        UsageError: no such segment.
+    """
+    source = str(path)
+    highdicom = need("highdicom", EXTRA, source, WHAT)
+    with library_errors(source, WHAT):
+        read = highdicom.seg.segread(path)
+        if read.segmentation_type == highdicom.seg.SegmentationTypeValues.FRACTIONAL:
+            raise DataError(
+                f"{source}: {WHAT} of fractions; expected one of bits or of labels: export it as BINARY or LABELMAP"
+            )
+        grid = read.get_volume_geometry()
+        if grid is None:
+            raise DataError(f"{source}: planes that are no even stack; expected a segmentation of a volume")
+        numbers = sorted(number for number in read.segment_numbers if number)
+        check_memory(2 * math.prod(grid.spatial_shape), source)
+        chosen = _chosen(numbers, options.component, source)
+        try:
+            found = read.get_volume(segment_numbers=chosen, combine_segments=True)
+        except RuntimeError as error:
+            if "overlap" not in str(error):
+                raise
+            raise SeveralComponents(
+                f"{source}: {len(numbers)} segments that overlap; expected one: choose it with --component 0 to "
+                f"{len(numbers) - 1}",
+                len(numbers),
+            ) from None
+    steps = found.affine[:3, 2::-1]  # of column, row and slice
+    spacing = np.linalg.norm(steps, axis=0)
+    return Volume(
+        np.ascontiguousarray(found.array), options.spacing_or((spacing[0], spacing[1], spacing[2])),
+        tuple(found.affine[:3, 3].tolist()), tuple((steps / spacing).ravel().tolist()),
+        path.resolve().name.removesuffix(".dcm"), space="LPS", reference=str(read.FrameOfReferenceUID),
+    )  # fmt: skip
+
+
+def _chosen(numbers: list[int], component: int | str | None, source: str) -> list[int]:
+    if component is None:
+        return numbers
+    if component not in range(len(numbers)):
+        raise UsageError(f"{source}: no segment {component}; expected --component 0 to {len(numbers) - 1}")
+    return [numbers[int(component)]]

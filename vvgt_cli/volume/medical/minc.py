@@ -1,0 +1,215 @@
+"""MINC 1 (a NetCDF file) and MINC 2 (an HDF5 file), ``.mnc``: values stay in their file, and are scaled slice by slice.
+
+The values of a slice run from image-min to image-max. Format: https://en.wikibooks.org/wiki/MINC/Reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays import MAGIC
+from vvgt_cli.volume.arrays.conventions import text_of
+from vvgt_cli.volume.arrays.hdf5 import checked_dataset, read_part
+from vvgt_cli.volume.arrays.netcdf3 import check_header
+from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import placed
+from vvgt_cli.volume.stored import Slices, give_back, stored_or_held
+from vvgt_cli.volume.types import Volume
+
+IMAGE, DIMENSIONS = "minc-2.0/image/0/", "minc-2.0/dimensions/"
+SLAB = 1 << 22  # voxels that are scaled at once, in float64
+AXES = ("xspace", "yspace", "zspace")
+
+
+@dataclass(frozen=True)
+class _Image:
+    """The image of a file.
+
+    Attributes:
+        names: of its axes, slowest first.
+        shape: of the stored values.
+        dtype: of the stored values.
+        read: reads the stored values at an index of all axes.
+        attributes: of the image.
+        ends: image-min and image-max, along the first axes of the image; None where values are not scaled.
+        axes: attributes of each axis.
+    """
+
+    names: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[tuple[Any, ...]], np.ndarray]
+    attributes: dict[str, Any]
+    ends: tuple[np.ndarray, np.ndarray] | None
+    axes: dict[str, dict[str, Any]]
+
+
+def read_minc(path: Path, options: ReadOptions) -> Volume:
+    """Read a MINC file as float32. A fourth axis is time.
+
+    Raises:
+        DataError: h5py is not installed, a damaged file, values in other files, axes that are no volume.
+        UsageError: time steps (`SeveralSteps`) and none chosen, or a choice that does not exist.
+    """
+    with open(path, "rb") as file:
+        packed = file.read(len(MAGIC)) == MAGIC
+    with library_errors(str(path), "MINC"):
+        image = _minc2(path) if packed else _minc1(path)
+        return _volume(image, path, options)
+
+
+def _minc1(path: Path) -> _Image:
+    variables = check_header(path)
+    if "image" not in variables:
+        raise DataError(f"{path}: no variable 'image'; expected one in a MINC file")
+    image = variables["image"]
+    dtype = image.dtype.newbyteorder("=")
+    if dtype.kind in "iS":
+        signed = str(image.attributes.get("signtype", "unsigned" if dtype.itemsize == 1 else "signed"))
+        dtype = np.dtype(f"{'u' if signed.startswith('unsigned') else 'i'}{dtype.itemsize}")
+    values = image.mapped(path)
+    if min(values.shape, default=0) > 0 and dtype.kind in "iu":
+        values = values.view(dtype.newbyteorder(">"))
+    ends = [variables[name] for name in ("image-min", "image-max") if name in variables]
+    limits = [(v.dims, v.mapped(path).reshape(v.shape)) for v in ends]
+    axes = {name: variables[name].attributes for name in image.dims if name in variables}
+    return _Image(
+        image.dims, image.shape, dtype, partial(_mapped_part, values), image.attributes,
+        _ends(limits, image.dims, image.shape, path), axes,
+    )  # fmt: skip
+
+
+def _mapped_part(values: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
+    """Copy a part of a map, and give its pages back."""
+    part = np.array(values[index])
+    give_back(values)
+    return part
+
+
+def _minc2(path: Path) -> _Image:
+    h5py = need("h5py", "hdf5", str(path), "MINC 2")
+    with h5py.File(path, "r") as file:
+        data = checked_dataset(h5py, file, path, IMAGE + "image")
+        names = _order(data)
+        limits = []
+        for name in ("image-min", "image-max"):
+            if IMAGE + name in file:
+                one = checked_dataset(h5py, file, path, IMAGE + name)
+                check_memory(one.size * one.dtype.itemsize, path.name)
+                limits.append((_order(one), np.asarray(one[()])))
+        axes = {name: dict(file[DIMENSIONS + name].attrs) for name in names if DIMENSIONS + name in file}
+        return _Image(
+            names, data.shape, data.dtype, partial(read_part, path, IMAGE + "image"), dict(data.attrs),
+            _ends(limits, names, data.shape, path), axes,
+        )  # fmt: skip
+
+
+def _order(dataset: Any) -> tuple[str, ...]:
+    """Return the names of a dataset's axes; its attribute may name more of them."""
+    names = text_of(dataset.attrs.get("dimorder", ""))
+    return tuple(names.split(",")[: len(dataset.shape)]) if names else ()
+
+
+def _ends(
+    limits: list[tuple[tuple[str, ...], np.ndarray]], names: tuple[str, ...], shape: tuple[int, ...], path: Path
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return image-min and image-max in float64."""
+    if not limits:
+        return None
+    n = len(limits[0][0])
+    if len(limits) != 2 or any(dims != names[:n] or values.shape != shape[:n] for dims, values in limits):
+        dims = " and ".join(", ".join(dims) or "none" for dims, _ in limits)
+        raise DataError(
+            f"{path}: image-min and image-max along axes {dims}; expected both along the first of the image"
+        )
+    low, high = (np.asarray(values, np.float64) for _, values in limits)
+    return low, high
+
+
+def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
+    shape = image.shape
+    spatial = image.names[-3:]
+    if len(shape) not in (3, 4) or min(shape) < 1 or set(spatial) != set(AXES) or image.dtype.kind not in "iuf":
+        raise DataError(
+            f"{path}: axes {', '.join(image.names)} of {shape} values of type {image.dtype}; expected three in space, "
+            "and time before them"
+        )
+    step = options.step(shape[0] if len(shape) == 4 else 1, str(path))
+    if options.component not in (None, 0):
+        raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
+    lead = (step,) if len(shape) == 4 else ()
+    read, chunk = _scaled(image, lead, path), (1, *shape[-2:])
+    field = stored_or_held(read, np.dtype(np.float32), shape[-3:], chunk, str(path), options.stored)
+    return placed(field, *_place(image.axes, spatial, path), options, volume_name(path), space="RAS")
+
+
+def _scaled(image: _Image, lead: tuple[int, ...], path: Path) -> Callable[[Slices], np.ndarray]:
+    """Make a function that reads the values of a box, scaled."""
+    low, high = _valid(image, path)
+
+    def part(slices: Slices) -> np.ndarray:
+        z, y, x = (range(*s.indices(n)) for s, n in zip(slices, image.shape[-3:], strict=True))
+        out = np.empty((len(z), len(y), len(x)), np.float32)
+        deep = max(SLAB // max(len(y) * len(x), 1), 1)
+        for k in range(0, len(z), deep):
+            index = (*lead, slice(z.start + k, min(z.start + k + deep, z.stop)), slices[1], slices[2])
+            values = image.read(index)
+            if image.ends is not None and image.dtype.kind != "f":
+                first, last = (_along(end, index) for end in image.ends)
+                slope = (last - first) / (high - low)
+                values = np.clip(values, low, high) * slope + (first - low * slope)
+            out[k : k + deep] = values
+        return out
+
+    return part
+
+
+def _along(end: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
+    """Return image-min or image-max of a part of the image, with the axes of the part."""
+    found = end[index[: end.ndim]]
+    rest = sum(isinstance(i, slice) for i in index[end.ndim :])
+    return np.reshape(found, (*np.shape(found), *[1] * rest))
+
+
+def _valid(image: _Image, path: Path) -> tuple[float, float]:
+    """Return the stored values that stand for image-min and image-max."""
+    if image.dtype.kind == "f":
+        return 0.0, 1.0
+    stated, info = image.attributes, np.iinfo(image.dtype)
+    found = np.ravel(stated["valid_range"]) if "valid_range" in stated else [
+        _number(stated, key, end) for key, end in (("valid_min", info.min), ("valid_max", info.max))
+    ]  # fmt: skip
+    low, high = (float(v) for v in found)
+    if not info.min <= low < high <= info.max:
+        raise DataError(f"{path}: its valid range is {low:g} to {high:g}; expected one of {image.dtype}, ascending")
+    return low, high
+
+
+def _number(attributes: dict[str, Any], key: str, default: float) -> float:
+    return float(np.ravel(attributes[key])[0]) if key in attributes else default
+
+
+def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) -> tuple[list[list[float]], np.ndarray]:
+    """Return the vectors of a step along x, y and z, one a row, and the first position: steps, starts and cosines."""
+    rows, origin = [], np.zeros(3)
+    for name in names[::-1]:  # fastest first
+        stated = axes.get(name, {})
+        if text_of(stated.get("spacing", "")).strip("_") == "irregular":
+            raise DataError(f"{path}: axis {name} has irregular steps; expected regular ones: try mincresample")
+        unit = np.eye(3)[AXES.index(name)]
+        cosines = np.asarray(stated.get("direction_cosines", unit), np.float64).reshape(3)
+        rows.append((cosines * _number(stated, "step", 1.0)).tolist())
+        origin += cosines * _number(stated, "start", 0.0)
+    if not np.isfinite(rows).all() or not np.isfinite(origin).all():
+        raise DataError(f"{path}: its steps or starts are not finite; check that the file is whole")
+    return rows, origin

@@ -1,0 +1,228 @@
+"""Images of microscopes: one channel and one time step of one as a volume, in memory or left in its file."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
+from vvgt_cli.volume.components import contiguous, listed, magnitude
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.stored import Slices, stored_or_held
+from vvgt_cli.volume.types import Volume
+
+EXTRA = "microscopy"
+MAX_XML = 64 << 20
+Color = tuple[float, float, float] | None
+Box = Slices
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image of a microscope.
+
+    Attributes:
+        times: number of time steps.
+        channels: number of channels.
+        shape: (nz, ny, nx) of each.
+        dtype: of the values.
+        read: (time, channel, slices along z, y, x, step 1) to that box, (z, y, x).
+        chunks: (z, y, x) voxels that are read together.
+        spacing: (x, y, z) in micrometres; None of an axis where the file has none.
+        origin: world position of the centre of voxel (0, 0, 0), (x, y, z), micrometres.
+        names: of the channels, where the file has any.
+        colors: RGB in [0, 1] of the channels, where the file has any.
+        rgb: the channels are red, green, blue and perhaps opacity.
+        mapped: ``read`` gives views of the file, which take no memory.
+    """
+
+    times: int
+    channels: int
+    shape: tuple[int, int, int]
+    dtype: np.dtype
+    read: Callable[[int, int, Box], np.ndarray]
+    chunks: tuple[int, int, int]
+    spacing: tuple[float | None, float | None, float | None] = (None, None, None)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    names: Sequence[str] = ()
+    colors: Sequence[Color] = ()
+    rgb: bool = False
+    mapped: bool = False
+
+
+def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
+
+    Raises:
+        DataError: sizes or values that are none, or more than the memory holds.
+        UsageError: several channels (`SeveralComponents`) or time steps (`SeveralSteps`) and none chosen, or none such.
+    """
+    if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
+        raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
+    channel = _channel(picture, options.component, source)
+    time = options.step(picture.times, source)
+    box = tuple(slice(0, n) for n in picture.shape)
+    size = math.prod(picture.shape)
+    field: Any
+    if channel is None:
+        if options.stored:
+            raise UsageError(f"{source}: a magnitude cannot be read block by block; choose one channel")
+        check_memory((picture.dtype.itemsize * picture.channels + 4) * size, source, IN_BLOCKS)
+        bands = [picture.read(time, c, box) for c in range(picture.channels)]
+        field = magnitude(np.stack(bands, axis=-1))
+    elif not picture.mapped:
+        read = partial(picture.read, time, channel)
+        field = stored_or_held(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
+    else:
+        field = picture.read(time, channel, box)
+        if not field.flags.c_contiguous:
+            check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
+        field = contiguous(field)
+    unit = "" if picture.spacing == (None, None, None) else "um"
+    return Volume(field, _spacing(picture, options), picture.origin, name=name, unit=unit)
+
+
+def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, float]:
+    """Return the spacing (x, y, z); an axis without a size is as wide as the others, as in `Facts.voxel` of TIFF."""
+    x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
+    across = x or y or z or 1.0
+    return options.spacing_or((x or across, y or across, z or across))
+
+
+def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
+    """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
+    colors, own = picture.colors, not picture.rgb
+    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, own)
+
+
+def choose_channel(
+    n: int, names: Sequence[str], dtype: np.dtype, wanted: int | str | None, source: str,
+    colors: Sequence[Color] = (), rgb: bool = False, own: bool = True,
+) -> int | None:  # fmt: skip
+    """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
+
+    Args:
+        n: how many there are.
+        names: of the channels, where they have any.
+        dtype: of their values.
+        wanted: number, name, ``magnitude``, or None.
+        source: for messages.
+        colors: RGB in [0, 1] of the channels, where they have any.
+        rgb: they are red, green, blue and perhaps opacity.
+        own: they are channels of their own, not samples of pixels.
+
+    Raises:
+        SeveralComponents: several and none chosen.
+        UsageError: none such.
+    """
+    names = [*names] if len(names) == n and any(names) else []
+    if wanted == "magnitude" and n > 1:
+        return None
+    if isinstance(wanted, str) and names.count(wanted) == 1:
+        return names.index(wanted)
+    if wanted is None and n == 1:
+        return 0
+    if isinstance(wanted, int) and wanted < n:
+        return wanted
+    listing = listed([f"{k} {name[:40]!r}" for k, name in enumerate(names)], ", ") if names else ""
+    what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {dtype}"
+    if n == 1:
+        raise UsageError(f"{what}; leave out --channel {wanted}")
+    expected = f"expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
+    if wanted is not None:
+        raise UsageError(f"{what}, not {wanted!r}; {expected}")
+    raise SeveralComponents(
+        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), own, names
+    )
+
+
+def choose_image(
+    names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str, deep: Sequence[bool] = (),
+    keys: Sequence[str] = (),
+) -> int:  # fmt: skip
+    """Return the index of the image, scene or position asked for by number or name, or of the only one.
+
+    The only one of several slices is taken where none is asked for, with a warning.
+
+    Args:
+        names: of all of them.
+        facts: description of each, for messages.
+        wanted: number or name; None for the only one.
+        what: word for them, in the plural, for messages.
+        source: for messages.
+        deep: which ones have several slices, where they differ.
+        keys: their numbers; from 0 on where they are not given.
+
+    Raises:
+        DataError: there are none.
+        UsageError: several and none chosen (`SeveralArrays`), or none such.
+    """
+    if not names:
+        raise DataError(f"{source}: no {what}; expected at least one")
+    keys = keys or [str(k) for k in range(len(names))]
+    listing = listed([f"{k} {n[:60]!r} ({f})" for k, n, f in zip(keys, names, facts, strict=True)])
+    if wanted is not None:
+        found = [k for k, name in enumerate(names) if wanted.strip("/") in (keys[k], name)]
+        if len(found) != 1:
+            raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
+        return found[0]
+    if len(names) == 1:
+        return 0
+    if sum(deep) != 1:
+        text = f"{source}: {len(names)} {what}: {listing}; choose one by number or name with --series NAME"
+        raise SeveralArrays(text, "--series", keys, names)
+    number = [*deep].index(True)
+    warnings.warn(
+        f"{source}: {names[number]!r} taken, of {len(names)} images the only one of several slices (--series chooses "
+        "another)", stacklevel=3,
+    )  # fmt: skip
+    return number
+
+
+def hex_color(text: Any) -> Color:
+    """Parse RGB in [0, 1] of ``RRGGBB`` or ``AARRGGBB``, after "#" or not; None for others, and for black."""
+    found = re.fullmatch(r"#?(?:[0-9a-fA-F]{2})?([0-9a-fA-F]{6})", text.strip()) if isinstance(text, str) else None
+    if found is None or found[1] == "000000":
+        return None
+    red, green, blue = bytes.fromhex(found[1])
+    return red / 255, green / 255, blue / 255
+
+
+def safe_xml(text: str, source: str) -> ElementTree.Element:
+    """Parse a file's metadata and return the root.
+
+    Raises:
+        DataError: entities, more than `MAX_XML` characters, or damage.
+    """
+    if "<!DOCTYPE" in text or "<!ENTITY" in text or len(text) > MAX_XML:
+        raise DataError(f"{source}: XML metadata of {len(text)} characters or with entities; expected plain metadata")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise DataError(f"{source}: damaged XML metadata ({error}); check that the file is whole") from error
+
+
+class Bounded(io.BufferedReader):
+    """A file that is never asked for more bytes than it has: lengths in it may lie, and memory is allocated first."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a file."""
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read as any file does, but never ask for more bytes than are left."""
+        rest = max(self._size - self.tell(), 0)
+        return super().read(rest if size is None or size < 0 else min(size, rest))

@@ -1,0 +1,143 @@
+"""Imaris (``.ims``), an HDF5 file of a known layout: channels, time steps and a pyramid of levels. Read by h5py.
+
+Format: Imaris 5.5 file format, https://imaris.oxinst.com/support/imaris-file-format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.microscopy.image import Box, Color, Picture, picture_volume
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.types import Volume
+
+MICROMETRE = 1e-6
+MOST = 1_000_000  # time steps or channels
+
+
+def is_imaris(file: Any) -> bool:
+    """Tell whether an open HDF5 file is one of Imaris."""
+    return "DataSet/ResolutionLevel 0/TimePoint 0/Channel 0/Data" in file and "DataSetInfo" in file
+
+
+def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes (z, y, x) of the levels, finest first; none for another file, or without h5py."""
+    try:
+        import h5py
+    except ImportError:
+        return []
+    try:
+        with h5py.File(path, "r") as file:
+            return [_shape(file, level) for level in range(_count(file, "ResolutionLevel"))] if is_imaris(file) else []
+    except (OSError, ValueError, KeyError, RuntimeError, DataError):
+        return []  # said where it is read
+
+
+def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[str], Any]) -> Volume:
+    """Read one channel of one time step of an open file, at ``options.level``.
+
+    Args:
+        file: open, by h5py.
+        path: of it.
+        options: level, time, component.
+        checked: the dataset of a path; raises where its values must not be read.
+
+    Raises:
+        DataError: a damaged file.
+        UsageError: several channels or time steps and none chosen, a level that is none.
+    """
+    if options.array is not None:
+        raise UsageError(f"{path}: an Imaris file, which has one image; leave out --array {options.array}")
+    levels, level = _count(file, "ResolutionLevel"), options.level or 0
+    if level >= levels:
+        raise UsageError(f"{path}: --level {level}: expected full, or 0 to {levels - 1}")
+    times = _count(file[f"DataSet/ResolutionLevel {level}"], "TimePoint", "")
+    channels = _count(file[f"DataSet/ResolutionLevel {level}/TimePoint 0"], "Channel", "")
+    first = checked(_place(level, 0, 0))
+    shape = _shape(file, level)
+    for time in range(times) if options.time is None else [min(options.time, times - 1)]:
+        for channel in range(channels):
+            name = _place(level, time, channel)
+            dataset = checked(name)
+            if len(dataset.shape) != 3 or any(a < b for a, b in zip(dataset.shape, shape, strict=True)):
+                raise DataError(f"{path}:/{name}: {dataset.shape}; expected at least the image's {shape}")
+    image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
+    spacing, origin = _placed(image, shape)
+    channel_facts = [_channel(file, c) for c in range(channels)]
+    picture = Picture(
+        times, channels, shape, first.dtype, partial(_read, path, level), first.chunks or (1, *shape[1:]), spacing,
+        origin, [name for name, _ in channel_facts], [color for _, color in channel_facts],
+    )  # fmt: skip
+    return picture_volume(picture, options, str(path), volume_name(path))
+
+
+def _place(level: int, time: int, channel: int) -> str:
+    return f"DataSet/ResolutionLevel {level}/TimePoint {time}/Channel {channel}/Data"
+
+
+def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarray:
+    """Read a box from a file that is open no longer than that; datasets are padded to whole chunks."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[_place(level, time, channel)][box])
+
+
+def _count(group: Any, what: str, inside: str = "DataSet") -> int:
+    """Count the groups ``what 0``, ``what 1``, ... in a row."""
+    group = group[inside] if inside else group
+    return next(k for k in range(MOST) if f"{what} {k}" not in group)
+
+
+def _shape(file: Any, level: int) -> tuple[int, int, int]:
+    """Return (nz, ny, nx) of a level, without the padding."""
+    group = file[f"DataSet/ResolutionLevel {level}/TimePoint 0/Channel 0"]
+    padded = group["Data"].shape
+    sizes = [_text(group.attrs.get(f"ImageSize{axis}", "")) for axis in "ZYX"]
+    if not all(text.isdecimal() and len(text) < 10 for text in sizes):
+        sizes = [str(n) for n in padded]
+    if len(padded) != 3 or len(sizes) != 3 or min(map(int, sizes)) < 1:
+        raise DataError(f"{file.filename}: level {level} of {' x '.join(sizes)}; expected three sizes of at least 1")
+    z, y, x = map(int, sizes)
+    return z, y, x
+
+
+def _text(value: Any) -> str:
+    """Join an attribute, an array of single characters, to text."""
+    found = np.asarray(value)
+    if found.dtype.kind == "S":
+        return found.tobytes().replace(b"\0", b"").decode("utf-8", "replace").strip()
+    return "".join(map(str, found.ravel()[:4096])).strip()
+
+
+def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:
+    """Return spacing and origin (x, y, z) in micrometres by the extent of the image."""
+    unit = (metres(_text(image.get("Unit", "um"))) or MICROMETRE) / MICROMETRE
+    spacing: list[float | None] = []
+    origin = []
+    for axis, size in enumerate(reversed(shape)):
+        ends = [[float(word) for word in _text(image.get(f"Ext{end}{axis}", "")).split()] for end in ("Min", "Max")]
+        width = (ends[1][0] - ends[0][0]) * unit / size if all(len(e) == 1 for e in ends) else 0.0
+        known = np.isfinite(width) and width > 0
+        spacing.append(width if known else None)
+        origin.append(ends[0][0] * unit + width / 2 if known else 0.0)
+    return tuple(spacing), tuple(origin)
+
+
+def _channel(file: Any, number: int) -> tuple[str, Color]:
+    """Return name and colour of a channel."""
+    group = file.get(f"DataSetInfo/Channel {number}")
+    if group is None:
+        return "", None
+    rgb = [float(word) for word in _text(group.attrs.get("Color", "")).split()]
+    good = len(rgb) == 3 and all(0 <= v <= 1 for v in rgb) and any(rgb)
+    name = _text(group.attrs.get("Name", ""))[:80]
+    return "" if name == "(name not specified)" else name, (rgb[0], rgb[1], rgb[2]) if good else None

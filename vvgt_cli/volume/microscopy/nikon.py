@@ -1,0 +1,168 @@
+"""Nikon (``.nd2``): one position of a file, frame by frame. Read by nd2, which maps uncompressed frames."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Box, Color, Picture, choose_image, picture_volume
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.types import Volume
+
+CHUNK_MAGIC = 0x0ABECEDA
+MAP_END = b"ND2 CHUNK MAP SIGNATURE 0000001!"
+END, CHUNK = struct.Struct("<32sQ"), struct.Struct("<IIQ")  # the end of the file; before every chunk
+MOST = 10_000_000  # frames
+
+
+def read_nd2(path: Path, options: ReadOptions) -> Volume:
+    """Read one position of an ND2 file; spacing in micrometres.
+
+    Raises:
+        DataError: nd2 is not installed, a damaged file, axes that are none of a volume.
+        UsageError: several positions, channels or time steps and none chosen.
+    """
+    nd2 = need("nd2", EXTRA, str(path), "ND2")
+    there = _frames(path)
+    with library_errors(str(path), "ND2"), _opened(nd2, path) as file:
+        sizes = {str(a): int(n) for a, n in file.sizes.items()}
+        odd = [a for a, n in sizes.items() if a not in "TPZCYXS" and n > 1]
+        if odd or min(sizes.values(), default=0) < 1 or not {"Y", "X"} <= set(sizes):
+            raise DataError(f"{path}: axes {sizes}; expected X and Y, and Z, T, P (positions), C or S at most")
+        place = _position(file, sizes, options, path)
+        loops = [a for a in sizes if a not in "CYXS"]
+        frames = int(np.prod([sizes[a] for a in loops], dtype=object))
+        found = sum(k in there for k in range(min(frames, MOST)))
+        if found < frames:
+            raise DataError(f"{path}: of {frames} frames {found} are there; check that the file is whole")
+        names, colors = _channels(file)
+        attributes = file.attributes
+        packed = (
+            (there, attributes.heightPx * (attributes.widthBytes or 0))
+            if attributes.compressionType == "lossless"
+            else None
+        )
+        x, y, z = (float(v) for v in file.voxel_size())
+        several = sizes.get("C", 1) > 1
+        read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
+        picture = Picture(
+            sizes.get("T", 1), sizes.get("C", 1) * sizes.get("S", 1), (sizes.get("Z", 1), sizes["Y"], sizes["X"]),
+            np.dtype(file.dtype), read, (1, sizes["Y"], sizes["X"]),
+            (x, y, z if sizes.get("Z", 1) > 1 else None), names=names if sizes.get("S", 1) == 1 else (), colors=colors,
+            rgb=sizes.get("S", 1) > 1 and not several,
+        )  # fmt: skip
+        name = volume_name(path) + (f":{place}" if sizes.get("P", 1) > 1 else "")
+        return picture_volume(picture, options, str(path), name)
+
+
+@contextmanager
+def _opened(nd2: Any, path: Path) -> Iterator[Any]:
+    with Bounded(path) as stream, nd2.ND2File(stream) as file:
+        yield file
+
+
+def _frames(path: Path) -> dict[int, int]:
+    """Return the position of each frame in the file, by number, from its map of chunks: nd2 reads zeros for others.
+
+    Raises:
+        DataError: no map of chunks at the file's end.
+    """
+    size = path.stat().st_size
+    with Bounded(path) as file:
+        file.seek(max(size - END.size, 0))
+        name, place = END.unpack(file.read(END.size).ljust(END.size, b"\0"))
+        if name != MAP_END or place >= size:
+            raise DataError(f"{path}: no map of chunks at its end; check that the ND2 file is whole")
+        file.seek(place)
+        magic, title, length = CHUNK.unpack(file.read(CHUNK.size).ljust(CHUNK.size, b"\0"))
+        file.seek(place + CHUNK.size + title)
+        data = file.read(length)
+    found: dict[int, int] = {}
+    at = 0
+    while magic == CHUNK_MAGIC:
+        end = data.find(b"!", at) + 1
+        if not end or data[at:end] == MAP_END or end + 16 > len(data):
+            break
+        number = re.fullmatch(rb"ImageDataSeq\|(\d{1,10})!", data[at:end])
+        if number and (begin := struct.unpack_from("<Q", data, end)[0]) < size:
+            found[int(number[1])] = begin
+        at = end + 16
+    return found
+
+
+def _position(file: Any, sizes: dict[str, int], options: ReadOptions, path: Path) -> int:
+    """Return the number of the position asked for."""
+    count = sizes.get("P", 1)
+    names = [f"position {k}" for k in range(count)]
+    for loop in file.experiment:
+        if getattr(loop, "type", "") == "XYPosLoop":
+            names = [str(p.name or names[k]) for k, p in enumerate(loop.parameters.points[:count])]
+    facts = " x ".join(f"{n} {a}" for a, n in sizes.items() if a != "P") + f" {file.dtype}"
+    return choose_image(names, [facts] * len(names), options.array, "positions", str(path))
+
+
+def _channels(file: Any) -> tuple[list[str], list[Color]]:
+    """Return names and colours of the channels."""
+    names: list[str] = []
+    colors: list[Color] = []
+    for one in file.metadata.channels or ():
+        names.append(str(one.channel.name))
+        rgb = [int(v) / 255 for v in tuple(one.channel.color)[:3]]
+        colors.append((rgb[0], rgb[1], rgb[2]) if any(rgb) else None)
+    return names, colors
+
+
+def _reader(
+    path: Path, sizes: dict[str, int], loops: list[str], place: int, dtype: np.dtype,
+    packed: tuple[dict[int, int], int] | None,
+) -> Any:  # fmt: skip
+    """Make a function that reads boxes frame by frame.
+
+    ``packed`` holds the positions of compressed frames and the bytes of an unpacked one.
+    """
+    turn = Lock()  # one file, one reader: workers may have threads
+
+    @cache
+    def opened() -> Any:
+        import nd2
+
+        return nd2.ND2File(Bounded(path))
+
+    def unpacked(number: int) -> np.ndarray:
+        """Unpack a frame (c, y, x, s) of zlib data to its size and no further, as nd2 would not."""
+        where, size = packed or ({}, 0)
+        with Bounded(path) as file:
+            file.seek(where[number])
+            _, title, length = CHUNK.unpack(file.read(CHUNK.size))
+            file.seek(title + 8, 1)  # the name and the time
+            values = np.frombuffer(zlib.decompressobj().decompress(file.read(length - 8), size), dtype)
+        rows = values.reshape(sizes["Y"], -1)[:, : sizes["X"] * sizes.get("C", 1) * samples]
+        return rows.reshape(sizes["Y"], sizes["X"], sizes.get("C", 1), samples).transpose(2, 0, 1, 3)
+
+    samples = sizes.get("S", 1)
+
+    def read(time: int, channel: int, box: Box) -> np.ndarray:
+        z, y, x = box
+        out = np.empty([k.stop - k.start for k in box], dtype)
+        with turn, library_errors(str(path), "ND2"):
+            for k in range(z.start, z.stop):
+                at = {"T": time, "P": place, "Z": k}
+                number = int(np.ravel_multi_index([at[a] for a in loops], [sizes[a] for a in loops])) if loops else 0
+                frame = np.asarray(opened().read_frame(number)) if packed is None else unpacked(number)
+                frame = frame.reshape(sizes.get("C", 1), sizes["Y"], sizes["X"], samples)
+                out[k - z.start] = frame[channel // samples, y, x, channel % samples]
+        return out
+
+    return read

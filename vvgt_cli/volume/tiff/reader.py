@@ -1,0 +1,260 @@
+"""TIFF (``.tif``, ``.tiff``), OME-TIFF, ImageJ's and BigTIFF among them: axes by tifffile, pixels by OpenImageIO.
+
+tifffile says which page is which slice, channel and time. Its decoders are not used where OpenImageIO has one: those
+unpack a page to its size and no further, and need no further package. Pixels that lie together plainly are
+memory-mapped. What OpenImageIO does not decode is left to tifffile, which wants imagecodecs for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import check_memory, size_text
+from vvgt_cli.volume.components import contiguous, magnitude
+from vvgt_cli.volume.libraries import library_errors
+from vvgt_cli.volume.microscopy.image import choose_channel, choose_image
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.tiff.decode import Pages
+from vvgt_cli.volume.tiff.metadata import Facts, count_planes, imagej_facts, ome_facts, ome_root
+from vvgt_cli.volume.tiff.pages import check_pages
+from vvgt_cli.volume.tiff.stored import lazy_pages
+from vvgt_cli.volume.types import Volume
+
+_AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
+
+
+@dataclass(frozen=True)
+class SeriesAxes:
+    """The positions of voxels along the axes of a series.
+
+    Attributes:
+        axes: letters as tifffile has them, unknown ones that stand for slices made Z.
+        shape: sizes along them.
+        lead: how many of them count pages; the rest lie in a page.
+        color: pixels are colours, as their photometric tag says.
+    """
+
+    axes: str
+    shape: tuple[int, ...]
+    lead: int
+    color: bool = False
+
+    def of(self, letters: str) -> list[int]:
+        """Return the positions of axes of more than one value."""
+        return [k for k, a in enumerate(self.axes) if a in letters and self.shape[k] > 1]
+
+
+def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
+    """Read a volume from a TIFF file; rows from the top are y. Resolution tags alone are not spacing.
+
+    Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
+
+    Args:
+        path: the file.
+        options: see `ReadOptions`.
+        slices: how many slices a volume has, if the file is one of them.
+
+    Raises:
+        DataError: directories or OME-XML that cannot be, damaged or missing pages, pixels of an unknown coding.
+        UsageError: several series, channels or time steps (`SeveralSteps`) and none chosen.
+    """
+    import tifffile
+
+    check_pages(path)
+    with library_errors(str(path), "TIFF"), _silent(), tifffile.TiffFile(path) as file:
+        root = ome_root(file.ome_metadata, path) if file.is_ome and file.ome_metadata else None
+        count_planes(file)
+        series, number = _series(file, options.array, path)
+        facts = _facts(file, root, series, number, path)
+        layout = _layout(series, path)
+        index, several = _choose(layout, facts, options, path, series.dtype)
+        mapped = _mappable(series)
+        if options.stored and _paged(layout, index, several) and not mapped:
+            _whole(series, path)
+            lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
+            turned = layout.axes.index("X") < layout.axes.index("Y")
+            field: Any = lazy_pages(path, number, lead, inner, index, np.dtype(series.dtype), turned)
+        else:
+            values = _values(file, series, layout, index, path)
+            field = _arranged(values, layout, index, several, path, options.stored and mapped)
+    spacing, doubts = facts.voxel(options, max(slices, field.shape[0]), str(path))
+    if doubts:
+        warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
+    return Volume(field, spacing, name=volume_name(path), unit=facts.length)
+
+
+def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) -> bool:
+    """Tell whether slices are pages of which nothing but rows and columns is kept."""
+    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
+    ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
+    return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
+
+
+def _arranged(
+    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path, view: bool
+) -> np.ndarray:
+    """Return (z, y, x) of what was read, the magnitude of several channels; ``view``: one of the file will do."""
+    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
+    field = values.transpose([kept.index(a) for a in "ZYXCS" if a in kept])
+    field = field[tuple(slice(None) if a in kept else None for a in "ZYX")]
+    if several:
+        check_memory(field[..., 0].size * 4, str(path))
+        return magnitude(field.reshape(*field.shape[:3], -1))
+    if view or field.flags.c_contiguous:
+        return field
+    check_memory(field.nbytes, str(path))
+    return contiguous(field)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep tifffile from logging: what matters of it becomes an error here."""
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
+    """Return the series asked for, or the only one that is an image of its own, and its number."""
+    found = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
+    if not found:
+        raise DataError(f"{path}: no pages but thumbnails and masks; expected slices")
+    facts = [f"{' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype}" for _, s in found]
+    deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
+    names, keys = [s.name for _, s in found], [str(k) for k, _ in found]
+    number, series = found[choose_image(names, facts, wanted, "series", str(path), deep, keys)]
+    return series, number
+
+
+def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
+    """Return the facts of a series; check that its pages are those that they describe."""
+    facts = Facts()
+    if root is not None:
+        facts = ome_facts(root, number, len(file.series))
+        if series.kind not in ("ome", "imagej", "mmstack"):
+            raise DataError(f"{path}: its OME-XML does not fit its pages; check that the file is whole")
+    if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
+        first = file.pages.first
+        x, y = (r if code in first.tags else None for code, r in zip((282, 283), first.get_resolution(), strict=True))
+        description = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
+        facts = replace(description, channels=facts.channels)
+        if facts.images > 1 and series.kind != "imagej" and root is None:
+            short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
+            missing = f" ({size_text(short)} are missing)" if short > 0 else ""
+            text = f"{path}: ImageJ's description tells of {facts.images} images that are not there{missing}"
+            raise DataError(f"{text}; is it whole?")
+    return facts
+
+
+def _layout(series: Any, path: Path) -> SeriesAxes:
+    """Return the axes of a series, and how they lie in its pages."""
+    axes, shape = series.get_axes(False), tuple(map(int, series.get_shape(False)))
+    keyframe = series.keyframe
+    if keyframe.photometric == 3 and not (keyframe.is_imagej or series.kind in ("ome", "imagej")):
+        raise DataError(f"{path}: pixels are numbers of a palette's colours; expected scalars: convert to grey first")
+    strange = [k for k, a in enumerate(axes) if a not in _AXES and shape[k] > 1]
+    deep = any(a == "Z" and n > 1 for a, n in zip(axes, shape, strict=True))
+    if len(strange) == 1 and not deep and axes[strange[0]] in "IQ":
+        axes = axes.replace("Z", "Q")
+        axes = axes[: strange[0]] + "Z" + axes[strange[0] + 1 :]
+    elif strange:
+        raise DataError(
+            f"{path}: axes {_described(axes, shape)}; expected slices, rows, columns, channels and time steps: "
+            "write the others as files of their own"
+        )
+    lead = next((k for k in range(len(shape), -1, -1) if math.prod(shape[k:]) == keyframe.size), None)
+    one = bool(series.is_truncated) and _mappable(series)  # one directory, whose planes lie behind each other
+    if lead is None or (math.prod(shape[:lead]) != len(series) and not one):
+        raise DataError(
+            f"{path}: {len(series)} pages of {keyframe.size} values; expected {' x '.join(map(str, shape))}; check "
+            "that the file is whole"
+        )
+    layout = SeriesAxes(axes, shape, lead, keyframe.photometric == 2)
+    if any(len(layout.of(letter)) > 1 for letter in _AXES):
+        raise DataError(f"{path}: axes {_described(axes, shape)}; expected one of each")
+    return layout
+
+
+def _described(axes: str, shape: tuple[int, ...]) -> str:
+    return ", ".join(f"{n} {_AXES.get(a, a)}" for a, n in zip(axes, shape, strict=True) if n > 1) or "of one value each"
+
+
+def _choose(
+    layout: SeriesAxes, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
+) -> tuple[tuple[int | slice, ...], bool]:
+    """Return an index along every axis of a series (whole along spatial ones), and whether all channels are wanted."""
+    space = layout.of("XYZ")
+    index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
+    channels = layout.of("CS")
+    several = options.component == "magnitude" and bool(channels)
+    sizes, own = [layout.shape[k] for k in channels], not layout.of("S")
+    n = math.prod(sizes)
+    number = (
+        choose_channel(n, facts.channels, dtype, options.component, str(path), facts.colors, layout.color, own) or 0
+    )
+    for k in reversed(channels):  # the samples of a pixel count faster than the channels
+        index[k] = slice(None) if several else number % layout.shape[k]
+        number //= layout.shape[k]
+    times = layout.of("T")
+    what = "time steps" if layout.of("Z") else "time steps of one slice each"
+    step = options.step(layout.shape[times[0]] if times else 1, str(path), what)
+    for k in times:
+        index[k] = step
+    return tuple(index), several
+
+
+def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
+    """Read the values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
+    if _mappable(series):
+        offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
+        size = path.stat().st_size
+        if offset + need > size:
+            raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
+        dtype = series.dtype.newbyteorder(file.byteorder)
+        return np.memmap(path, dtype, "r", offset, layout.shape)[index]
+    _whole(series, path)
+    whole = [isinstance(i, slice) for i in index]
+    sizes = [n for n, kept in zip(layout.shape, whole, strict=True) if kept]
+    check_memory(math.prod(sizes) * series.dtype.itemsize, str(path))
+    out = np.empty(sizes, series.dtype)
+    lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
+    rows = out.reshape(-1, *(n for n, kept in zip(inner, whole[layout.lead :], strict=True) if kept))
+    wanted = itertools.product(
+        *(range(n) if isinstance(i, slice) else (i,) for n, i in zip(lead, index[: layout.lead], strict=True))
+    )
+    with Pages(path) as pages:
+        for row, place in zip(rows, wanted, strict=True):
+            number = int(np.ravel_multi_index(place, lead)) if place else 0
+            row[...] = pages.decoded(series[number], series).reshape(inner)[index[layout.lead :]]
+    return out
+
+
+def _mappable(series: Any) -> bool:
+    """Return whether the values of a series lie together plainly; those of one directory may begin anywhere."""
+    aligned = bool(series.keyframe.is_memmappable) or bool(series.is_truncated)
+    return series.dataoffset is not None and not series.is_multifile and aligned
+
+
+def _whole(series: Any, path: Path) -> None:
+    """Refuse a series that lacks planes."""
+    missing = [number for number, page in enumerate(series[:]) if page is None]
+    if missing:
+        raise DataError(
+            f"{path}: {len(missing)} of {len(series)} planes are missing, the first is number {missing[0]}; check that "
+            "the file, or the set, is whole"
+        )

@@ -1,0 +1,279 @@
+"""VTK's readers in a process of their own: what brings one down is one line of error.
+
+The request is a line of JSON on standard input, the answer one on standard output, with the values behind it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from threading import Event, Thread
+from typing import IO, Any, cast
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
+from vvgt_cli.resources import free_memory
+from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
+from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
+from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.vtk import INDEX, SINGLE, is_index
+from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
+from vvgt_cli.volume.vtk.resample import MOST
+
+SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
+START = f"from {__name__} import main; main()"
+IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
+KEYS = ("dims", "spacing", "array", "component", "time")
+LARGEST = 1 << 20  # bytes of the line of an answer
+
+
+def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
+    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume.
+
+    Raises:
+        DataError: damaged, or VTK's reader did not come to an end.
+        UsageError: a choice of step, array or component that is missing or does not exist.
+    """
+    facts, values = _asked(program, path, options, "volume")
+    place = {key: tuple(facts[key]) for key in ("spacing", "origin", "direction")}
+    return Volume(values, name=facts["name"], **place)  # type: ignore[arg-type]  # three numbers each
+
+
+def read_indexed(path: Path, options: ReadOptions) -> Volume:
+    """Read what an index names: a single file as that file's reader does, several as one volume.
+
+    Raises:
+        DataError: damaged, or files that are missing, lie elsewhere or are no datasets.
+        UsageError: a choice of step, array or component that is missing or does not exist.
+    """
+    found = _single(read_index(path), options.time)
+    if found is None:
+        return volume_by_child(INDEX, path, options)
+    from vvgt_cli.volume.registry import read_volume
+
+    file, time = found
+    return read_volume(str(file), replace(options, time=time, crop=None, mask=None))
+
+
+def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tuple[Path, int | None] | None:
+    """Return the only file that an index leads to, and the step to read of it; None where there are several."""
+    timed = bool(index.times)
+    entries = index.at(time) if timed else index.entries
+    if len(entries) != 1 or index.kind in PIECES:
+        return None
+    file = next(files_of(index, entries, above))[0]
+    rest = None if timed else time
+    with open(file, "rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    return _single(read_index(file), rest, (*above, index.path.resolve())) if is_index(head) else (file, rest)
+
+
+def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
+    """List steps, arrays and blocks, each a row with the option that chooses it.
+
+    Raises:
+        DataError: as `volume_by_child`.
+    """
+    return _asked(program, path, options, "contents")[0]
+
+
+def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
+    size = path.stat().st_size if program == SINGLE else _bytes_near(path)
+    samples = count(options.dims) if options.dims else min(40 * size, MOST**3)
+    seconds = math.ceil(SECONDS + A_BYTE * size + A_VOXEL * samples)
+    request = {
+        "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
+        "options": {key: getattr(options, key) for key in KEYS},
+    }  # fmt: skip
+    found, status = run(request)
+    if found is None:
+        raise _ended(path, program, status, seconds)
+    facts, values = found
+    for line in facts.pop("notes", ()):
+        warnings.warn(line, stacklevel=2)
+    if "error" in facts:
+        raise _error(facts)
+    return facts, values
+
+
+def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | None, int]:
+    """Run a request in a process; return its answer, None where it gives none, and its exit status."""
+    paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+    with subprocess.Popen(
+        [sys.executable, "-c", START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": paths},
+    ) as child:  # fmt: skip
+        to, back, ended = cast(IO[bytes], child.stdin), cast(IO[bytes], child.stdout), Event()
+        Thread(target=_watch, args=(child, ended), daemon=True).start()
+        try:
+            with suppress(BrokenPipeError):  # it has ended: what it left says how
+                to.write(json.dumps(request).encode() + b"\n")
+                to.close()
+            found = received(back)
+        except BaseException:
+            child.kill()
+            raise
+        finally:
+            ended.set()
+    return found, child.returncode
+
+
+def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
+    """Kill a child that sleeps for good: a lock of a library that broke down is never free again."""
+    stat, last, idle = Path(f"/proc/{child.pid}/stat"), "", 0.0
+    while not ended.wait(LOOK) and idle < IDLE:
+        try:
+            used = " ".join(stat.read_text().rpartition(")")[2].split()[11:13])
+        except OSError:  # it has ended, or this system has no such file
+            return
+        idle = idle + LOOK if used == last else 0.0
+        last = used
+    if not ended.is_set():
+        child.kill()
+
+
+def _bytes_near(path: Path) -> int:
+    """Count the bytes of the files in a file's folder: those that it may name."""
+    total = 0
+    for n, (folder, _, names) in enumerate(os.walk(path.parent)):
+        total += sum(os.stat(file).st_size for name in names if os.path.isfile(file := os.path.join(folder, name)))
+        if n > 1000:
+            break
+    return total
+
+
+def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
+    """Read facts and values, None where they end early."""
+    line = stream.readline(LARGEST)
+    if not line.endswith(b"\n"):
+        return None
+    facts = json.loads(line)
+    dtype, shape = np.dtype(facts.pop("dtype", "u1")), tuple(facts.pop("shape", (0,)))
+    check_memory(count(shape) * dtype.itemsize, str(facts.get("name")))
+    values = np.empty(shape, dtype)
+    view, filled = values.reshape(-1).view(np.uint8).data, 0
+    while filled < values.nbytes:
+        n = stream.readinto(view[filled:])  # type: ignore[attr-defined]
+        if not n:
+            return None
+        filled += n
+    return facts, values
+
+
+def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
+    who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
+    if status in (-signal.SIGXCPU, -signal.SIGKILL):
+        return DataError(
+            f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
+        )
+    what = signal.Signals(-status).name if status < 0 else f"status {status}"
+    return DataError(f"{path}: {who} broke down ({what}), or had too little memory; is the file whole?")
+
+
+def _error(facts: dict[str, Any]) -> VvgtError:
+    """Make the error that an answer reports."""
+    text, kind = facts["text"], facts["error"]
+    made: VvgtError
+    if kind == "SeveralSteps":
+        made = SeveralSteps("", facts["steps"], times=facts["times"])
+        made.args = (text,)
+        return made
+    if kind == "SeveralArrays":
+        return SeveralArrays(text, "--array", facts["choices"])
+    if kind == "SeveralComponents":
+        return SeveralComponents(text, facts["count"], facts["color"])
+    return UsageError(text) if kind == "UsageError" else DataError(text)
+
+
+def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Answer a request with facts and values. Runs in the child."""
+    path = Path(request["path"])
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in request["options"].items()
+    }
+    options = ReadOptions(**given)
+    caught: list[Any] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            facts, values = _work(request["program"], path, options, request["task"])
+    except VvgtError as error:
+        facts, values = {"error": type(error).__name__, "text": str(error)}, None
+        if isinstance(error, SeveralSteps):
+            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
+        if isinstance(error, SeveralArrays) and request["program"] == GRIB:
+            return facts | {"choices": error.choices, "notes": []}, None
+        if isinstance(error, SeveralComponents):
+            facts |= {"count": error.count, "color": error.color}
+        if facts["error"] not in ("SeveralSteps", "SeveralComponents"):
+            facts["error"] = "UsageError" if isinstance(error, UsageError) else "DataError"
+    except MemoryError:
+        facts, values = (
+            {"error": "DataError", "text": f"{path}: not enough memory to read it; try a machine with more"},
+            None,
+        )
+    except Exception as error:  # of readers that were given anything
+        text = " ".join(str(error).split())[:300] or type(error).__name__
+        facts, values = {"error": "DataError", "text": f"{path}: damaged ({text}); check that it is whole"}, None
+    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # the question repeats them
+    notes = [str(one.message) for one in caught if one.category is UserWarning and not again]
+    return {**facts, "notes": notes}, values
+
+
+def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray | None]:
+    from vvgt_cli.volume.vtk.contents import contents_of, datasets
+    from vvgt_cli.volume.vtk.leaves import volume_of
+
+    if task == "contents":
+        return contents_of(program, path, options), None
+    if program == GRIB:
+        volume = grib_volume(path, options)
+    else:
+        leaves, _ = datasets(program, path, options.time, options.array)
+        volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
+    values = np.ascontiguousarray(volume.data)
+    place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}
+    return {"name": volume.name, "dtype": values.dtype.str, "shape": values.shape, **place}, values
+
+
+def bound(free: int | None, seconds: int) -> None:
+    """Let this process have ``free`` bytes more, and ``seconds`` of processor time."""
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
+    if free is not None and pages:
+        limit = pages * resource.getpagesize() + free
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def send(stream: IO[bytes], facts: dict[str, Any], values: np.ndarray | None) -> None:
+    """Write an answer, for `received`."""
+    stream.write(json.dumps(facts).encode() + b"\n")
+    if values is not None:
+        stream.write(values.reshape(-1).view(np.uint8).data)
+
+
+def main() -> None:
+    """Answer one request; libraries that print do so elsewhere."""
+    with os.fdopen(os.dup(1), "wb") as stream:
+        os.dup2(2, 1)
+        request = json.loads(sys.stdin.readline())
+        import vtkmodules.vtkCommonCore  # noqa: F401  its libraries count as there already
+
+        bound(request["free"], request["seconds"])
+        send(stream, *answer(request))
+    os._exit(0)  # whatever a damaged file left behind is not taken apart

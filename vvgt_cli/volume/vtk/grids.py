@@ -1,0 +1,241 @@
+"""VTK's meshes and grids: the checks of their files, and datasets in memory as volumes, resampled.
+
+Declared sizes are checked against the file before VTK allocates, cells against points before VTK walks them.
+"""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.blocks import check_memory, count, size_text
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import placed
+from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.vtk import LEGACY_GRIDS
+from vvgt_cli.volume.vtk.blocks import check_blocks
+from vvgt_cli.volume.vtk.legacy import Parser
+from vvgt_cli.volume.vtk.resample import resample
+from vvgt_cli.volume.vtk.xml import (
+    GHOSTS,
+    HIDDEN,
+    around,
+    extent_dims,
+    scan,
+    stored_ratio,
+    without,
+)
+
+
+def check_xml_grid(path: Path) -> str:
+    """Check that a ``.vtu``, ``.vtr`` or ``.vts`` can hold what it declares, and return its type of dataset.
+
+    Raises:
+        DataError: damaged, or it cannot.
+    """
+    found = scan(path)
+    points, cells = found.points, found.cells
+    if found.image:
+        dims = extent_dims(found.image, path)
+        points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
+    need = 12 * points if found.kind == "StructuredGrid" else 0
+    if found.kind == "UnstructuredGrid":
+        need = 12 * points + 5 * cells  # coordinates; an offset and a type a cell
+    for info, _ in found.arrays:
+        need += (points if info.where == "point" else cells) * info.components * np.dtype(info.dtype).itemsize
+    size = path.stat().st_size
+    if need > size * stored_ratio(found, path):
+        raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
+    check_memory(need, str(path))
+    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
+    return found.kind
+
+
+class _Sections(Parser):
+    """The sections of a legacy mesh or grid, to see that the file holds what they declare."""
+
+    KINDS = LEGACY_GRIDS
+
+    def section(self, key: str, words: list[str]) -> None:
+        if key in ("X_COORDINATES", "Y_COORDINATES", "Z_COORDINATES"):
+            self.skip(words[2].lower(), int(words[1]))
+        elif key == "POINTS":
+            self.skip(words[2].lower(), 3 * int(words[1]))
+        elif key == "CELL_TYPES":
+            self.skip("int", int(words[1]))
+        elif key == "CELLS":
+            self.cells(int(words[1]), int(words[2]))
+        else:
+            super().section(key, words)
+
+    def cells(self, first: int, second: int) -> None:
+        """Skip cells, stored as numbers in a row (version 4) or as offsets and connectivity (5.1)."""
+        back = self.position
+        line = self.text[back : back + 64].split(None, 2)
+        if not line or line[0] != b"OFFSETS":
+            self.skip("int", second)
+            return
+        for n in (first, second):
+            words = self.words() or []
+            if len(words) != 2:
+                raise self.bad("CELLS without OFFSETS and CONNECTIVITY")
+            self.skip(words[1].lower(), n)
+
+
+def check_legacy_grid(path: Path) -> None:
+    """Check that a legacy ``.vtk`` mesh or grid holds what its sections declare.
+
+    Raises:
+        DataError: it does not.
+    """
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        _Sections(text, path).parse()
+
+
+def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of a vtkDataSet: an image as it is, any other grid or mesh of cells resampled.
+
+    Args:
+        mesh: vtkDataSet (pyvista's are).
+        options: ``array``, ``component``, ``spacing``, and ``dims`` of what is resampled.
+        source: for messages.
+        name: of the volume.
+
+    Raises:
+        DataError: a surface, or damaged cells.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    if not mesh.IsA("vtkDataSet"):
+        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
+    if mesh.IsA("vtkPolyData"):
+        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
+    infos = arrays_of(mesh)
+    info = infos[choose_array(infos, options.array, source)]
+    if mesh.IsA("vtkImageData"):
+        return _image(mesh, info, options, source, name)
+    if options.spacing is not None:
+        raise UsageError(
+            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
+        )
+    check_cells(mesh, source)
+    mesh = shown(mesh)
+    values = values_of(mesh, info).reshape(1, 1, -1, info.components)
+    field = select_from_array(values, info, options.component, source)
+    return resample(mesh, field.ravel(), info.where, options.dims, source, name)
+
+
+def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
+    """Return the numbers of an array: (n,), or (n, c) with components."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
+    result: np.ndarray = vtk_to_numpy(data.GetArray(info.name))
+    return result
+
+
+def arrays_of(mesh: Any) -> list[ArrayInfo]:
+    """List the arrays of numbers, without ghost marks."""
+    from vtkmodules.util.numpy_support import get_vtk_to_numpy_typemap
+
+    types = get_vtk_to_numpy_typemap()
+    found = []
+    for where, data in (("point", mesh.GetPointData()), ("cell", mesh.GetCellData())):
+        active = data.GetScalars()
+        for k in range(data.GetNumberOfArrays()):
+            array = data.GetArray(k)
+            if array is None or array.GetDataType() not in types or array.GetName() == GHOSTS:
+                continue
+            if not array.GetName():
+                array.SetName(f"array{k}")
+            dtype = np.dtype(types[array.GetDataType()]).name
+            found.append(ArrayInfo(array.GetName(), where, array.GetNumberOfComponents(), dtype, array is active))
+    return found
+
+
+def check_cells(mesh: Any, source: str) -> None:
+    """Refuse cells that name points which are not there: VTK would read beyond the array."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if not mesh.IsA("vtkUnstructuredGrid") or mesh.GetNumberOfCells() < 1:
+        return
+    cells = mesh.GetCells()
+    ids = vtk_to_numpy(cells.GetConnectivityArray())
+    offsets = vtk_to_numpy(cells.GetOffsetsArray())
+    fits = ids.size and ids.min() >= 0 and ids.max() < mesh.GetNumberOfPoints()
+    if not fits or offsets[0] != 0 or offsets[-1] > ids.size or (np.diff(offsets) < 0).any():
+        raise DataError(f"{source}: its cells name points that do not exist; check that the file is whole")
+
+
+def shown(mesh: Any) -> Any:
+    """Remove hidden cells, and cells with a hidden point, from a grid or mesh; return it as it is where none are."""
+    from vtkmodules.vtkCommonCore import vtkIdList
+    from vtkmodules.vtkFiltersCore import vtkExtractCells
+
+    marks = _hidden(mesh, "cell")
+    points = _hidden(mesh, "point")
+    if points is not None:
+        ids, odd = vtkIdList(), np.zeros(mesh.GetNumberOfCells(), bool)
+        for point in np.flatnonzero(points).tolist():
+            mesh.GetPointCells(point, ids)
+            odd[[ids.GetId(k) for k in range(ids.GetNumberOfIds())]] = True
+        marks = odd if marks is None else marks | odd
+    if marks is None:
+        return mesh
+    chosen = vtkIdList()
+    for cell in np.flatnonzero(~marks).tolist():
+        chosen.InsertNextId(cell)
+    keep = vtkExtractCells()
+    keep.SetInputData(mesh)
+    keep.SetCellList(chosen)
+    keep.Update()
+    return keep.GetOutput()
+
+
+def _hidden(mesh: Any, where: str) -> np.ndarray | None:
+    """Return a mask of the points or cells that ghost marks hide; None where they hide none."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    array = (mesh.GetPointData() if where == "point" else mesh.GetCellData()).GetArray(GHOSTS)
+    if array is None or array.GetNumberOfComponents() != 1:
+        return None
+    hidden: np.ndarray = vtk_to_numpy(array).astype(np.uint8) & HIDDEN[where] != 0
+    return hidden if hidden.any() else None
+
+
+def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
+    """Set the values (nz, ny, nx) of an image to NaN where they are hidden."""
+    for kind in ("point", "cell"):
+        hidden = None if (kind, where) == ("point", "cell") else _hidden(image, kind)
+        if hidden is not None:
+            hidden = hidden.reshape(image_place(image, kind)[0][::-1])
+            field = without(field, hidden if kind == where else around(hidden, field.shape))
+    return field
+
+
+def image_place(image: Any, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
+    low = np.array(image.GetExtent()[::2], float)
+    dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
+    if where == "cell":
+        low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
+    return dims, spacing, np.array(image.GetOrigin()) + _direction(image) @ (low * spacing)
+
+
+def _direction(image: Any) -> np.ndarray:
+    matrix = image.GetDirectionMatrix()
+    return np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
+
+
+def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of a vtkImageData: point data, or cell data on the grid of cell centres."""
+    if options.dims is not None:
+        raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
+    dims, spacing, origin = image_place(image, info.where)
+    values = values_of(image, info).reshape(*dims[::-1], info.components)
+    field = visible(image, select_from_array(values, info, options.component, source), info.where)
+    return placed(field, (_direction(image) * spacing).T, origin, options, name)

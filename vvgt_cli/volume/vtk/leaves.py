@@ -1,0 +1,220 @@
+"""Many vtkDataSets as one volume: blocks, pieces and levels of refinement, each sampled where it lies.
+
+Blocks of lower levels come first, so that finer ones replace them; what lies in no block, or in hidden cells, is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume, float_dtype, triple
+from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
+from vvgt_cli.volume.vtk.resample import MOST, Samples, grid_of, probe, sampled_volume
+
+ALIGNED = 1e-3  # voxels that images of one lattice may lie off
+EDGE = 1e-6  # of a cell: samples that lie on the face of a block are in it
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A vtkDataSet among many.
+
+    Attributes:
+        data: vtkDataSet.
+        level: of refinement, 0 the coarsest.
+        name: of its block, may be empty.
+    """
+
+    data: Any
+    level: int = 0
+    name: str = ""
+
+
+def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
+    """Yield the datasets in a vtkDataObject: itself, or those of its blocks that are there, with their levels."""
+    from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet
+
+    if found is None or found.IsA("vtkDataSet"):
+        if found is not None:
+            yield Leaf(found, 0, name)
+        return
+    if not found.IsA("vtkCompositeDataSet"):
+        return
+    walk = found.NewIterator()
+    amr = hasattr(walk, "GetCurrentLevel")
+    walk.InitTraversal()
+    while not walk.IsDoneWithTraversal():
+        data = walk.GetCurrentDataObject()
+        own = walk.GetCurrentMetaData() if walk.HasCurrentMetaData() else None
+        label = own.Get(vtkCompositeDataSet.NAME()) if own is not None else None
+        level = walk.GetCurrentLevel() if amr else 0
+        if data is not None and data.IsA("vtkDataSet"):
+            label = label or (f"level {level}" if amr else f"block {walk.GetCurrentFlatIndex()}")
+            yield Leaf(data, level, "/".join(filter(None, (name, label))))
+        walk.GoToNextItem()
+
+
+def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
+    """List the arrays of all datasets, each once."""
+    found: dict[tuple[str, str], ArrayInfo] = {}
+    for leaf in leaves:
+        for info in arrays_of(leaf.data):
+            before = found.get((info.name, info.where))
+            found[info.name, info.where] = (
+                info if before is None else replace(before, active=before.active or info.active)
+            )
+    return list(found.values())
+
+
+def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
+    """Make a volume of the array that is asked for, from all datasets that hold it.
+
+    Raises:
+        DataError: surfaces alone, damaged cells, or memory that does not suffice.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    if not leaves:
+        raise DataError(f"{source}: no dataset in it; expected an image, a grid or a mesh")
+    for leaf in leaves:
+        check_cells(leaf.data, source)
+    deep = [leaf for leaf in leaves if _fills(leaf.data)]
+    if len(leaves) == 1 or not deep:
+        return dataset_volume(leaves[0].data, options, source, name)
+    infos = arrays_in(deep)
+    if not infos:
+        raise DataError(f"{source}: no array of numbers in its {len(deep)} blocks; expected at least one")
+    info = infos[choose_array(infos, options.array, source)]
+    holders = [leaf for leaf in deep if any((a.name, a.where) == (info.name, info.where) for a in arrays_of(leaf.data))]
+    if len(holders) == 1:
+        return dataset_volume(holders[0].data, replace(options, array=info.name), source, name)
+    if options.spacing is not None:
+        raise UsageError(
+            f"{source}: its blocks say where values are; leave out --spacing (--dims says how many to take)"
+        )
+    fields = [_field(leaf, info, options, source) for leaf in holders]
+    dtype = np.result_type(*(values.dtype for _, values in fields))
+    lattice = _lattice([leaf.data for leaf, _ in fields], info.where) if options.dims is None else None
+    grid = lattice or _samples([leaf for leaf, _ in fields], options.dims, source)
+    check_memory(count(grid.dims) * (float_dtype(dtype).itemsize + 1), source)
+    out = np.full(grid.dims[::-1], np.nan, float_dtype(dtype))
+    for leaf, values in sorted(fields, key=_coarseness):
+        _paint(leaf.data, values, info.where, grid, out)
+    inside = ~np.isnan(out)
+    if lattice is None:
+        return sampled_volume(out, inside, dtype, grid, options.dims, source, name)
+    whole = inside.all() and dtype.kind in "iu"
+    return Volume(out.astype(dtype) if whole else out, grid.spacing, grid.origin, name=name)
+
+
+def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:
+    """Return a sorting key that puts coarse blocks first: by level, images of one level by their cells."""
+    data = row[0].data
+    return row[0].level, -float(np.prod(data.GetSpacing())) if data.IsA("vtkImageData") else 0.0
+
+
+def _fills(data: Any) -> bool:
+    """Tell whether a dataset has cells that fill a volume."""
+    return data.GetNumberOfCells() > 0 and not data.IsA("vtkPolyData") and data.GetMaxSpatialDimension() == 3
+
+
+def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tuple[Leaf, np.ndarray]:
+    """Return a dataset without its hidden cells, and the scalars (n,) of its points or cells."""
+    image = leaf.data.IsA("vtkImageData")
+    data = leaf.data if image else shown(leaf.data)
+    own = next((a for a in arrays_of(data) if (a.name, a.where) == (info.name, info.where)), info)
+    if own.components != info.components:
+        raise DataError(f"{source}: array {info.name!r} has {own.components} components in block {leaf.name}")
+    values = values_of(data, own).reshape(1, 1, -1, own.components)
+    return replace(leaf, data=data), select_from_array(values, info, options.component, source).ravel()
+
+
+def _lattice(images: Sequence[Any], where: str) -> Samples | None:
+    """Find the one grid that images are boxes of; None where they are not, or it is larger than they are."""
+    if not all(image.IsA("vtkImageData") and _upright(image) for image in images):
+        return None
+    places = [image_place(image, where) for image in images]
+    steps = np.array([place[1] for place in places])
+    if (np.abs(steps - steps[0]) > 1e-9 * steps[0]).any():
+        return None
+    origins = np.array([place[2] for place in places])
+    first = origins.min(axis=0)
+    begin = (origins - first) / steps[0]
+    if np.abs(begin - begin.round()).max() > ALIGNED:
+        return None
+    dims = (begin.round().astype(np.int64) + np.array([place[0] for place in places])).max(axis=0)
+    if count(tuple(dims)) > 4 * sum(count(tuple(place[0])) for place in places):
+        return None
+    return Samples(triple(dims.tolist()), triple(steps[0].tolist()), triple(first.tolist()))
+
+
+def _upright(image: Any) -> bool:
+    """Tell whether an image's axes are x, y and z."""
+    matrix = image.GetDirectionMatrix()
+    return all(matrix.GetElement(r, c) == (r == c) for r in range(3) for c in range(3))
+
+
+def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: str) -> Samples:
+    """Choose samples that fill all datasets: as fine as the finest level of images, else about as many as cells."""
+    bounds = np.array([leaf.data.GetBounds() for leaf in leaves]).reshape(-1, 3, 2)
+    box = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
+    cells = sum(leaf.data.GetNumberOfCells() for leaf in leaves)
+    if dims is None and all(leaf.data.IsA("vtkImageData") and _upright(leaf.data) for leaf in leaves):
+        finest = np.min([leaf.data.GetSpacing() for leaf in leaves], axis=0)
+        if (finest > 0).all() and np.isfinite(box).all():
+            wanted = np.maximum(np.round((box[:, 1] - box[:, 0]) / finest), 1)
+            dims = triple(np.ceil(wanted / max(wanted.max() / MOST, 1)).astype(int).tolist())
+    return grid_of(box, dims, cells, source)
+
+
+def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, out: np.ndarray) -> None:
+    """Put the values of a dataset into the samples ``out`` (nz, ny, nx) that lie in it."""
+    bounds = np.array(data.GetBounds()).reshape(3, 2)
+    origin, step = np.array(grid.origin), np.array(grid.spacing)
+    lo = np.maximum(np.ceil((bounds[:, 0] - origin) / step - EDGE), 0)
+    hi = np.minimum(np.floor((bounds[:, 1] - origin) / step + EDGE) + 1, grid.dims)
+    if not (lo < hi).all():
+        return
+    begin, end = lo.astype(int), hi.astype(int)
+    part = Samples(triple((end - begin).tolist()), grid.spacing, triple((origin + begin * step).tolist()))
+    if data.IsA("vtkImageData") and _upright(data):
+        sampled, inside = _of_image(data, values, where, part)
+    else:
+        sampled, inside = probe(data, values, where, part)
+    target = out[tuple(slice(a, b) for a, b in zip(begin[::-1], end[::-1], strict=True))]
+    np.copyto(target, sampled, where=inside, casting="unsafe")
+
+
+def _of_image(image: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """Sample an upright image, and mask the samples in it: cells are constant, points interpolated linearly."""
+    from vvgt_cli.volume.vtk.grids import visible
+
+    dims, spacing, first = image_place(image, where)
+    field = visible(image, values.reshape(dims[::-1]), where)
+    inside = np.ones(grid.dims[::-1], bool)
+    for axis in range(3):  # x, y, z
+        along = 2 - axis
+        at = (grid.origin[axis] + grid.spacing[axis] * np.arange(grid.dims[axis]) - first[axis]) / spacing[axis]
+        n = int(dims[axis])
+        reach = 0.5 if where == "cell" or n == 1 else 0.0
+        good = (at >= -reach - EDGE) & (at <= n - 1 + reach + EDGE)
+        shape = [1, 1, 1]
+        shape[along] = len(at)
+        inside &= good.reshape(shape)
+        near = np.clip(np.round(at), 0, n - 1).astype(int)
+        if where == "cell" or (np.abs(at - near) < ALIGNED)[good].all():
+            field = np.take(field, near, axis=along)
+            continue
+        low = np.clip(np.floor(at), 0, max(n - 2, 0)).astype(int)
+        part = np.clip(at - low, 0, 1).reshape(shape)
+        field = (
+            np.take(field, low, axis=along) * (1 - part) + np.take(field, np.minimum(low + 1, n - 1), axis=along) * part
+        )
+    return field, inside & ~np.isnan(field)

@@ -1,0 +1,305 @@
+"""Files of simulation programs, by VTK's readers: EnSight, Exodus, OpenFOAM, XDMF, CGNS, Plot3D, and VTKHDF.
+
+A row of `PROGRAMS` names a format's endings, how it begins and its VTK reader. All of it runs in a process of its own
+(`vvgt_cli.volume.vtk.child`): the readers trust their files.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import any_case, data_file
+from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time, walk_xml
+from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
+from vvgt_cli.volume.vtk.messages import quiet_vtk
+
+MOST_NAMES = 100_000  # files that a case may name
+
+
+@dataclass(frozen=True)
+class Program:
+    """A format.
+
+    Attributes:
+        name: for messages.
+        reader: what makes VTK's reader of a file, all arrays enabled.
+        skips: its reader goes on without the fields that it cannot read.
+    """
+
+    name: str
+    reader: Callable[[Path], Any]
+    skips: bool = False
+
+
+def read_program(
+    program: Program, path: Path, time: int | None, array: str | None = None
+) -> tuple[list[Leaf], list[float]]:
+    """Read the datasets of a time step, and the times of all steps.
+
+    Raises:
+        DataError: damaged, or a file that it names is missing or lies elsewhere, or VTK cannot read field ``array``.
+        UsageError: several time steps and none chosen, or one that there is not.
+    """
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+
+    with quiet_vtk() as message:
+        reader = program.reader(path)
+        reader.UpdateInformation()
+        facts = reader.GetOutputInformation(0)
+        times = list(facts.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ())
+        first_error = message(errors=True)
+        chosen = chosen_time(times, time, str(path))
+        if chosen is None:
+            reader.Update()
+        else:
+            reader.UpdateTimeStep(chosen)
+        found = reader.GetOutputDataObject(0)
+        leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
+        error, errors = message(errors=True) or first_error, message(errors=True, every=True)
+    if program.skips and leaves and error and not first_error and _mesh_is_sound(program, path, chosen):
+        held = {info.name for info in arrays_in(leaves)}
+        lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
+        lost = [
+            name for name in lost if re.search(rf"\b{re.escape(name)}\b", errors)
+        ] or lost  # others have other times
+        if array in lost:
+            raise DataError(f"{path}: VTK cannot read field {array} ({error}); expected plain values in its file")
+        warnings.warn(
+            f"{path}: without {', '.join(lost) or 'some values'}, which VTK cannot read ({error})", stacklevel=2
+        )
+        return leaves, times
+    if error or not leaves:
+        fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
+        raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
+    return leaves, times
+
+
+def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
+    """Return whether VTK reads a time step without an error when all fields are switched off."""
+    with quiet_vtk() as message:
+        reader = program.reader(path)
+        reader.DisableAllCellArrays()
+        reader.DisableAllPointArrays()
+        reader.UpdateTimeStep(0.0 if time is None else time)
+        return not message(errors=True)
+
+
+def _check_name(path: Path, named: str) -> None:
+    """Refuse a file named by another that does not lie in its folder, or is not there; a pattern stands for several."""
+    if not re.search(r"[*%]", named):
+        data_file(path, named, exact=True)  # VTK opens it
+    elif Path(named).is_absolute() or ".." in Path(named).parts:
+        raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    if len(names) > MOST_NAMES:
+        raise DataError(f"{path}: it names {len(names)} files; expected at most {MOST_NAMES}")
+    for named in dict.fromkeys(names):
+        _check_name(path, named)
+
+
+def _small(path: Path) -> str:
+    """Read the text of a file that describes others."""
+    if path.stat().st_size > MAX_BYTES:
+        raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {MAX_BYTES >> 20} MiB of text")
+    return path.read_text("utf-8-sig", "replace")
+
+
+def _ensight(path: Path) -> Any:
+    from vtkmodules.vtkIOEnSight import vtkGenericEnSightReader
+
+    section, names = "", []
+    if path.read_bytes().startswith(MARK):
+        raise DataError(f"{path}: begins with a byte order mark, which VTK's reader stops at; save it as plain text")
+    for line in _small(path).splitlines():
+        line = line.partition("#")[0].strip()
+        if re.fullmatch(r"[A-Z]+", line):
+            section = line
+        key, colon, value = line.partition(":")
+        words = re.findall(r'"[^"]*"|\S+', value)
+        files = section == "GEOMETRY" or (section == "VARIABLE" and "constant" not in key)
+        if colon and files and words:
+            words = [word for word in words if word != "change_coords_only"]
+            names.append(words[-1].strip('"'))
+    _check_names(path, names)
+    reader = vtkGenericEnSightReader()
+    reader.SetFilePath(str(path.parent))
+    reader.SetCaseFileName(path.name)
+    reader.ReadAllVariablesOn()
+    return reader
+
+
+def _exodus(path: Path) -> Any:
+    from vtkmodules.vtkIOExodus import vtkExodusIIReader
+
+    reader = vtkExodusIIReader()
+    reader.SetFileName(str(path))
+    reader.GenerateObjectIdCellArrayOff()
+    reader.UpdateInformation()
+    for kind in (reader.NODAL, reader.ELEM_BLOCK):
+        reader.SetAllArrayStatus(kind, 1)
+    return reader
+
+
+def _times(folder: Path) -> set[float]:
+    """Return the times that the folders of an OpenFOAM case are named by."""
+    number = re.compile(r"\d*\.?\d+(?:e[+-]?\d+)?", re.I)
+    return {float(p.name) for p in folder.glob("*") if number.fullmatch(p.name) and p.is_dir()}
+
+
+def _openfoam(path: Path) -> Any:
+    """Make the reader of a case: of its decomposed parts where they have times that the whole case lacks."""
+    from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
+
+    case, asked = path.parent, path.stem.lower()
+    whole = any(p.is_dir() for pattern in ("polyMesh", "*/polyMesh") for p in (case / "constant").glob(pattern))
+    mine, parts = _times(case), _times(case / "processor0")
+    if any(_times(p) - mine - parts for p in case.glob("processors*")):
+        text = f"{path}: its processors folder (OpenFOAM's collated format) holds times, which VTK does not read; try"
+        text += " reconstructPar, or mpirun -np N foamFormatConvert -parallel -fileHandler uncollated"
+        if not whole and not parts:
+            raise DataError(text)
+        warnings.warn(text, stacklevel=2)
+    if not whole and not (case / "processor0").is_dir():
+        raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
+    decomposed = not whole or bool((parts and asked == "decomposed") or (parts - mine and asked != "reconstructed"))
+    if whole and parts - mine:
+        here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
+        warnings.warn(
+            f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, "
+            f"reconstructed {len(mine)} up to {max(mine, default=0):g}; read {there}.foam, an empty file, for that",
+            stacklevel=2,
+        )
+    reader = vtkPOpenFOAMReader()
+    reader.SetFileName(str(path))
+    reader.SetCaseType(0 if decomposed else 1)
+    reader.CreateCellToPointOff()  # values as they are stored
+    reader.UpdateInformation()
+    reader.EnableAllCellArrays()
+    reader.EnableAllPointArrays()
+    for name in [reader.GetPatchArrayName(k) for k in range(reader.GetNumberOfPatchArrays())]:
+        reader.SetPatchArrayStatus(name, name.endswith("internalMesh"))  # of each region
+    return reader
+
+
+def _xdmf(path: Path) -> Any:
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
+
+    names: list[str] = []
+    texts: list[str] = []
+    coded = False
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal coded
+        coded = tag == "DataItem" and attributes.get("Format", "XML").upper() in ("HDF", "HDF5", "H5", "BINARY", "TIFF")
+        texts.clear()
+        if tag.endswith("include") and "href" in attributes:
+            names.append(attributes["href"])
+
+    def text(data: str) -> None:
+        if coded:
+            texts.append(data)
+
+    def end(tag: str) -> None:
+        nonlocal coded
+        named = "".join(texts).strip()
+        if coded and named:
+            names.append(named.rpartition(":")[0] if ":" in named else named)
+        coded = False
+        texts.clear()
+
+    walk_xml(path, start, end, text)
+    _check_names(path, names)
+    reader = vtkXdmfReader()
+    reader.SetFileName(str(path))
+    return reader
+
+
+def _cgns(path: Path) -> Any:
+    from vtkmodules.vtkIOCGNSReader import vtkCGNSReader
+
+    reader = vtkCGNSReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    reader.EnableAllBases()
+    reader.EnableAllPointArrays()
+    reader.EnableAllCellArrays()
+    return reader
+
+
+def _plot3d(path: Path) -> Any:
+    """Make the reader of ``NAME.xyz`` with ``NAME.q`` or ``.f`` beside it, or of ParaView's ``.p3d`` (JSON)."""
+    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader
+
+    stated: dict[str, Any] = {"auto-detect-format": True}
+    files = {"xyz": path.name}
+    if path.suffix.lower() == ".p3d":
+        try:
+            stated = json.loads(_small(path))
+            rows = stated["filenames"]
+            files = {key: str(rows[0][key]) for key in ("xyz", "q", "function") if key in rows[0]}
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            raise DataError(
+                f'{path}: damaged ({error}); expected JSON with "filenames", an "xyz" among them'
+            ) from error
+        if len(rows) != 1 or "xyz" not in files:
+            raise DataError(
+                f'{path}: {len(rows)} entries in "filenames"; expected one, with "xyz" and "q" or "function"'
+            )
+    else:
+        for key, suffix in (("q", ".q"), ("function", ".f")):
+            if (found := any_case(path.with_suffix(suffix))).is_file():
+                files[key] = found.name
+    if len(files) < 2:
+        raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
+    _check_names(path, list(files.values()))
+    reader = vtkMultiBlockPLOT3DReader()
+    for key, put in (
+        ("xyz", reader.SetXYZFileName),
+        ("q", reader.SetQFileName),
+        ("function", reader.SetFunctionFileName),
+    ):
+        if key in files:
+            put(str(path.parent / files[key]))
+    _describe_plot3d(reader, stated)
+    return reader
+
+
+def _describe_plot3d(reader: Any, stated: dict[str, Any]) -> None:
+    """Tell the reader what a ``.p3d`` states (vtkPlot3DMetaReader's keys)."""
+    reader.SetAutoDetectFormat(bool(stated.get("auto-detect-format", False)))
+    reader.SetBinaryFile(str(stated.get("format", "binary")).lower() != "ascii")
+    (reader.SetByteOrderToLittleEndian if stated.get("byte-order") == "little" else reader.SetByteOrderToBigEndian)()
+    reader.SetHasByteCount(str(stated.get("language", "C")).lower() == "fortran")
+    reader.SetMultiGrid(bool(stated.get("multi-grid", False)))
+    reader.SetIBlanking(bool(stated.get("blanking", False)))
+    reader.SetTwoDimensionalGeometry(bool(stated.get("2D", False)))
+    reader.SetDoublePrecision(stated.get("precision") == 64)
+
+
+def _vtkhdf(path: Path) -> Any:
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    return reader
+
+
+PROGRAMS = {
+    "VTKHDF": Program("VTKHDF", _vtkhdf),
+    "EnSight": Program("EnSight", _ensight),
+    "Exodus": Program("Exodus", _exodus),
+    "OpenFOAM": Program("OpenFOAM", _openfoam, skips=True),
+    "XDMF": Program("XDMF", _xdmf),
+    "CGNS": Program("CGNS", _cgns),
+    "Plot3D": Program("Plot3D", _plot3d),
+}

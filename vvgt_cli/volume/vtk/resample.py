@@ -1,0 +1,162 @@
+"""Meshes and irregular grids resampled to a regular one, by VTK; outside of the mesh is NaN."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.types import Volume, float_dtype, triple
+
+MOST = 512  # voxels along an axis, where nobody said how many
+
+
+def rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
+    """Make a vtkRectilinearGrid of points at ascending coordinates along x, y and z."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
+
+    grid = vtkRectilinearGrid()
+    grid.SetDimensions(*map(len, coordinates))
+    for along, put in zip(coordinates, (grid.SetXCoordinates, grid.SetYCoordinates, grid.SetZCoordinates), strict=True):
+        put(numpy_to_vtk(np.ascontiguousarray(along, np.float64), deep=True))
+    return grid
+
+
+def resample(
+    mesh: Any, values: np.ndarray, where: str, dims: tuple[int, int, int] | None, source: str, name: str
+) -> Volume:
+    """Sample values on a vtkDataSet on a regular grid that fills the mesh's bounding box (vtkProbeFilter).
+
+    Point data are interpolated as the cells do, cell data are constant in a cell. Samples are voxel centres: the first
+    lies half a voxel inside the box. The volume's name says how many there are.
+
+    Args:
+        mesh: a vtkDataSet.
+        values: (n,) scalars of its points or cells.
+        where: ``point`` or ``cell``.
+        dims: voxels along (x, y, z); None: cubic ones, about as many as the mesh has cells, `MOST` along an axis.
+        source: for messages.
+        name: of the volume.
+
+    Raises:
+        DataError: an empty mesh, or memory that does not suffice.
+    """
+    if mesh.GetNumberOfCells() < 1:
+        raise DataError(f"{source}: a mesh without cells; expected some to sample")
+    grid = grid_of(np.array(mesh.GetBounds()).reshape(3, 2), dims, mesh.GetNumberOfCells(), source)
+    check_memory(count(grid.dims) * 2 * values.itemsize, source)
+    sampled, inside = probe(mesh, values, where, grid)
+    return sampled_volume(np.where(inside, sampled, np.nan), inside, values.dtype, grid, dims, source, name)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A regular grid of samples: dims, spacing, and the first sample, (x, y, z)."""
+
+    dims: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    origin: tuple[float, float, float]
+
+
+def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
+    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2).
+
+    Raises:
+        DataError: bounds that are not finite.
+    """
+    if not np.isfinite(bounds).all():
+        raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
+    size, spacing = _grid(bounds, dims, cells)
+    flat = bounds[:, 0] == bounds[:, 1]
+    return Samples(size, spacing, triple(np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2).tolist()))
+
+
+def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """Sample the values on a vtkDataSet, by vtkProbeFilter.
+
+    Args:
+        mesh: a vtkDataSet.
+        values: (n,) scalars of its points or cells.
+        where: ``point`` or ``cell``.
+        grid: the samples.
+
+    Returns:
+        (nz, ny, nx) values, and a mask of those that lie in a cell.
+    """
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkFiltersCore import vtkProbeFilter
+
+    image = vtkImageData()
+    image.SetDimensions(*grid.dims)
+    image.SetSpacing(*grid.spacing)
+    image.SetOrigin(*grid.origin)
+    single = mesh.NewInstance()
+    single.CopyStructure(mesh)
+    array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
+    array.SetName("values")
+    (single.GetPointData() if where == "point" else single.GetCellData()).AddArray(array)
+    filtered = vtkProbeFilter()
+    filtered.SetInputData(image)
+    filtered.SetSourceData(single)
+    filtered.Update()
+    found = filtered.GetOutput().GetPointData()
+    inside = vtk_to_numpy(found.GetArray(filtered.GetValidPointMaskArrayName())).astype(bool)
+    shape = grid.dims[::-1]
+    return vtk_to_numpy(found.GetArray("values")).reshape(shape), inside.reshape(shape)
+
+
+def sampled_volume(
+    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
+) -> Volume:
+    """Make the volume of samples; warn of their number where ``dims`` is None.
+
+    Args:
+        values: (nz, ny, nx), NaN where not ``inside``.
+        inside: mask of the samples in a cell.
+        dtype: of the values before.
+        grid: the samples.
+        dims: what was asked for, None: nothing.
+        source: for messages.
+        name: of the volume.
+
+    Raises:
+        DataError: none is inside.
+    """
+    if not inside.any():
+        raise DataError(f"{source}: no sample of {_text(grid.dims)} lies in a cell of the mesh; try other --dims")
+    if dims is None:
+        edges = " x ".join(f"{edge:.6g}" for edge in grid.spacing)
+        warnings.warn(
+            f"{source}: resampled to {_text(grid.dims)} voxels of {edges}, by its cells (--dims X Y Z decides)",
+            stacklevel=2,
+        )
+    label = f"{name} (resampled to {_text(grid.dims)})"
+    return Volume(values.astype(float_dtype(dtype)), grid.spacing, grid.origin, name=label)
+
+
+def _text(size: Sequence[int]) -> str:
+    return " x ".join(map(str, size))
+
+
+def _grid(
+    bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int
+) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
+    """Return voxels and their edges along x, y, z."""
+    extent = bounds[:, 1] - bounds[:, 0]
+    thick = extent > 0
+    if dims is None:
+        edge = (np.prod(extent[thick]) / cells) ** (1 / max(thick.sum(), 1)) if thick.any() else 1.0
+        edge = max(edge, extent.max() / MOST)
+        wanted = np.clip(np.ceil(extent / edge - 1e-9), 1, MOST).astype(int)
+    else:
+        wanted = np.where(thick, dims, 1)
+    steps = np.where(thick, extent / wanted, 0.0)
+    steps = np.where(thick, steps, steps[thick].mean() if thick.any() else 1.0)
+    return triple(wanted.tolist()), triple(steps.tolist())

@@ -1,0 +1,357 @@
+"""VTK XML images (``.vti``), read by VTK.
+
+A plain (raw, appended) array is memory-mapped instead; a compressed one may be unpacked box by box (`packed`). The
+XML is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.headers import type_of
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import unit_rows
+from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
+from vvgt_cli.volume.vtk.blocks import check_blocks
+from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.packed import packed_array
+
+# Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
+_RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
+_CHUNK = 1 << 16
+DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
+GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
+HIDDEN = {"point": 2, "cell": 32}
+
+
+@dataclass
+class Scan:
+    """The contents of the XML; arrays are those of the first piece, points and cells of all.
+
+    In an index of pieces, ``sources`` are the files that it names, with their extents.
+    """
+
+    kind: str = ""
+    root: dict[str, str] = field(default_factory=dict)
+    image: dict[str, str] = field(default_factory=dict)
+    pieces: int = 0
+    points: int = 0
+    cells: int = 0
+    where: str = ""
+    active: dict[str, str] = field(default_factory=dict)
+    arrays: list[tuple[ArrayInfo, dict[str, str]]] = field(default_factory=list)
+    sources: list[tuple[str, str]] = field(default_factory=list)
+    appended: str = ""
+    data_start: int = -1
+
+    @property
+    def infos(self) -> list[ArrayInfo]:
+        """The arrays that may be chosen: ghost marks are not values."""
+        return [info for info, _ in self.arrays if info.name != GHOSTS]
+
+    def find(self, name: str, where: str) -> tuple[ArrayInfo, dict[str, str]] | None:
+        """Return an array and its attributes, None where there is none of the name."""
+        return next((row for row in self.arrays if (row[0].name, row[0].where) == (name, where)), None)
+
+
+def scan(path: Path) -> Scan:
+    """Scan the elements of a VTK XML file, up to its appended data.
+
+    Raises:
+        DataError: not well-formed, or not a VTKFile.
+    """
+    found = Scan()
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "VTKFile":
+            found.root, found.kind = attributes, attributes.get("type", "")
+        elif tag.removeprefix("P") in ("ImageData", "RectilinearGrid", "StructuredGrid"):
+            found.image = attributes
+        elif tag == "Piece":
+            found.pieces += 1
+            found.points += int(attributes.get("NumberOfPoints", "0"))
+            found.cells += int(attributes.get("NumberOfCells", "0"))
+            if "Source" in attributes:
+                found.sources.append((attributes["Source"], attributes.get("Extent", "")))
+        elif tag in DATA:
+            found.where = DATA[tag]
+            found.active[found.where] = attributes.get("Scalars", "")
+        elif tag in ("DataArray", "PDataArray") and found.where and found.pieces == (tag == "DataArray"):
+            _note_array(found, attributes, path)
+        elif tag == "AppendedData":
+            found.appended, found.data_start = attributes.get("encoding", ""), parser.CurrentByteIndex
+
+    def end(tag: str) -> None:
+        if tag in DATA:
+            found.where = ""
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    with open(path, "rb") as file:
+        try:
+            while found.data_start < 0 and (chunk := file.read(_CHUNK)):
+                parser.Parse(chunk)
+        except expat.ExpatError as error:
+            if found.data_start < 0:
+                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+        if found.data_start >= 0:
+            file.seek(found.data_start)
+            mark = re.match(rb"[^>]*>\s*_", file.read(4096))
+            if mark is None:  # VTK's reader would begin elsewhere
+                raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
+            found.data_start += mark.end()
+    return found
+
+
+def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
+    dtype = type_of(attributes.get("type", ""), {"bit": "u1"})
+    if dtype is None:
+        return
+    components = int(attributes.get("NumberOfComponents", "1"))
+    if components < 1:
+        raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
+    name = attributes.get("Name", "")
+    active = bool(name) and name == found.active.get(found.where)
+    found.arrays.append((ArrayInfo(name, found.where, components, dtype.name, active), attributes))
+
+
+def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
+    try:
+        values = [float(t) for t in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != n:
+        raise DataError(f"{path}: {what} is {text!r}; expected {n} numbers")
+    return values
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Dims, origin and spacing (x, y, z) of the values, direction row-major."""
+
+    dims: tuple[int, ...]
+    origin: tuple[float, ...]
+    spacing: tuple[float, ...]
+    direction: tuple[float, ...]
+
+
+def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
+    """Parse the six numbers of an extent.
+
+    Raises:
+        DataError: they are not.
+    """
+    return [int(e) for e in _numbers(text, 6, path, what)]
+
+
+def extent_dims(image: dict[str, str], path: Path) -> list[int]:
+    """Return the points along (x, y, z) of an image or a structured grid, by its attributes.
+
+    Raises:
+        DataError: none along an axis.
+    """
+    extent = extent_of(image.get("WholeExtent", ""), path)
+    dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
+    if min(dims) < 1:
+        raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
+    return dims
+
+
+def stored_ratio(found: Scan, path: Path) -> int:
+    """Return the most bytes of values that a byte of the file can stand for.
+
+    Raises:
+        DataError: an unknown compressor.
+    """
+    compressor = found.root.get("compressor", "")
+    if compressor not in _RATIO:
+        raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
+    return _RATIO[compressor]
+
+
+def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
+    """Return the grid of points, or of cell centres (half a voxel further, one fewer along each axis), by attributes.
+
+    Raises:
+        DataError: numbers that are none.
+    """
+    extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
+    spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
+    origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
+    direction: tuple[float, ...] = IDENTITY
+    if "Direction" in image:
+        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))
+    first = [float(extent[2 * k]) for k in range(3)]
+    if where == "cell":
+        first = [f + 0.5 if d > 1 else f for f, d in zip(first, dims, strict=True)]
+        dims = [max(d - 1, 1) for d in dims]
+    step = [f * s for f, s in zip(first, spacing, strict=True)]
+    origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
+    axes = [[direction[3 * row + k] * spacing[k] for row in range(3)] for k in range(3)]
+    return Grid(tuple(dims), tuple(origin), *unit_rows(axes))
+
+
+def read_vti(path: Path, options: ReadOptions) -> Volume:
+    """Read a VTK XML image: point data, or cell data on the grid of cell centres.
+
+    Raises:
+        DataError: another dataset than an image, damaged, or sizes that the file cannot hold.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    found = scan(path)
+    if found.kind != "ImageData" or not found.image:
+        raise DataError(
+            f"{path}: a VTK file of type {found.kind or 'unknown'}; expected ImageData (.vti); resample it first "
+            "(ParaView: Resample To Image)"
+        )
+    infos = found.infos
+    info = infos[choose_array(infos, options.array, str(path))]
+    grid = image_grid(found.image, info.where, path)
+    values = image_values(found, info, grid, options, path)
+    return Volume(values, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
+
+
+def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
+    """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
+
+    With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden.
+
+    Raises:
+        DataError: sizes that the file cannot hold, or it is damaged.
+        UsageError: a choice of component that is missing or does not exist.
+    """
+    packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
+    if packed is not None:
+        return packed
+    component = select_from_array(_stored(found, info, grid, path), info, options.component, str(path))
+    for where in ("point", "cell"):
+        row = found.find(GHOSTS, where)
+        if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
+            continue
+        marks = _stored(found, row[0], image_grid(found.image, where, path), path)[..., 0]
+        hidden = marks.astype(np.uint8) & HIDDEN[where] != 0
+        component = without(component, hidden if where == info.where else around(hidden, component.shape))
+    return component
+
+
+def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
+    """Read the values (nz, ny, nx, c) of an array, mapped or by VTK."""
+    row = found.find(info.name, info.where)
+    shape = (*reversed(grid.dims), info.components)
+    _check_declared(found, info, count(shape), path)
+    check_memory(count(shape) * np.dtype(info.dtype).itemsize, str(path))
+    values = None if row is None else _mapped(found, row[1], info, shape, path)
+    return _by_vtk(path, info, shape) if values is None else values
+
+
+def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Set ``values`` to NaN where ``hidden``; return them as they are where nothing is."""
+    if not hidden.any():
+        return values
+    return np.where(hidden, np.nan, values).astype(float_dtype(values.dtype))
+
+
+def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Mask the points (nz, ny, nx) whose surrounding cells are all in ``cells``, a mask."""
+    for axis, n in enumerate(shape):
+        if n > cells.shape[axis]:
+            ones = np.ones_like(np.take(cells, [0], axis))
+            cells = np.concatenate([ones, cells], axis) & np.concatenate([cells, ones], axis)
+    return cells
+
+
+def _check_declared(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+    """Refuse sizes that the file cannot hold."""
+    need = n_values * np.dtype(info.dtype).itemsize
+    size = path.stat().st_size
+    if need > size * stored_ratio(found, path):
+        raise DataError(
+            f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
+            "declares; check that the file is whole"
+        )
+    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
+
+
+def _mapped(
+    found: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
+) -> np.ndarray | None:
+    """Map an array that is stored plainly, in one piece; None for others."""
+    plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
+    if not plain or found.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
+        return None
+    word, dtype = _order(found, info)
+    start = found.data_start + int(attributes.get("offset", "0"))
+    declared = int(load_block(path, word, (1,), offset=start)[0])
+    if start < found.data_start or declared != count(shape) * dtype.itemsize:
+        raise DataError(
+            f"{path}: array {info.name!r} stores {declared} bytes, its header declares {count(shape) * dtype.itemsize}"
+        )
+    return load_block(path, dtype, shape, offset=start + word.itemsize)
+
+
+def _order(found: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
+    """Return the types of the words before an array's values and of the values, as stored."""
+    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
+    word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
+    return word, np.dtype(order + np.dtype(info.dtype).str[1:])
+
+
+def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
+    """Wrap an array that is appended and compressed, in one piece, with no hidden value; None for others."""
+    row = found.find(info.name, info.where)
+    hidden = any(found.find(GHOSTS, where) for where in HIDDEN)
+    plain = not found.root.get("compressor") or found.appended not in ("raw", "base64") or found.data_start < 0
+    if row is None or plain or hidden or found.pieces != 1 or options.component == "magnitude":
+        return None
+    if row[1].get("format") != "appended" or row[1]["type"] == "Bit":
+        return None
+    shape = (*reversed(grid.dims), info.components)
+    _check_declared(found, info, count(shape), path)
+    start = found.data_start + int(row[1].get("offset", "0"))
+    if start < found.data_start:
+        raise DataError(f"{path}: array {info.name!r} begins before the appended data; check that the file is whole")
+    component = None if options.component is None else int(options.component)
+    word, dtype = _order(found, info)
+    return packed_array(
+        path, found.root["compressor"], word, found.appended == "base64", start, dtype, shape, component, info
+    )  # fmt: skip
+
+
+def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
+    """Read values (nz, ny, nx, c) by vtkXMLImageDataReader, without a copy."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+    with quiet_vtk() as message:
+        reader = vtkXMLImageDataReader()
+        reader.SetFileName(str(path))
+        reader.UpdateInformation()
+        for where, selection in (
+            ("point", reader.GetPointDataArraySelection()),
+            ("cell", reader.GetCellDataArraySelection()),
+        ):
+            selection.DisableAllArrays()
+            if where == info.where:
+                selection.EnableArray(info.name)
+        reader.Update()
+        image = reader.GetOutput()
+        data = image.GetPointData() if info.where == "point" else image.GetCellData()
+        array = data.GetArray(info.name) if info.name else data.GetArray(0)
+        error = message()
+    if error or reader.GetErrorCode() or array is None:
+        raise DataError(f"{path}: VTK cannot read array {info.name!r} ({error or 'no message'}); is the file whole?")
+    values = vtk_to_numpy(array)
+    if values.size != count(shape):
+        raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")
+    result: np.ndarray = values.reshape(shape)
+    return result
