@@ -1,8 +1,8 @@
-# make test | quick | lint | long | mutants | viewers | page | model | ci
+# make test | quick | lint | docs | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format long fuzz mutants viewers page model ci
+.PHONY: test quick lint format docs long fuzz mutants viewers page model ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -28,6 +28,11 @@ lint: $(VENV)/bin/pytest
 format: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
+
+# The documentation as a site that can be searched: out/docs/index.html.
+docs: $(VENV)/bin/pytest
+	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,docs]'
+	$(VENV)/bin/python -m sphinx -W --keep-going -q -c docs . out/docs
 
 # The checks that take too long for every change: tests marked `long`, and property tests with 100 times the examples.
 long: $(VENV)/bin/pytest

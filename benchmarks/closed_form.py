@@ -1,4 +1,4 @@
-"""Closed form against the volume renderer on a list of scenes: a CSV row each, and docs/closed-form.md's table.
+"""Closed form against the volume renderer on a list of scenes: a CSV row each, and a table of it.
 
     PYTHONPATH=. python benchmarks/closed_form.py SCENES.tsv DATA_DIR TF_DIR -o docs/closed-form.csv
     PYTHONPATH=. python benchmarks/closed_form.py --table docs/closed-form.csv

@@ -1,4 +1,4 @@
-"""Adaptive grids of rays against 8 x 8 rays in every pixel: a CSV row a scene, and docs/dvr.md's table.
+"""Adaptive grids of rays against 8 x 8 rays in every pixel: a CSV row a scene, and a table of it.
 
     PYTHONPATH=. python benchmarks/dvr_pixels.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-pixels.csv
     PYTHONPATH=. python benchmarks/dvr_pixels.py --table docs/dvr-pixels.csv

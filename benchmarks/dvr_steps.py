@@ -1,4 +1,4 @@
-"""Error against time of pre-integrated and of plain stepping: a CSV row each, and docs/dvr.md's table.
+"""Error against time of pre-integrated and of plain stepping: a CSV row each, and a table of it.
 
     PYTHONPATH=. python benchmarks/dvr_steps.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-steps.csv
     PYTHONPATH=. python benchmarks/dvr_steps.py --table docs/dvr-steps.csv

@@ -1,4 +1,4 @@
-"""Our ray caster against VTK's CPU mapper, alternating in one run: a CSV row each, and docs/dvr.md's table.
+"""Our ray caster against VTK's CPU mapper, alternating in one run: a CSV row each, and a table of it.
 
     PYTHONPATH=. python benchmarks/dvr_vtk.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-vtk.csv
     PYTHONPATH=. python benchmarks/dvr_vtk.py --table docs/dvr-vtk.csv

@@ -1,4 +1,4 @@
-"""Our shading against VTK's two volume mappers at equal steps: a CSV row each, and docs/dvr.md's table.
+"""Our shading against VTK's two volume mappers at equal steps: a CSV row each, and a table of it.
 
     PYTHONPATH=. python benchmarks/light_vtk.py SCENES.tsv DATA_DIR TF_DIR -o docs/light-vtk.csv
     PYTHONPATH=. python benchmarks/light_vtk.py --table docs/light-vtk.csv

@@ -1,4 +1,4 @@
-"""What `vvgt convert --dry-run` predicts against what then happens: a CSV row a conversion, and docs/plan.md's table.
+"""What `vvgt convert --dry-run` predicts against what then happens: a CSV row a conversion.
 
     PYTHONPATH=. python benchmarks/plan.py SCENES.tsv DATA_DIR TF_DIR -o docs/plan.csv
     PYTHONPATH=. python benchmarks/plan.py --table docs/plan.csv

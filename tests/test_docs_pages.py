@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 from pathlib import Path
 
 import click
@@ -11,8 +12,10 @@ import pytest
 
 from tests.test_architecture import ROOMS
 from vvgt_cli.cli.main import COMMANDS, cli
+from vvgt_cli.conversion.batch import CANNOT
 
 ROOT = Path(__file__).parent.parent
+SITE = runpy.run_path(str(ROOT / "docs" / "conf.py"))
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("examples/*.md")])
 
 
@@ -32,17 +35,28 @@ def options(command):
 
 
 @pytest.mark.parametrize(("page", "command"), list(commands()), ids=lambda value: getattr(value, "name", value))
-def test_every_command_has_a_page_with_its_options_and_no_others(page, command):
+def test_every_command_has_a_page_on_which_the_site_lists_its_options(page, command):
     text = (ROOT / "docs" / "commands" / f"{page}.md").read_text("utf-8")
-    if command.name != page:  # a group's page has a section a command
-        text = text.partition(f"\n## vvgt {page} {command.name}\n")[2].partition("\n## ")[0]
-    table = [row.split(" | ")[0] for row in text.splitlines() if row.startswith("| `-")]
-    named = re.findall(r"(?<![\w-])-{1,2}[a-z][\w-]*", " ".join(re.findall(r"`(-[^`]*)`", " ".join(table))))
-    assert {name for name in named if not re.fullmatch(r"-[xyz]", name)} == set(options(command))
+    name = page if command.name == page else f"{page} {command.name}"
+    place = SITE["OPTIONS"].search(text[text.index(f"# vvgt {name}\n") :])
+    assert place[1] == name
+    listed = re.findall(r"^```{option} (.*)$", SITE["options"](place), re.M)
+    assert sorted(re.findall(r"(?<![\w-])-{1,2}[a-z][\w-]*", " ".join(listed))) == sorted(options(command))
     for example in re.findall(r"^vvgt (.*)$", text, re.M):
         for option in re.findall(r"(?<!\S)(--[a-z-]+|-[a-z])(?=\s|$)", example.split(" | ")[0]):
             owner = example.split()[0]
             assert any(option in options(sub) for name, sub in commands() if name == owner), f"{example}: {option}"
+
+
+def test_the_page_of_convert_gets_the_table_of_what_cannot_be_combined():
+    text = (ROOT / "docs" / "commands" / "convert.md").read_text("utf-8")
+    rows = [
+        row.strip("| ").split(" | ") for row in SITE["combinations"](SITE["COMBINATIONS"].search(text)).splitlines()
+    ]
+    listed = {(kind, name): reason for kind, names, reason in rows for name in re.findall("`(.*?)`", names)}
+    assert listed == {
+        (kind, name): SITE["escaped"](reason) for kind, refused in CANNOT.items() for name, reason in refused.items()
+    }
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -63,13 +77,11 @@ def test_links_to_sections_find_them(path):
             assert section in heads, f"{target}#{section}"
 
 
-def test_the_index_has_every_room_in_its_order_and_every_page():
+def test_the_index_leads_to_every_page():
     text = (ROOT / "docs" / "index.md").read_text("utf-8")
-    table = text.partition("## Rooms of the package")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| (`.*?`) \| ", table, re.M)
-    assert tuple(re.findall(r"`(\w+)`", " ".join(rows))) == ROOMS
-    for page in (ROOT / "docs").glob("*.md"):
-        assert page.name == "index.md" or f"({page.name})" in text, page.name
+    pages = SITE["navigation"](text).splitlines()
+    for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "commands").glob("*.md")]:
+        assert page.name == "index.md" or page.relative_to(ROOT / "docs").with_suffix("").as_posix() in pages, page
 
 
 def test_files_that_contributors_are_sent_to_are_there():
@@ -117,7 +129,8 @@ def test_constraints_pin_every_dependency_of_the_package():
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
+    extras = project["optional-dependencies"]
+    wanted = project["dependencies"] + extras["test"] + extras["docs"]
     for requirement in wanted:
         assert re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower() in names, requirement
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests import anatomy
+from tests import anatomy, vtk_files
 from tests.docs_commands import blocks, small
 from tests.headers import uncertified
 from tests.test_look_formats import mrml
@@ -73,6 +73,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     cells = np.stack([[data, data[::-1]], [data, data // 2]]).astype("<u2")  # T C Z Y X
     sizes = {"PhysicalSizeX": 0.2, "PhysicalSizeY": 0.2, "PhysicalSizeZ": 0.5, "Channel": {"Name": ["DAPI", "GFP"]}}
     tifffile.imwrite(tmp_path / "cells.ome.tif", cells, ome=True, metadata={"axes": "TCZYX", **sizes})
+    for name in ("flow", "cavity"):
+        (tmp_path / name).mkdir()
+    case = vtk_files.ensight(tmp_path / "flow").rename(tmp_path / "flow" / "flow.case")
+    case.write_text(case.read_text().replace("1 ramp", "1 p"))
+    vtk_files.openfoam(tmp_path / "cavity").rename(tmp_path / "cavity" / "cavity.foam")
+    for cells in (tmp_path / "cavity").glob("*/cells"):
+        cells.with_name("p").write_text(cells.read_text().replace("object cells", "object p"))
     (tmp_path / "bone.json").write_text(anatomy.TF)
     preset = {"RGBPoints": [0, 0.9, 0.8, 0.7, 900, 1, 1, 1], "Points": [0, 0, 0.5, 0, 900, 0.5, 0.5, 0]}
     (tmp_path / "presets.json").write_text(json.dumps([preset | {"Name": name} for name in ("bone", "skin")]))

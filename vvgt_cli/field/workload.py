@@ -1,4 +1,4 @@
-"""`Workload`: what of a scene and a machine the costs of stages depend on (docs/plan.md says how they were fitted)."""
+"""`Workload`: what of a scene and a machine the costs of stages depend on (docs/optimize.md, "The plan")."""
 
 from __future__ import annotations
 

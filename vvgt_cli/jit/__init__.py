@@ -1,1 +1,1 @@
-"""Compile kernels in a process of their own, keep their machine code on disk and load it (docs/kernels.md)."""
+"""Compile kernels in a process of their own, keep their machine code on disk and load it (CONTRIBUTING.md)."""

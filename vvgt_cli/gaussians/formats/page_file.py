@@ -1,7 +1,7 @@
 """The page that shows Gaussians: its text, and the whole of it as one file that opens without a server.
 
 `page/` holds its text, and `viewer.js.gz`, which `make page` builds of `page.mjs`, SuperSplat's viewer and the
-PlayCanvas engine (docs/dependencies.md).
+PlayCanvas engine (CONTRIBUTING.md, "Dependencies").
 """
 
 from __future__ import annotations
