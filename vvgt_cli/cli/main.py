@@ -86,7 +86,7 @@ def cli() -> None:
 
 def _fail(message: str, code: int) -> int:
     if not first_of_group():
-        time.sleep(ALONE)  # what ends all processes is told by the first; torchrun ends the others meanwhile
+        time.sleep(ALONE)  # the first process reports what ends all; torchrun ends the others meanwhile
     print(f"vvgt: error: {' '.join(message.split())}", file=sys.stderr)
     return code
 

@@ -33,7 +33,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.tiff.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
-SOON = 10.0  # seconds of reading after which a page is shown that waits; what fails sooner is told without one
+SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
 LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
