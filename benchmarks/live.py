@@ -31,7 +31,7 @@ from vvgt_cli.field.layered import Content
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
-from vvgt_cli.gaussians.live import baked, shown_by
+from vvgt_cli.gaussians.live import apply_look, baked
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.fog import fog
@@ -83,7 +83,7 @@ def placed(field: Resident, gaussians: int) -> Gaussians:
     run = Run(Console(quiet=True), ConversionReport("convert"))
     request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
     assert isinstance(source.tf, TransferFunction)
-    foggy = field.with_look(source.shown_by(fog(source.statistics, source.tf)))
+    foggy = field.with_look(source.with_function(fog(source.statistics, source.tf)))
     return wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
 
 
@@ -120,10 +120,10 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
-        shown = field.with_look(source.shown_by(replace(tf, opacity_unit_distance=spacing)))
+        shown = field.with_look(source.with_function(replace(tf, opacity_unit_distance=spacing)))
         table = table_of(shown.source)
         looks = {
-            "live": shown_by(live, table, pixel), "bytes": shown_by(packed, table, pixel),
+            "live": apply_look(live, table, pixel), "bytes": apply_look(packed, table, pixel),
             "other viewers": baked(live, table, pixel),
         }  # fmt: skip
         if beside:

@@ -23,7 +23,7 @@ from vvgt_cli.volume import ReadOptions, read_volume
         ({"Modality": "MR"}, False),
     ],
 )
-def test_dicom_says_which_values_are_hounsfield_units(tmp_path: Path, changes: dict, units: bool) -> None:
+def test_dicom_states_which_values_are_hounsfield_units(tmp_path: Path, changes: dict, units: bool) -> None:
     write_series(tmp_path, **changes)
     assert read_volume(str(tmp_path)).hounsfield == units
     name = "automatic (Hounsfield units)" if units else "automatic (histogram)"
@@ -39,9 +39,9 @@ def test_opacity_is_per_a_share_of_the_longest_edge(tmp_path: Path) -> None:
     assert (asked.unit_distance, asked.unit_label) == (7 / 3, "mean-spacing")
 
 
-def test_a_volume_of_one_value_is_a_box_and_that_is_said(tmp_path: Path) -> None:
+def test_a_constant_volume_is_a_box_with_a_warning(tmp_path: Path) -> None:
     np.save(tmp_path / "zero.npy", np.zeros((4, 4, 4), np.uint8))
-    with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so that only the box is seen; check --dtype"):
+    with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so only the box is visible; check --dtype"):
         source = load(SourceRequest(str(tmp_path / "zero.npy")))
     assert 0 < source.tf.opacity(np.zeros(1))[0] < 0.05
 

@@ -76,7 +76,7 @@ BAD = {
     "deep": ("[" * 200_000, "not JSON"),
     "a list": ("[]", "no list 'frames'"),
     "no frames": (json.dumps(LENS), "no list 'frames'"),
-    "text frame": (json.dumps({**LENS, "frames": ["a"]}), "frame 0 is not an object"),
+    "text frame": (json.dumps({**LENS, "frames": ["a"]}), "frame 0 is str; expected an object"),
     "no matrix": (json.dumps({**LENS, "frames": [{}]}), "4 x 4"),
     "ragged": (json.dumps({**LENS, "frames": [{**FRAME, "transform_matrix": [[1], [2, 3]]}]}), "4 x 4"),
     "scaled": (

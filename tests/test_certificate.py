@@ -99,7 +99,7 @@ def test_a_certificate_that_is_none_is_one_line(text) -> None:
         + [f"property float {name}_{k}" for name, n in (("scale", 3), ("rot", 4)) for k in range(n)]
         + ["end_header", ""]
     )
-    with pytest.raises(DataError, match="is not one that vvgt writes"):
+    with pytest.raises(DataError, match="expected one that vvgt writes"):
         parse_header(header.encode(), "x.ply")
 
 
@@ -131,7 +131,7 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     assert "--shard 2/2" in found.command
 
 
-def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_path, monkeypatch) -> None:
+def test_seconds_are_stated_unless_files_must_be_reproducible(vvgt, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *args, "-o", tmp_path / "timed.ply").code == 0
@@ -275,7 +275,7 @@ def test_positions_far_from_the_origin_are_known_to_be_rounded(made) -> None:
     assert 0.1 < position_error(gaussians, far) <= 0.25 + 1e-6  # half a step of float32 at 5e6
 
 
-def test_a_verdict_says_what_does_not_hold() -> None:
+def test_a_verdict_names_what_does_not_hold() -> None:
     assert Verdict(True, True, 40.0, 40.05).text() == "holds: the same volume and look, 40.00 dB (40.05 dB recorded)"
     assert Verdict(None, True, 40.0, 40.0).text().startswith("holds: the volume was not compared (too large)")
     assert Verdict(True, True, 39.8, 40.0).text() == "does not hold: 39.80 dB, 40.00 dB recorded"

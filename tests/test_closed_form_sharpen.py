@@ -12,7 +12,7 @@ from vvgt_cli.closed_form import VbmOptions, closed_form, initialise, sharpen
 from vvgt_cli.closed_form.sharpen import AMOUNT, BRIGHTEST, WINDOW, curves, sharpened
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import together
+from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.readers import minimal
 from vvgt_cli.splat import render
@@ -128,7 +128,7 @@ def fog(n=40):
 def test_what_is_hidden_takes_the_colour_of_what_hides_it():
     behind, front = cloud(400, 9), cloud(400, 10)
     both = replace(behind.take(np.arange(400)), colors=np.tile(np.float32(YELLOW), (400, 1)))
-    both = together([both, replace(front, colors=np.tile(np.float32(BLUE), (400, 1)))])
+    both = concatenate([both, replace(front, colors=np.tile(np.float32(BLUE), (400, 1)))])
     seen = np.concatenate([np.full(400, 0.01), np.ones(400)])
     found = sharpened(both, seen, BOX).colors
     assert np.abs(found[:400] - BLUE).mean() < 0.1 * np.abs(np.subtract(YELLOW, BLUE)).mean()

@@ -29,7 +29,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.refine.options import TEXTURE
 from vvgt_cli.score.record import ConversionReport, Run
 
-CASE = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
+CASE = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, base_bytes=2e8)
 FORM = 0.4 + 0.62 + 0.03 * 10.2 + 0.28  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)

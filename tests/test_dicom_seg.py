@@ -17,7 +17,7 @@ from pydicom.uid import UID, generate_uid
 from tests.test_volume_slices import header, write_series
 from vvgt_cli.dvr.layers import common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
-from vvgt_cli.field.layered import layers_of, open_parts
+from vvgt_cli.field.layered import layers_of, open_content
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look.label_files import read_labels
@@ -130,15 +130,17 @@ def test_a_scan_with_its_segmentation(tmp_path: Path) -> None:
     red = grid[..., 0] > 1.5 * grid[..., 2]
     np.testing.assert_array_equal(red, organs()[..., 0] > 0)
     scan(tmp_path / "other", "1.2.3.4")
-    other = open_parts(str(tmp_path / "other"), ReadOptions())
-    layers = layers_of(other, "gray", None) + layers_of(open_parts(str(tmp_path / "s.dcm"), ReadOptions()), None, None)
+    other = open_content(str(tmp_path / "other"), ReadOptions())
+    layers = layers_of(other, "gray", None) + layers_of(
+        open_content(str(tmp_path / "s.dcm"), ReadOptions()), None, None
+    )
     with pytest.warns(UserWarning, match="s: of another frame of reference"):
         common_grid(layers)
 
 
 def test_by_command(vvgt, tmp_path: Path) -> None:
     write_seg(tmp_path / "s.dcm", scan(tmp_path / "ct"), organs())
-    with pytest.warns(UserWarning, match="s: taken as a label map, by its segments"):
+    with pytest.warns(UserWarning, match="s: read as a label map by its segments"):
         done = vvgt("init", tmp_path / "s.dcm", *SMALL[:4], "-o", tmp_path / "a.ply")
     assert done.code == 0, done.err
     colors = read_ply(str(tmp_path / "a.ply"))[0].colors

@@ -16,11 +16,11 @@ from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, Box, camera_arrays
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import Boxes, piece_edge
-from vvgt_cli.field.open import Wanted, blocked
-from vvgt_cli.field.parts import Parts
-from vvgt_cli.field.rays import Cast, front_to_back, meeting, pieces_of
+from vvgt_cli.field.open import FieldNeeds, blocked
+from vvgt_cli.field.rays import KernelBundle, front_to_back, meeting, pieces_of
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
@@ -50,7 +50,7 @@ def labels_of(dims):
 def in_blocks(request, edge, folder, workers=1):
     """The field of a request in blocks of ``edge`` voxels."""
     run = Run(Console(quiet=True), ConversionReport("convert"))
-    with blocked(run, request, BlockOptions(edge, workers), Parts(folder), Wanted(500, 64)) as field:
+    with blocked(run, request, BlockOptions(edge, workers), BlockStore(folder), FieldNeeds(500, 64)) as field:
         yield field
 
 
@@ -116,7 +116,7 @@ def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
     from vvgt_cli.field.field import Resident
 
     memory = Resident(source, source.scene())
-    ours = memory.start(options).gaussians
+    ours = memory.pyramid(options).gaussians
     with in_blocks(request, 16, tmp_path / "parts") as field:
         theirs = field.pyramid(options).gaussians
         assert len(ours) == len(theirs)
@@ -135,7 +135,7 @@ def cast_of(camera, half=1.0, step=0.02):
     eye, basis, lens = camera_arrays(Box(np.full(3, half), np.full(3, step)), camera)
     rows, columns = np.indices((camera.height, camera.width))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
-    return Cast(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))
+    return KernelBundle(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))
 
 
 def test_a_piece_casts_the_rays_that_may_meet_it_and_no_others(tmp_path, monkeypatch):
@@ -179,7 +179,7 @@ def test_pieces_follow_from_the_volume_and_come_front_to_back():
     assert len(set(met)) > 3
 
 
-def test_init_in_blocks_says_its_error_against_the_volume(vvgt, tmp_path):
+def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     notes = []

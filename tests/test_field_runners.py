@@ -85,7 +85,7 @@ def test_one_that_is_killed_between_two_passes_is_none_of_those_that_do_no_block
         (idle,) = signed(tmp_path)
         os.kill(idle, signal.SIGKILL)
         assert ended(idle)
-        with pytest.raises(DataError, match=f"ended {IDLE} times without a block done"):
+        with pytest.raises(DataError, match=f"killed {IDLE} times before finishing a block"):
             runner.run(Sign(tmp_path, deadly=True), range(6), None)
     assert len(signed(tmp_path) - {idle}) == IDLE
 

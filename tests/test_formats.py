@@ -127,10 +127,12 @@ def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_an_old_openusd_is_told(monkeypatch):
+def test_an_old_openusd_is_reported(monkeypatch):
     usd = pytest.importorskip("pxr.Usd")
     monkeypatch.setattr(usd, "GetVersion", lambda: (0, 25, 11))
-    with pytest.raises(DataError, match=r"OpenUSD 25\.11 knows no ParticleField3DGaussianSplat.*usd-core>=26\.3"):
+    with pytest.raises(
+        DataError, match=r"OpenUSD 25\.11 does not support ParticleField3DGaussianSplat.*usd-core>=26\.3"
+    ):
         ready("a.usdc")
 
 
@@ -221,7 +223,7 @@ def test_a_usd_stage_is_turned_upright():
         assert tuple(round(v, 6) for v in up) == (0, 1, 0)  # PLY -y is up
 
 
-def test_convert_says_what_the_format_costs(tmp_path, vvgt):
+def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
     result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     assert result.code == 0, result.err
@@ -237,7 +239,7 @@ def test_convert_says_what_the_format_costs(tmp_path, vvgt):
     assert json.loads(scored.out)["size"] == 64
 
 
-def test_view_writes_formats_and_says_how_near_they_are(tmp_path, vvgt):
+def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
         result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
@@ -375,7 +377,7 @@ def test_a_stream_of_spz_4_that_ends_early_is_one_line():
     (size, whole), short = struct.unpack_from("<QQ", content, table), bytes(zstd.compress(bytes(200), 1))
     end = len(content) - sum(struct.unpack_from("<Q", content, table + 16 * k)[0] for k in range(1, content[15]))
     changed = content[:table] + struct.pack("<QQ", len(short), whole) + content[table + 16 : end - size] + short
-    with pytest.raises(DataError, match=r"stream 0: less than the 540 bytes"):
+    with pytest.raises(DataError, match=r"stream 0: truncated; expected 540 bytes"):
         known.read(changed + content[end:], "a.spz")
 
 

@@ -175,7 +175,7 @@ def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
     assert lit[1] + lit[2] > 0.95 * lit[0]  # the view is oblique: both may cover a pixel
 
 
-def test_a_live_page_in_a_browser_without_webgl_says_so(live: Path, tmp_path: Path) -> None:
+def test_a_live_page_reports_that_a_browser_has_no_webgl(live: Path, tmp_path: Path) -> None:
     off = "HTMLCanvasElement.prototype.getContext = () => null"
     text = live.with_suffix(".html").read_text("utf-8").replace("<head>", f"<head><script>{off}</script>", 1)
     (tmp_path / "off.html").write_text(text, "utf-8")

@@ -12,7 +12,7 @@ import pytest
 
 from tests import anatomy
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.boxed import boxed
+from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
@@ -349,7 +349,7 @@ def test_a_turned_scene_is_seen_by_a_turned_camera(matrix: np.ndarray) -> None:
     )  # fmt: skip
     camera: Camera = replace(default_views("train", size=64)[5], cx=30.0, cy=35.0)
     expected = render(transform(cloud, matrix), camera)
-    inside, mirrored = boxed(camera, matrix)
+    inside, mirrored = to_box_frame(camera, matrix)
     seen = render(cloud, inside)
     assert mirrored == (np.linalg.det(matrix) < 0)
     np.testing.assert_allclose(seen[:, ::-1] if mirrored else seen, expected, atol=2e-4)
@@ -381,7 +381,7 @@ def test_comments_that_cannot_be_are_refused(vvgt, comment: str) -> None:
     head, _, body = Path("a.ply").read_bytes().partition(b"end_header\n")
     lines = [line for line in head.split(b"\n") if not line.startswith(f"comment {comment[:9]}".encode())]
     Path("a.ply").write_bytes(b"\n".join([*lines[:-1], f"comment {comment}".encode(), b"end_header\n"]) + body)
-    assert "is not one that vvgt writes" in vvgt("info", "a.ply").error
+    assert "expected one that vvgt writes" in vvgt("info", "a.ply").error
 
 
 def test_info_says_axes_and_handedness(vvgt) -> None:

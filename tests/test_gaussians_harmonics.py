@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vvgt_cli.cameras.boxed import boxed
+from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.conversion.stages.refinement import drawn_by_all
@@ -186,7 +186,7 @@ def test_up_turns_harmonics_with_the_gaussians(up):
 def test_a_scene_seen_in_another_frame_is_the_same_picture(mirrored):
     g, camera = cloud(200, size=0.5), look_at((2.0, -1.7, 1.1), width=48, height=40, fov=40.0)
     matrix = orthogonal(3, mirrored)
-    inside, flipped = boxed(camera, matrix)
+    inside, flipped = to_box_frame(camera, matrix)
     assert flipped == mirrored
     picture = render(g, inside)
     np.testing.assert_allclose(
@@ -267,7 +267,10 @@ def test_files_of_other_frames_come_back(frame, up):
 GOOD = written(cloud(3, 1))
 LIES = {
     "nan": (GOOD[: -4 * 9] + np.float32(np.nan).tobytes() + GOOD[-4 * 8 :], "harmonics: 1 of 3 rows are not finite"),
-    "names": (GOOD.replace(b"f_rest_8", b"f_rest_9"), "f_rest_9 among 9 f_rest properties; expected f_rest_0 and on"),
+    "names": (
+        GOOD.replace(b"f_rest_8", b"f_rest_9"),
+        "f_rest_9 among 9 f_rest properties; expected them from f_rest_0",
+    ),
     "double": (GOOD.replace(b"float f_rest_8", b"double f_rest_8"), "f_rest_8 is double; expected float"),
     "count": (GOOD.replace(b"f_rest_8", b"rest"), "8 f_rest properties"),
 }

@@ -51,7 +51,7 @@ def same(one: Gaussians, other: Gaussians) -> bool:
 def test_rows_that_cannot_be_drawn_are_skipped_and_counted(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(ply(damaged()))
-    message = r"of 40 Gaussians 7 skipped \(.*\), 1 taken as opaque \(opacity inf\)"
+    message = r"of 40 Gaussians 7 skipped \(.*\), 1 read as opaque \(opacity inf\)"
     for read in (read_splats, library.read_ply, open_gaussians):
         with pytest.warns(UserWarning, match=message):
             found, _ = read(str(path))
@@ -224,7 +224,7 @@ def test_faulty_compressed_files(tmp_path: Path, content: bytes, said: str) -> N
         read(tmp_path, content)
 
 
-def test_our_own_compressed_files_keep_what_they_say(tmp_path: Path) -> None:
+def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:
     stream = io.BytesIO()
     gaussians = read_ply(io.BytesIO(ply(GOOD)))[0]
     write_ply(stream, gaussians, PlyOptions())

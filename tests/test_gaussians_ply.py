@@ -112,7 +112,7 @@ def test_layout_is_the_one_that_loaders_count_on():
 
 
 @pytest.mark.parametrize(("degree", "size"), [(0, 68), (1, 104), (2, 164), (3, 248)])
-def test_sh_padding_is_zero_and_comments_can_be_left_out(degree, size):
+def test_sh_padding_is_zero_and_comments_are_optional(degree, size):
     content = written(random_gaussians(3), sh_degree=degree, comments=False)
     assert b"comment" not in content
     rows = np.frombuffer(content.split(b"end_header\n", 1)[1], "<f4").reshape(3, size // 4)
@@ -210,7 +210,7 @@ LIES = {
     "double": (GOOD.replace(b"float opacity", b"double opacity"), "expected float"),
     "list": (GOOD.replace(b"property float nx", b"property list uchar int nx"), "scalar type"),
     "rest": (GOOD.replace(b"float nx", b"float f_rest_0"), "1 f_rest properties"),
-    "comment": (GOOD.replace(b"vvgt up none", b"vvgt up wide"), "not one that vvgt writes"),
+    "comment": (GOOD.replace(b"vvgt up none", b"vvgt up wide"), "expected one that vvgt writes"),
     "world": (GOOD.replace(b"frame unit", b"frame world"), "scale and centre"),
     "binary": (GOOD.replace(b"vvgt up", b"vvgt \xff\xfe"), "not text"),
     "nan": (GOOD[:-4] + np.float32(math.nan).tobytes(), "not finite"),

@@ -173,8 +173,8 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
         assert (done.code, "none of its labels is visible" in done.error) == (1, True), done.error
 
 
-def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:
-    with pytest.warns(UserWarning, match="balls_seg: taken as a label map, by its name"):
+def test_a_recognised_label_map_is_reported_and_none_reads_scalars(vvgt, tmp_path: Path, seg: Path) -> None:
+    with pytest.warns(UserWarning, match="balls_seg: read as a label map by its name"):
         done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
     assert "distinct colours" in done.err
     plain = vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "b.ply")
@@ -189,13 +189,13 @@ def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
 
     values = np.array([0, 1, 3, 1, 0, 3, 1, 0], np.uint8)
     (tmp_path / "x.seg.nrrd").write_bytes(SEGMENTS.encode() + values.tobytes())
-    with pytest.warns(UserWarning, match="taken as a label map"):
+    with pytest.warns(UserWarning, match="read as a label map"):
         table = load(SourceRequest(str(tmp_path / "x.seg.nrrd"))).tf
     assert isinstance(table, LabelTable)
     assert [(e.number, e.name) for e in table.labels] == [(1, "skin"), (3, "inner_core")]
 
 
-@pytest.mark.filterwarnings("ignore:.*taken as a label map")
+@pytest.mark.filterwarnings("ignore:.*read as a label map")
 def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
     path = tmp_path / "x.seg.nrrd"
     path.write_bytes(SEGMENTS.replace("sizes: 2 2 2", "sizes: 24 24 24").encode() + balls().tobytes())
@@ -251,7 +251,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
     for options, said in (
         (("--labels", "auto", "--tf", "gray"), "expected one of --tf and --labels"),
         (("--labels", tmp_path / "no.ctbl"), "no such file"),
-        (("--split-labels", "--tf", "gray"), "leave out --tf"),
+        (("--split-labels", "--tf", "gray"), "the colours of labels come from --labels"),
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):
@@ -260,7 +260,8 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
         assert said in done.error
     np.save(tmp_path / "empty_seg.npy", balls() * 0)
     assert (
-        "no label but 0" in vvgt("init", tmp_path / "empty_seg.npy", "--labels", "auto", "-o", tmp_path / "a.ply").error
+        "no label other than 0"
+        in vvgt("init", tmp_path / "empty_seg.npy", "--labels", "auto", "-o", tmp_path / "a.ply").error
     )
 
 
@@ -353,7 +354,7 @@ def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> No
     assert np.median(near) < 0.1
 
 
-def test_tables_are_listed_and_told_from_functions(vvgt, tmp_path: Path) -> None:
+def test_tables_are_listed_and_distinguished_from_functions(vvgt, tmp_path: Path) -> None:
     for text, name in ((SLICER, "a.ctbl"), (FREESURFER, "LUT.txt"), (SNAP, "a.label"), (JSON, "a.json")):
         path = table(tmp_path, text, name)
         facts = json.loads(vvgt("info", path, "--json").out)
@@ -372,7 +373,7 @@ def test_tables_are_listed_and_told_from_functions(vvgt, tmp_path: Path) -> None
     assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
 
 
-def test_evaluate_says_where_the_labels_are_others(vvgt, tmp_path: Path, seg: Path) -> None:
+def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> None:
     ply, labels = tmp_path / "a.ply", table(tmp_path, JSON, "a.json")
     assert vvgt("init", seg, "--labels", labels, *SMALL[:4], "-o", ply).code == 0
     again = table(

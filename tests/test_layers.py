@@ -15,7 +15,7 @@ import vvgt_cli as library
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.field.layered import ALL, open_parts
+from vvgt_cli.field.layered import ALL, open_content
 from vvgt_cli.field.source import SourceRequest, load, parse_layer
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
@@ -153,7 +153,7 @@ def write_vti(path: Path, values: np.ndarray) -> None:
 def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int) -> None:
     values = colors(samples=samples)
     write(tmp_path / name, values)
-    content = open_parts(str(tmp_path / name), ReadOptions())
+    content = open_content(str(tmp_path / name), ReadOptions())
     assert content.color
     np.testing.assert_array_equal(np.stack([v.data for v in content.volumes], axis=-1), values)
     np.testing.assert_array_equal(read_volume(str(tmp_path / name), ReadOptions(component=1)).data, values[..., 1])
@@ -183,7 +183,7 @@ def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     one = vvgt("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
     assert one.code == 0, one.err
     asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
-    assert "one component; leave out --component color" in asked.error
+    assert "one component; expected several: omit --component color" in asked.error
     table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
     assert "several components" in table.error
 
@@ -220,7 +220,7 @@ def write_ome(path: Path) -> np.ndarray:
 
 def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     values = write_ome(tmp_path / "a.ome.tif")
-    content = open_parts(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL))
+    content = open_content(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL))
     assert list(content.colors) == [(1.0, 0.0, 0.0), (0.0, 1.0, 1.0)]
     source = load(SourceRequest(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL)))
     grid = grid_of(source.layers, source.volume)
@@ -323,7 +323,7 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     nibabel.save(nibabel.Nifti1Image(np.zeros((8, 8, 8, 3), np.float32), np.eye(4)), tmp_path / "four.nii")
     for out in ("a.ply", "a.html", "a_{}.ply"):
         steps = vvgt("convert", "example:blob:8", "--layer", tmp_path / "four.nii", "-o", tmp_path / out)
-        assert (steps.code, "3 time steps; expected one for a layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
+        assert (steps.code, "3 time steps; expected one per layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
             2, True,
         ), steps.error  # fmt: skip
 

@@ -24,8 +24,8 @@ from vvgt_cli.gaussians.live import (
     AMOUNT,
     AROUND,
     Table,
+    apply_look,
     baked,
-    shown_by,
 )
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
@@ -106,7 +106,7 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
     """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
     live = np.array([[10.0, 20.0, 1e-5, 1.0, 0.0, 0.0]])
     one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
-    shown = shown_by(one, Table.of_function(WINDOW, LO, HI, 0.05, GRAIN))
+    shown = apply_look(one, Table.of_function(WINDOW, LO, HI, 0.05, GRAIN))
     np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
     axes = rotations(shown.quaternions.astype(float))[0] * np.exp(shown.log_scales.astype(float))
     covariance = axes @ axes.T
@@ -129,7 +129,7 @@ def test_a_look_turns_with_its_gaussians() -> None:
     for of, change in (
         (some, lambda g: turn(g, "x")), (fine, lambda g: transform(g, shear)), (some, lambda g: transform(g, mirrored))
     ):  # fmt: skip
-        before, after = change(shown_by(of, table)), shown_by(change(of), table)
+        before, after = change(apply_look(of, table)), apply_look(change(of), table)
         np.testing.assert_allclose(after.means, before.means, atol=2e-5)
         axes = [
             rotations(g.quaternions.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
@@ -180,7 +180,7 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live values", b"live valuez", 1))
-    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
         read_ply(tmp_path / "c.ply")
 
 
@@ -238,7 +238,7 @@ def test_bytes_for_pages_lose_little() -> None:
     camera = default_views("test", size=200)[0]
     for tf in (RAMP, WINDOW):
         table = Table.of_function(tf, LO, HI, 0.05, GRAIN)
-        images = [render(shown_by(g, table), camera)[..., :3] for g in (some, back)]
+        images = [render(apply_look(g, table), camera)[..., :3] for g in (some, back)]
         assert psnr(*images) > 50  # at 34 dB from the volume 10 log10(1 + 10^-1.6) = 0.1 dB
 
 
@@ -291,7 +291,7 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
         vvgt("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c").code == 0
     )
     assert next((tmp_path / "c").glob("*.png")).read_bytes() not in pictures  # of its own function
-    with pytest.warns(UserWarning, match="no columns for values"):
+    with pytest.warns(UserWarning, match="cannot store values for other functions"):
         assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
 
 
@@ -355,7 +355,7 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
         request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
         with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
             wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
-            foggy = field.with_look(field.source.shown_by(fog(field.source.statistics)))
+            foggy = field.with_look(field.source.with_function(fog(field.source.statistics)))
             found.append((field.sample(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9

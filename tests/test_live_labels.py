@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.labelled import assign_labels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.legend import legend_text
-from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, baked, opacities, seen_under, shown_by
+from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.fog import label_fog
 from vvgt_cli.look.label_files import read_labels
@@ -53,7 +53,7 @@ def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
     some = labels_cloud()
     assert some.live is not None
     some.live[:, 3:6] = 0  # in no surface
-    shown = shown_by(some, Palette.of_labels(LABELS, 0.05))
+    shown = apply_look(some, Palette.of_labels(LABELS, 0.05))
     for row, label in enumerate(LABELS[:2]):
         own = some.live[:, 6] == row
         np.testing.assert_allclose(shown.colors[own], np.tile(label.color, (own.sum(), 1)), atol=1e-6)
@@ -65,7 +65,7 @@ def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
         opaque = -np.expm1(-tau * length)[:, None]
         np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, FLAT, FLAT])), atol=1e-3)
     np.testing.assert_allclose(shown.means, some.means, atol=1e-6)
-    assert set(some.live[seen_under(some, Palette.of_labels(LABELS, 0.05)), 6]) == {0, 1}
+    assert set(some.live[visible_under(some, Palette.of_labels(LABELS, 0.05)), 6]) == {0, 1}
 
 
 def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     assert read_ply(tmp_path / "b.ply")[0].live[0, 6] == 299  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
-    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
         read_ply(tmp_path / "c.ply")
     (tmp_path / "d.ply").write_bytes(whole[:-1] + b"\x09")
     with pytest.raises(vvgt_library.DataError, match="row 9"):
@@ -168,7 +168,7 @@ def test_labels_under_gaussians_and_the_way_they_end() -> None:
     assert gradient[0, 0] < 0 < gradient[1, 0]
 
 
-def test_a_fog_of_labels_tells_them_apart() -> None:
+def test_a_fog_of_labels_distinguishes_them() -> None:
     table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8})
     assert len({label.color[0] for label in table.labels}) == 3
     assert [label.opacity > 0 for label in table.labels] == [True, True, False]

@@ -19,8 +19,8 @@ from tests.test_page_live import compare, options
 from vvgt_cli.commands.live_site import Cloud
 from vvgt_cli.conversion.place import in_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.live import Palette, Several, Table, baked, shown_by
-from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.volume import Volume
 
 TF = {"points": [{"x": 0.2, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.9, "rgb": [0, 1, 0], "opacity": 0.8}]}
@@ -42,10 +42,10 @@ def layered(count: int = 40) -> Gaussians:
 def test_each_layer_is_looked_up_in_its_own_table() -> None:
     some = layered()
     tables = (Table.of_function(WINDOW, LO, 80, 0.05, GRAIN), Palette.of_labels(LABELS, 0.02))
-    together = shown_by(some, Several(tables))
+    together = apply_look(some, LayerTables(tables))
     for number, table in enumerate(tables):
         own = np.flatnonzero(some.live[:, 7] == number)  # type: ignore[index]
-        alone = shown_by(some.take(own), table)
+        alone = apply_look(some.take(own), table)
         np.testing.assert_array_equal(alone.means, together.means[own])
         np.testing.assert_array_equal(alone.opacity_logits, together.opacity_logits[own])
         np.testing.assert_array_equal(alone.colors, together.colors[own])
@@ -55,11 +55,11 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
     """Values over one range, values over another one, and labels."""
     some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
     assert some.live is not None
-    some.live[:, NUMBER] = np.arange(60) % 3
-    some.live[some.live[:, NUMBER] < 2, ROW] = 0
-    some.live[:, ROW] %= len(LABELS)
+    some.live[:, LAYER_ID] = np.arange(60) % 3
+    some.live[some.live[:, LAYER_ID] < 2, LABEL_ROW] = 0
+    some.live[:, LABEL_ROW] %= len(LABELS)
     first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
-    table = Several(
+    table = LayerTables(
         (
             Table.of_function(WINDOW, LO, HI, 0.05, GRAIN),
             Table.of_function(values().tf("pet"), -5, 160, 0.025, GRAIN),
@@ -79,10 +79,10 @@ def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.live[:, [0, 1, 2, 6, 7]], some.live[:, [0, 1, 2, 6, 7]])  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(whole[:-1] + b"\x07")
-    with pytest.raises(vvgt_library.DataError, match="a layer of number 7"):
+    with pytest.raises(vvgt_library.DataError, match="layer number 7"):
         read_ply(tmp_path / "b.ply")
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live layer 0.25", b"live layer zero", 1))
-    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
         read_ply(tmp_path / "c.ply")
     scalars = replace(several(), others=(replace(values(RAMP), name="pet", distance=1.0),))
     live = some.live.copy()  # type: ignore[union-attr]

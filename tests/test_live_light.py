@@ -17,7 +17,7 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.harmonics import basis, view_colors
-from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
+from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
 from vvgt_cli.look.lighting import Lighting, LightOptions
 
 SIDE = Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
@@ -71,7 +71,7 @@ def test_a_light_turns_with_its_gaussians() -> None:
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
-        return relight(shown_by(gaussians, table), gaussians.live[:, 3:], light)
+        return relight(apply_look(gaussians, table), gaussians.live[:, 3:], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
     for light, other in ((SIDE, turned), (HEAD, HEAD)):
@@ -91,7 +91,7 @@ def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_recolor_lights_as_it_is_told_and_else_as_the_file_is_lit(vvgt, lit_file, tmp_path) -> None:
+def test_recolor_uses_the_given_light_or_else_that_of_the_file(vvgt, lit_file, tmp_path) -> None:
     _, header = read_ply(lit_file)
     assert (header.light, header.sh_degree) == (Lighting(), 2)
     found = {}
@@ -146,7 +146,7 @@ def test_what_is_opaque_lies_flat_in_its_surface() -> None:
     some = Gaussians(
         np.zeros((2, 3)), np.full((2, 3), np.log(0.1)), [[1, 0, 0, 0]] * 2, [0.0] * 2, [[1, 1, 1]] * 2, live=live
     )
-    shown = shown_by(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
+    shown = apply_look(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     axes = rotations(shown.quaternions.astype(float)) * np.exp(shown.log_scales.astype(float))[:, None, :]
     variances, turned = np.linalg.eigh(axes[0] @ axes[0].T)
     wanted = 0.01 * np.array([SHARP, FLAT, FLAT])

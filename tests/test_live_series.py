@@ -19,7 +19,7 @@ from tests.test_page_live import PLANES
 from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.live import from_bytes
-from vvgt_cli.gaussians.formats.page_live import in_common, renumbered
+from vvgt_cli.gaussians.formats.page_live import renumbered, shared_facts
 
 SMALL = ("--max-gaussians", 90, "--size", 48)
 
@@ -138,7 +138,7 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
             np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
 
 
-def test_a_layer_that_is_empty_in_a_frame_is_left_out_of_it(vvgt, tmp_path) -> None:
+def test_a_layer_that_is_empty_in_a_frame_is_skipped_there(vvgt, tmp_path) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
     ball, low = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32), (z < -0.5).astype(np.uint8)
     for k in range(3):
@@ -164,15 +164,15 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     """Labels of each frame are renumbered in their own layer alone."""
     value, named = several().layers
     first, second = (replace(value, others=(replace(named, labels=some),)) for some in (LABELS[:2], LABELS[1:]))
-    both = in_common([first, second])
+    both = shared_facts([first, second])
     assert both is not None
     assert both.layers == (value, replace(named, labels=LABELS))
     for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
-        assert in_common([first, other]) is None
+        assert shared_facts([first, other]) is None
     assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
     assert renumbered(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
     other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
-    both = in_common([first, replace(value, others=(other,))])
+    both = shared_facts([first, replace(value, others=(other,))])
     assert both is not None
     assert [(label.number, label.name) for label in both.others[0].labels] == [
         (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),

@@ -140,7 +140,7 @@ def test_files_of_before_are_read_and_moved_ones_refused(tmp_path):
     for change in (before, as_matrix):
         assert read(changed(content, change), "a").means == pytest.approx(gaussians.means)
     for key, value in (("translation", [0, 0, 1]), ("rotation", [0, 0, 0, 1]), ("scale", [1, 1, 2])):
-        with pytest.raises(DataError, match="placed otherwise"):
+        with pytest.raises(DataError, match="moved by another program"):
             read(changed(content, lambda node, key=key, value=value: node.update({key: value})), "a")
 
 

@@ -73,7 +73,7 @@ def test_lines_along_either_axis_count_alike():
     assert across[1] == pytest.approx(0.02 / np.sqrt(2), rel=0.3)  # of two axes one has it
 
 
-def test_what_cannot_be_told_is_refused():
+def test_what_cannot_be_measured_is_refused():
     for image, period in ((np.zeros((64, 32)), 8.0), (np.zeros((64, 64)), 20.0), (np.zeros((64, 64)), 2.0)):
         with pytest.raises(ValueError, match="period"):
             lattice(image, period)

@@ -52,7 +52,7 @@ def test_foreground_is_where_the_reference_has_alpha():
     assert scores.psnr_alpha == pytest.approx(20 - 10 * np.log10(share), abs=1e-4)
 
 
-def test_views_without_foreground_are_counted_and_left_out():
+def test_views_without_foreground_are_counted_and_excluded():
     reference = views(3)
     reference[1] = 0
     reference[1, 3, 3] = 0.005  # below the threshold
@@ -80,7 +80,7 @@ def test_identical_views_and_json():
     assert record["per_view"][1]["psnr"] == CAP
 
 
-def test_perceptual_numbers_are_left_out_when_not_asked_for_or_impossible():
+def test_perceptual_scores_are_none_when_not_requested_or_impossible():
     reference = views(1)
     scores = score_views(reference, reference, perceptual=False)
     assert scores.ssim is None
@@ -106,9 +106,9 @@ def test_views_are_read_one_at_a_time():
 
 def test_views_that_do_not_fit_are_refused():
     reference = views(2)
-    with pytest.raises(DataError, match="more views in the reference"):
+    with pytest.raises(DataError, match="more reference views"):
         score_views(reference, reference[:1])
-    with pytest.raises(DataError, match="fewer views in the reference"):
+    with pytest.raises(DataError, match="fewer reference views"):
         score_views(reference[:1], reference)
     with pytest.raises(DataError, match="same"):
         score_views(reference, reference[..., :3])

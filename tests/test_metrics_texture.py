@@ -38,7 +38,7 @@ def test_a_wave_on_a_flat_field_is_its_amplitude_over_root_two(wavelength):
     assert found.ours_worst >= found.ours
 
 
-def test_a_lattice_of_gaussians_ripples_as_the_formula_says():
+def test_a_lattice_of_gaussians_ripples_as_in_the_formula():
     """2 exp(-2 pi^2 (s / a)^2) of the mean, along one axis."""
     edge, mean = 12.0, 100.0
     for wide, ripple in ((0.4, 0.0850), (0.5, 0.01439), (0.6, 0.00164)):

@@ -107,7 +107,7 @@ def test_bad_calls_are_one_line(ply, tmp_path, vvgt, monkeypatch):
     assert "read" not in result.err.replace(result.error, "")
 
 
-def test_what_ffmpeg_cannot_do_is_told(tmp_path):
+def test_errors_of_ffmpeg_are_reported(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
 
     def pictures():

@@ -37,7 +37,7 @@ def one() -> Gaussians:
     return Gaussians(POINT[None], -4 * ones, np.array([[1, 0, 0, 0]], np.float32), ones[:, 0], ones)
 
 
-def test_a_page_says_how_far_what_is_seen_reaches() -> None:
+def test_a_page_states_the_extent_of_visible_gaussians() -> None:
     """Of all of its clouds, in the viewer's axes; not what is too faint to be seen."""
     rng = np.random.default_rng(3)
     means = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
@@ -98,7 +98,7 @@ def test_the_page_knows_the_place_and_the_letters(up: str, tmp_path: Path) -> No
         np.testing.assert_allclose(sign * axes["xyz".index(up[-1])], [0, 1, 0], atol=1e-12)
 
 
-def test_files_without_a_space_have_their_own_axes(tmp_path: Path) -> None:
+def test_files_without_an_anatomical_space_use_the_volume_axes(tmp_path: Path) -> None:
     told = PlyOptions(scale=SCALE, centre=CENTRE, space="none", affine=AFFINE, length_unit="um")
     found = world_of(splats_of(one(), upright(told)), tmp_path)
     assert (found["unit"], found["letters"][0], found["anatomical"]) == ("µm", ["−x", "x"], False)

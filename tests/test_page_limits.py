@@ -55,7 +55,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("what", DAMAGED)
-def test_a_damaged_page_says_one_line(someone: Person, blob: Path, what: str, tmp_path: Path) -> None:
+def test_a_damaged_page_shows_one_line(someone: Person, blob: Path, what: str, tmp_path: Path) -> None:
     def damage(found: re.Match[str]) -> str:
         return f"{found[1]}{base64.b64encode(DAMAGED[what](base64.b64decode(found[2]))).decode()}"
 

@@ -24,8 +24,8 @@ from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_live import PLANES, nodes_of, planes_of
 from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
-from vvgt_cli.gaussians.live import Looks, Table, baked, shown_by
-from vvgt_cli.gaussians.live_facts import ROW
+from vvgt_cli.gaussians.live import Looks, Table, apply_look, baked
+from vvgt_cli.gaussians.live_facts import LABEL_ROW
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 
 STEP = TransferFunction("step", PiecewiseOpacity(np.array([0.0, 20, 20, 60]), np.array([0.0, 0.1, 0.8, 0.3])), COLORS)
@@ -154,7 +154,7 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
     wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
     assert carried is not None
     assert wanted.live is not None
-    np.testing.assert_array_equal(wanted.live[:, ROW:], carried[:, ROW:])
+    np.testing.assert_array_equal(wanted.live[:, LABEL_ROW:], carried[:, LABEL_ROW:])
     axes = rotations(wanted.quaternions.astype(float)) * np.exp(wanted.log_scales.astype(float))[:, None, :]
     flip = np.array([-1.0, -1, 1])  # the viewer has PLY (x, y, z) at (-x, -y, z)
     given = {"live": scene["live"], "bytes": list(planes), "centers": (wanted.means * flip).tolist()}
@@ -177,7 +177,7 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
     )
     subprocess.run(["node", "run.mjs"], cwd=folder, check=True, timeout=120)
     found = json.loads((folder / "found.json").read_text())
-    ours = shown_by(wanted, table, pixel_width(300))
+    ours = apply_look(wanted, table, pixel_width(300))
     alpha = 1 / (1 + np.exp(-ours.opacity_logits.astype(float)))
     axes = rotations(ours.quaternions.astype(float)) * np.exp(ours.log_scales.astype(float))[:, None, :]
     for k, one in enumerate(found):

@@ -208,7 +208,7 @@ def test_a_baked_page_is_uncovered_too(person: Person, tmp_path: Path) -> None:
         uncovered(person, person.picture(tmp_path, f"{name}.png"))
 
 
-def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path: Path) -> None:
+def test_the_scale_bar_has_the_length_of_its_label(dots: str, person: Person, tmp_path: Path) -> None:
     person("open", dots)
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
     away = 3 * max(person.size) / min(person.size)  # both are in the window, whichever way

@@ -118,11 +118,11 @@ def test_counts_of_blocks_add_up_to_the_statistics(tmp_path, dtype, factor, scal
         values[3, 4, 5:9], values[0, 0, 0] = np.nan, np.inf
     np.save(tmp_path / "v.npy", values)
     volume = replace(read_volume(str(tmp_path / "v.npy")), slope=float(scale[0]), intercept=float(scale[1]))
-    parts = [volume.data[a:b].copy() for a, b in ((11, 25), (0, 3), (3, 11))]
-    whole = tally(parts[0], volume).plus(tally(parts[1], volume)).plus(tally(parts[2], volume))
+    store = [volume.data[a:b].copy() for a, b in ((11, 25), (0, 3), (3, 11))]
+    whole = tally(store[0], volume).plus(tally(store[1], volume)).plus(tally(store[2], volume))
     whole, histogram = with_limits(whole, volume), None
     if not counted(volume):
-        histogram = sum(tally(part, volume, (whole.lo, whole.hi)).histogram for part in parts)
+        histogram = sum(tally(part, volume, (whole.lo, whole.hi)).histogram for part in store)
     ours, theirs = statistics_of(whole, volume, histogram), statistics(volume)
     assert (ours.lo, ours.hi, ours.nan_count, ours.inf_count) == (
         theirs.lo,
@@ -228,7 +228,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     assert "expected full, or 0 to 2" in run.err
     run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
     assert run.code == 2
-    assert "no OME-Zarr, N5 or Imaris image" in run.err
+    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run.err
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
@@ -285,17 +285,17 @@ def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_p
 
 
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
+    from vvgt_cli.field.block_store import COUNTS, BlockStore
     from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
-    from vvgt_cli.field.parts import COUNTS, Parts
     from vvgt_cli.field.reader import Place
 
     merged = []
     for slices in (1, 7, 80):
-        parts = Parts(tmp_path / str(slices))
-        (parts.folder / COUNTS).mkdir(parents=True)
+        store = BlockStore(tmp_path / str(slices))
+        (store.folder / COUNTS).mkdir(parents=True)
         task = CountBlocks(
-            Place(str(raw), ReadOptions(stored=True)), Boxes((100, 90, 80), (64, 64, 64)), slices, parts, COUNTS
+            Place(str(raw), ReadOptions(stored=True)), Boxes((100, 90, 80), (64, 64, 64)), slices, store, COUNTS
         )
         for number in range(len(task)):
             task(number)

@@ -100,10 +100,10 @@ def stored(dims, dtype, read=None, chunk=64):
 
 def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     from vvgt_cli.field import reader
+    from vvgt_cli.field.block_store import COUNTS, BlockStore
     from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
     from vvgt_cli.field.layered import Content
-    from vvgt_cli.field.parts import COUNTS, Parts
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 
@@ -112,11 +112,11 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
         return values[slices].copy()
 
     volume = stored((100, 90, 80), np.float32, part)
-    monkeypatch.setattr(reader, "open_parts", lambda source, options: Content((volume,)))
-    parts = Parts(tmp_path)
-    (parts.folder / COUNTS).mkdir()
+    monkeypatch.setattr(reader, "open_content", lambda source, options: Content((volume,)))
+    store = BlockStore(tmp_path)
+    (store.folder / COUNTS).mkdir()
     place = reader.Place("counted once", ReadOptions(stored=True))
-    task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24, parts, COUNTS)
+    task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24, store, COUNTS)
     for number in range(len(task)):
         task(number)
     assert values.size <= sum(read) < 1.1 * values.size
@@ -142,19 +142,19 @@ def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):
     import weakref
 
-    from vvgt_cli.field import forest
+    from vvgt_cli.field import tiled_tree
 
     values, made = np.round(bodies((128, 90, 120)) * 255).astype(np.uint8), []
     path = tmp_path / "v_128x90x120_uint8.raw"
     path.write_bytes(values.tobytes())
 
-    def watched(*args, build=forest.build_tree):
+    def watched(*args, build=tiled_tree.build_tree):
         assert sum(one() is not None for one in made) <= 1  # the one before
         tree = build(*args)
         made.append(weakref.ref(tree.moments))
         return tree
 
-    monkeypatch.setattr(forest, "build_tree", watched)
+    monkeypatch.setattr(tiled_tree, "build_tree", watched)
     run = vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     assert run.code == 0, run.err
     assert len(made) > 6

@@ -79,7 +79,7 @@ def decoded(files: dict[str, bytes], i: int) -> tuple[list[float], ...]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_pixel_says_what_the_engine_takes_it_for(degree: int) -> None:
+def test_every_pixel_decodes_as_in_the_engine(degree: int) -> None:
     before = some(70, degree)
     content = sog(before, "a")
     files, after = members(content), read_sog(content, "a")
@@ -185,7 +185,7 @@ def changed(change: Callable[[Any], None]) -> bytes:
         (lambda m: m.update(count=5000), "is of 8 x 8 px; expected 5000 px"),
         (lambda m: m["means"].update(maxs=[1, 2]), "no maxs of means"),
         (lambda m: m["means"].update(maxs=[1, 2, 500]), "float32"),
-        (lambda m: m["means"].update(files="means_l.webp"), "names no images of means"),
+        (lambda m: m["means"].update(files="means_l.webp"), "does not name the images of means"),
         (lambda m: m["means"].update(files=["../../etc/passwd", "x"]), "no '../../etc/passwd' in the archive"),
         (lambda m: m["scales"].update(codebook=[0.0] * 255), "no codebook of scales"),
         (lambda m: m["scales"].update(codebook=[10**400] * 256), "no codebook of scales"),

@@ -22,9 +22,9 @@ from vvgt_cli.conversion.shards.apart import errors_apart
 from vvgt_cli.conversion.shards.ladder import Ladder
 from vvgt_cli.conversion.shards.streamed_files import Files, Level
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.formats.levels import Levels
+from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
 from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
@@ -225,7 +225,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
         random, level = np.random.default_rng(seed), Level(0)
         columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 3)]
         logits, rest = columns[0][:, 0], np.zeros((50, 0, 3), np.float32)
-        files = Files(tmp_path, Parts(tmp_path / name), "written")
+        files = Files(tmp_path, BlockStore(tmp_path / name), "written")
         files.add(level, Splats(*columns[:3], logits, columns[3], rest))
         files.write(level)
         assert level.bytes == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())
@@ -239,7 +239,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
     assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
-def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
+def test_an_existing_folder_is_replaced_only_on_request(vvgt, volume: Path, folder: Path) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     manifest["filenames"].append("3_7/meta.json")
     (folder / "lod-meta.json").write_text(json.dumps(manifest))
@@ -284,7 +284,7 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
         assert ask(url, f"{path}../secret")[0] == 404
 
 
-def test_a_folder_with_a_file_missing_is_told(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_a_folder_with_a_missing_file_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
@@ -339,7 +339,7 @@ def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path
 
 
 def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: Path) -> None:
-    levels = Levels(folder / "lod-meta.json")
+    levels = StreamedLevels(folder / "lod-meta.json")
     counts, nodes = (
         [len(levels.level(str(level))) for level in range(levels.count)],
         nodes_of(read_manifest(levels.path), ""),
@@ -364,17 +364,17 @@ def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: P
 
 
 def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    levels, read = Levels(folder / "lod-meta.json"), []
+    levels, read = StreamedLevels(folder / "lod-meta.json"), []
     counted = lambda meta, image, name: read.append(name) or splats_in(meta, image, name)  # noqa: E731
     monkeypatch.setattr("vvgt_cli.gaussians.formats.levels.splats_in", counted)
     for distance, shown in ((1e6, {levels.count - 1}), (1e6, set()), (0.0, {0})):
         read.clear()
         seen = levels.seen_from(np.array([0, -distance, 0]), 45.0)
         assert ({int(Path(name).parent.name.split("_")[0]) for name in read}, len(read)) == (shown, len(set(read)))
-        assert sum(map(len, levels._shown.values())) == len(seen)
+        assert sum(map(len, levels._cached.values())) == len(seen)
 
 
-def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_levels_that_cannot_be_read_are_reported_in_one_line(vvgt, folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "b"
     shutil.copytree(folder, broken)
     (broken / "1_0" / "sh0.webp").unlink()

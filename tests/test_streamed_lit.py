@@ -12,7 +12,7 @@ from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
 from vvgt_cli.closed_form.lit import base_rows
 from vvgt_cli.conversion.shards.merge import pyramid
 from vvgt_cli.conversion.shards.plan import Plan, load_light
-from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.formats import read_splats
 
@@ -73,14 +73,14 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
     assert all(other == one for other in others)
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]
     assert files[0] == files[1]
-    plan = Plan.load(parts := Parts(tmp_path / "parts"))
-    forest, _ = pyramid(parts, plan, load_light(parts, plan))
-    top = forest.top
+    plan = Plan.load(store := BlockStore(tmp_path / "parts"))
+    tiled_tree, _ = pyramid(store, plan, load_light(store, plan))
+    top = tiled_tree.top
     assert top is not None
-    (root,) = forest.leaves(np.finfo(float).max)
+    (root,) = tiled_tree.leaves(np.finfo(float).max)
     first, last = base_rows(top, np.array([len(top) - 1]))
-    assert (first[0], last[0]) == (0, len(forest.tiles))
-    tiles = [cuts[0].moments[0] for cuts in forest.cuts(np.full((len(forest.tiles), 1), np.finfo(float).max))]
+    assert (first[0], last[0]) == (0, len(tiled_tree.tiles))
+    tiles = [cuts[0].moments[0] for cuts in tiled_tree.cuts(np.full((len(tiled_tree.tiles), 1), np.finfo(float).max))]
     seen = np.array([row[SEEN] for row in tiles])
     np.testing.assert_allclose(root.moments[0, : MASS + 1], np.sum([row[: MASS + 1] for row in tiles], axis=0))
     np.testing.assert_allclose(
@@ -102,7 +102,7 @@ def test_normals_of_a_merged_file_point_along_the_gradient(vvgt, volume: Path, t
     assert np.median(cosines) > 0.97
 
 
-def test_a_damaged_light_is_told(vvgt, volume: Path, tmp_path: Path) -> None:
+def test_a_damaged_light_is_reported(vvgt, volume: Path, tmp_path: Path) -> None:
     line = ("init", volume, *FIT, *LIGHTS["head"], "--blocks", "64", "--shard", "1/1", "-o", tmp_path / "parts")
     assert vvgt(*line).code == 0
     (tmp_path / "parts" / "light.npz").write_bytes(b"PK")

@@ -80,7 +80,7 @@ def test_a_volume_written_as_nrrd_reads_back(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["tubes", "stratified"])
-def test_the_command_writes_what_it_says(kind, tmp_path, vvgt):
+def test_the_command_writes_what_it_reports(kind, tmp_path, vvgt):
     more = [] if kind == "tubes" else ["--turnovers", "0.1"]
     result = vvgt("synth", kind, "--size", 16, "--seed", 3, *more, "-o", tmp_path / "v.nrrd")
     assert result.code == 0, result.err
@@ -114,7 +114,7 @@ def test_a_shape_of_no_size():
         make_shape("noise", 4)
 
 
-def test_a_file_is_not_overwritten_and_its_name_says_what_it_is(tmp_path, vvgt):
+def test_a_file_is_not_overwritten_and_its_name_describes_it(tmp_path, vvgt):
     (tmp_path / "v.nrrd").write_text("mine")
     assert "--overwrite" in vvgt("synth", "noise", "--size", 8, "-o", tmp_path / "v.nrrd").error
     assert (tmp_path / "v.nrrd").read_text() == "mine"

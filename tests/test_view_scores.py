@@ -59,7 +59,7 @@ def test_the_console_hears_that_what_has_no_live_form_is_not_scored(capsys: pyte
     assert "not scored: no memory" in capsys.readouterr().err
 
 
-def test_the_end_of_a_process_that_scores_is_told() -> None:
+def test_the_end_of_a_scoring_process_is_reported() -> None:
     messages: list[Message] = []
 
     def hear(number: int, message: Message) -> None:

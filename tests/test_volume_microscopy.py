@@ -16,7 +16,7 @@ from tests import microscopes
 from tests.microscopes import COLORS, NAMES, SPACING, cells
 from tests.test_labels import SMALL
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError
-from vvgt_cli.field.layered import open_parts
+from vvgt_cli.field.layered import open_content
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import level_shapes
@@ -49,7 +49,7 @@ def test_values_place_names_and_colours(tmp_path: Path, write: Callable, name: s
     values = cells(times=2)
     write(tmp_path / name, values)
     path = str(tmp_path / name)
-    content = open_parts(path, ReadOptions(time=1))
+    content = open_content(path, ReadOptions(time=1))
     assert list(content.names) == list(NAMES)
     np.testing.assert_allclose(content.colors, COLORS)
     spacing = SPACING if name != "a.nd2" else (SPACING[0], SPACING[0], SPACING[2])  # which has one number for x and y
@@ -313,7 +313,7 @@ def test_all_channels_in_the_colours_of_the_file(vvgt, tmp_path: Path, write: Ca
         assert done.code == 0, done.err
         told = {str(note.message) for note in notes if "all shown" in str(note.message)}
         assert told == {
-            f"{(tmp_path / name)}: 2 channels, all shown: 0 'DAPI' #ff0000, 1 'GFP' #00ffff (--channel N: one of them)"
+            f"{(tmp_path / name)}: 2 channels, all shown: 0 'DAPI' #ff0000, 1 'GFP' #00ffff (try --channel N for one)"
         }
         made[blocks] = read_ply(str(out))[0]
     for gaussians in made.values():
@@ -350,4 +350,4 @@ def test_many_channels_and_vectors_stay_a_choice(tmp_path: Path) -> None:
     np.save(tmp_path / "vector.npy", np.zeros((3, 8, 9, 2), np.float32))
     for name in ("many.ome.tif", "vector.npy"):
         with pytest.raises(UsageError, match=r"component|channel"):
-            open_parts(str(tmp_path / name), ReadOptions())
+            open_content(str(tmp_path / name), ReadOptions())

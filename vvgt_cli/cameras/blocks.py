@@ -1,4 +1,4 @@
-"""Blocks of pixels that stand for a large picture: errors are measured there for what a small one costs."""
+"""Blocks of pixels that represent a large picture, so that measuring its error costs as little as for a small one."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BLOCK = 16  # pixels along an edge: the tile of the ray caster and of the splatter
-ENOUGH = 625  # blocks: as many as a picture of 400 px has
-FEW = 250  # blocks that tell the better of two results, and from where one looks worst
+BLOCK = 16  # pixels along an edge: the tile of the ray caster and the splat renderer
+ENOUGH = 625  # blocks: as many as in a picture of 400 px
+FEW = 250  # blocks that suffice to compare two results, or to find the worst view of one
 GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Some of the blocks that tile a picture from its upper left corner.
+    """A subset of the blocks that tile a picture from its upper left corner.
 
     Attributes:
-        width, height: of the picture in pixels.
-        numbers: (n,) int64 blocks in row-major order of ceil(width / 16) a row; all lie wholly inside.
+        width, height: size of the picture in pixels.
+        numbers: (n,) int64 block numbers, row-major with ceil(width / 16) per row; all blocks lie inside the picture.
     """
 
     width: int
@@ -26,7 +26,7 @@ class Blocks:
     numbers: np.ndarray
 
     def mask(self) -> np.ndarray:
-        """(height, width) bool: pixels of the blocks."""
+        """Return the mask (height, width) of the blocks' pixels."""
         rows, across = -(-self.height // BLOCK), -(-self.width // BLOCK)
         chosen = np.zeros(rows * across, bool)
         chosen[self.numbers] = True
@@ -34,7 +34,7 @@ class Blocks:
         return np.ascontiguousarray(wide[: self.height, : self.width])  # as kernels are compiled for
 
     def pick(self, image: np.ndarray) -> np.ndarray:
-        """The blocks of an image (h, w, c) below each other: (16 n, 16, c)."""
+        """Stack the blocks of an image (h, w, c) vertically, (16 n, 16, c)."""
         across = -(-self.width // BLOCK)
         top, left = self.numbers // across * BLOCK, self.numbers % across * BLOCK
         inside = np.arange(BLOCK)
@@ -43,10 +43,10 @@ class Blocks:
 
 
 def spread_blocks(width: int, height: int, shift: int = 0, enough: int = ENOUGH) -> Blocks | None:
-    """About ``enough`` blocks on a lattice over the picture; None where that would be nearly all of it.
+    """Return about ``enough`` blocks on a lattice over a picture, None if that is nearly all of it.
 
-    Every s-th block of the first row, and from row to row the golden part of s further, so that no line or column of
-    the picture is left out; ``shift`` takes others of the s sets (of other views, say), as many.
+    The lattice has every s-th block of a row, shifted from row to row by the golden section of s so that it covers all
+    rows and columns; ``shift`` selects one of s disjoint lattices, for example another one per view.
     """
     rows, across = height // BLOCK, width // BLOCK
     every = round(rows * across / enough)

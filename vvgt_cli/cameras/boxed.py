@@ -1,7 +1,7 @@
-"""Cameras of the unit frame taken to the box frame, where scenes lie along their index axes.
+"""Conversion of cameras from the unit frame to the box frame, in which the scene is aligned with its index axes.
 
-A pinhole sees straight lines, so a turn of the scene is a turn of the camera. What a reflection makes of a scene no
-camera sees, but its mirror image: the picture is turned round afterwards.
+Rotating the scene is the same as rotating the camera. A reflected scene is rendered as its mirror image, and the
+picture is flipped afterwards.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import numpy as np
 
 from vvgt_cli.cameras.types import Camera
 
-_MIRROR = np.array([-1.0, 1.0, 1.0])  # of camera axes: left and right exchanged
+_MIRROR = np.array([-1.0, 1.0, 1.0])  # swaps left and right in camera axes
 
 
-def boxed(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
-    """The camera that sees in the box frame what ``camera`` sees in the unit frame.
+def to_box_frame(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
+    """Return the camera that sees in the box frame what ``camera`` sees in the unit frame.
 
     Args:
-        camera: in the unit frame.
-        axes: (3, 3) with ``unit = axes @ box``; orthogonal, else its nearest orthogonal matrix is taken.
+        camera: camera in the unit frame.
+        axes: (3, 3) with ``unit = axes @ box``; the nearest orthogonal matrix is used.
 
     Returns:
-        (camera, mirrored): whether left and right of its picture are to be exchanged.
+        (camera, mirrored): the camera, and whether its picture must be flipped horizontally.
     """
     if np.array_equal(axes, np.eye(3)):
         return camera, False
@@ -39,10 +39,10 @@ def boxed(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
 
 
 def render_in_box(draw: Callable[[Camera], np.ndarray], axes: np.ndarray) -> Callable[[Camera], np.ndarray]:
-    """What draws pictures (h, w, ...) for cameras of the unit frame, from what draws them in the box frame."""
+    """Convert a renderer of pictures (h, w, ...) for cameras in the box frame to one for cameras in the unit frame."""
 
     def image(camera: Camera) -> np.ndarray:
-        inside, mirrored = boxed(camera, axes)
+        inside, mirrored = to_box_frame(camera, axes)
         picture = draw(inside)
         return np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture
 

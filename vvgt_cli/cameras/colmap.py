@@ -1,7 +1,7 @@
-"""View sets as COLMAP keeps them: `cameras.bin`, `images.bin` and `points3D.bin`; and points as a `.ply`.
+"""View sets in COLMAP's format, `cameras.bin`, `images.bin` and `points3D.bin`, and points as a `.ply`.
 
-COLMAP's conventions are ours: world-to-camera poses, OpenCV axes, the upper left pixel's centre at (0.5, 0.5).
-Layout of the files: COLMAP's documentation, "Output Format", binary.
+COLMAP has the same conventions as vvgt: world-to-camera poses, OpenCV axes, the upper left pixel's centre at (0.5,
+0.5). The layout is that of COLMAP's documentation, "Output Format", binary.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy
 def colmap_model(
     cameras: Sequence[Camera], names: Sequence[str], points: np.ndarray, colors: np.ndarray
 ) -> dict[str, bytes]:
-    """The three files of a COLMAP model by name; points are seen by no image (tracks are empty).
+    """Return the three files of a COLMAP model by name; the points have empty tracks.
 
     Args:
-        cameras: views; those that share a lens share a COLMAP camera.
+        cameras: views; views with the same lens share a COLMAP camera.
         names: image files, relative to COLMAP's folder of images.
         points: (n, 3) positions, unit frame.
         colors: (n, 3) RGB in [0, 1], clipped.
@@ -48,9 +48,9 @@ def colmap_model(
 
 
 def point_cloud_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
-    """A `.ply` point cloud: x y z nx ny nz (float, normals zero) and red green blue (uchar), little-endian.
+    """Return a `.ply` point cloud: x y z nx ny nz (float, normals zero) and red green blue (uchar), little-endian.
 
-    In that order nerfstudio, OpenSplat and the original 3DGS code (which insists on normals) all read it.
+    In this order, nerfstudio, OpenSplat and the original 3DGS code (which requires normals) can all read it.
 
     Args:
         points: (n, 3) positions, unit frame.
@@ -65,9 +65,9 @@ def point_cloud_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
 
 
 def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
 
-    Bar-Itzhack (2000): the eigenvector of a symmetric matrix, well conditioned for every angle.
+    It is the eigenvector of a symmetric matrix, well conditioned for every angle (Bar-Itzhack 2000).
     """
     r = np.asarray(rotation, dtype=np.float64)
     k = np.array(

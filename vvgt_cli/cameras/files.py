@@ -1,7 +1,7 @@
-"""View sets in files: nerfstudio's `transforms.json`, and the Blender style that it grew from.
+"""View sets in files: nerfstudio's `transforms.json`, and the Blender style that it is derived from.
 
-Matrices are OpenGL camera-to-world (+x right, +y up, looking along -z); ours are OpenCV world-to-camera. World is
-the unit frame, which is what `vvgt` writes unless told otherwise.
+Matrices in files are OpenGL camera-to-world (+x right, +y up, looking along -z); those of `Camera` are OpenCV
+world-to-camera. The world is the unit frame, which is what `vvgt` writes by default.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def camera_to_opengl(camera: Camera) -> np.ndarray:
-    """OpenGL camera-to-world matrix (4, 4) float64 of an OpenCV world-to-camera pose."""
+    """Return the OpenGL camera-to-world matrix (4, 4) float64 of an OpenCV world-to-camera pose."""
     matrix = np.eye(4)
     matrix[:3, :3] = camera.rotation.T @ OPENGL
     matrix[:3, 3] = camera.position
@@ -34,7 +34,7 @@ def camera_to_opengl(camera: Camera) -> np.ndarray:
 
 
 def opengl_to_pose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV world-to-camera rotation (3, 3) and translation (3,) of an OpenGL camera-to-world matrix (4, 4)."""
+    """Return the OpenCV world-to-camera rotation (3, 3) and translation (3,) of an OpenGL camera-to-world matrix."""
     rotation = OPENGL @ matrix[:3, :3].T
     return rotation, -rotation @ matrix[:3, 3]
 
@@ -45,8 +45,8 @@ class Frame:
 
     Attributes:
         camera: pose and lens, unit frame.
-        file_path: its image as the file has it; the Blender style leaves the suffix out.
-        test: whether the file keeps it for testing (nerfstudio's ``test_filenames``).
+        file_path: its image as named in the file, in the Blender style without the suffix.
+        test: whether the file reserves it for testing (nerfstudio's ``test_filenames``).
     """
 
     camera: Camera
@@ -61,15 +61,15 @@ def transforms_json(
     paths: Sequence[str] | None = None,
     splits: dict[str, list[str]] | None = None,
 ) -> str:
-    """The text of a `transforms.json` for ``cameras``; images are ``NAME.png`` beside it.
+    """Return the text of a `transforms.json` for ``cameras``.
 
-    Intrinsics stand at the top where all cameras share them, and in each frame where they do not.
+    Intrinsics are written once if all cameras share them, else per frame.
 
     Args:
-        cameras: in the order of the frames.
-        ply_file_path: point cloud to start from (nerfstudio, OpenSplat).
-        paths: images in place of ``NAME.png``.
-        splits: nerfstudio's split: ``{"train": paths, "val": paths, "test": paths}``.
+        cameras: cameras in the order of the frames.
+        ply_file_path: initial point cloud (nerfstudio, OpenSplat).
+        paths: image paths, by default ``NAME.png`` next to the file.
+        splits: nerfstudio's splits: ``{"train": paths, "val": paths, "test": paths}``.
     """
     paths = [f"{camera.name}.png" for camera in cameras] if paths is None else paths
     document: dict[str, Any] = {"camera_model": "OPENCV"}
@@ -80,9 +80,9 @@ def transforms_json(
 
 
 def blender_json(cameras: Sequence[Camera], paths: Sequence[str]) -> str:
-    """The text of a Blender-style `transforms_train.json`: ``camera_angle_x``, and image paths without a suffix.
+    """Return the text of a Blender-style `transforms_train.json`, with ``camera_angle_x`` and paths without suffix.
 
-    Size and focal lengths stand beside the angle, for readers that know them.
+    Sizes and focal lengths are written too, for programs that read them.
     """
     angle = [{"camera_angle_x": 2 * math.atan(c.width / (2 * c.fx))} for c in cameras]
     lenses = [a | _lens_record(camera) for a, camera in zip(angle, cameras, strict=True)]
@@ -106,20 +106,20 @@ def _document(
 
 
 def read_cameras(path: str | Path, size: int | None = None) -> list[Camera]:
-    """Cameras of a `transforms.json`, as `read_frames` has them."""
+    """Read the cameras of a `transforms.json`; see `read_frames`."""
     return [frame.camera for frame in read_frames(path, size)]
 
 
 def read_frames(path: str | Path, size: int | None = None) -> list[Frame]:
-    """Views of a `transforms.json` (nerfstudio or Blender style), in the file's order.
+    """Read the views of a `transforms.json` (nerfstudio or Blender style), in the file's order.
 
     Args:
         path: the file.
-        size: image height in pixels; views are scaled to it. Needed where the file holds no ``w`` and ``h``.
+        size: image height in pixels that views are scaled to; required if the file has no ``w`` and ``h``.
 
     Raises:
-        DataError: not JSON, no frames, a lens with distortion, a pose that is not a rigid motion, no image size,
-            two images of one name.
+        DataError: the file is not JSON or has no frames, a lens has distortion, a pose is not a rigid motion, the image
+            size is missing, or two images have the same name.
     """
     name = Path(path).name
     try:
@@ -134,10 +134,10 @@ def read_frames(path: str | Path, size: int | None = None) -> list[Frame]:
     taken: set[str] = set()
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise DataError(f"{name}: frame {i} is not an object")
+            raise DataError(f"{name}: frame {i} is {type(entry).__name__}; expected an object")
         camera = _camera(document | entry, f"{name}: frame {i}", i, size)
         if camera.name in taken:
-            raise DataError(f"{name}: frame {i}: a second image called {camera.name!r}; expected a name a view")
+            raise DataError(f"{name}: frame {i}: a second image named {camera.name!r}; expected one name per view")
         taken.add(camera.name)
         file_path = str(entry.get("file_path", camera.name))
         frames.append(Frame(camera, file_path, isinstance(kept, list) and file_path in kept))
@@ -145,13 +145,13 @@ def read_frames(path: str | Path, size: int | None = None) -> list[Frame]:
 
 
 def _camera(entry: dict[str, Any], name: str, index: int, size: int | None) -> Camera:
-    """One frame with the document's shared entries under its own."""
+    """Return the camera of one frame, whose entries override the document's."""
     model = str(entry.get("camera_model", "OPENCV"))
     if model not in _PINHOLE:
         raise DataError(f"{name}: camera model {model!r}; expected a pinhole ({', '.join(_PINHOLE)})")
     bent = [key for key in _DISTORTION if entry.get(key)]
     if bent:
-        raise DataError(f"{name}: lens distortion ({', '.join(bent)}); expected a pinhole: undistort the set first")
+        raise DataError(f"{name}: lens distortion ({', '.join(bent)}); expected a pinhole: undistort the images first")
     matrix = _matrix(entry.get("transform_matrix"), name)
     width, height, fx, fy, cx, cy = _lens(entry, name, size)
     stem = PurePosixPath(str(entry.get("file_path", f"view_{index:03d}"))).stem or f"view_{index:03d}"
@@ -189,14 +189,14 @@ def _number(entry: dict[str, Any], key: str, name: str) -> float | None:
 
 
 def _lens(entry: dict[str, Any], name: str, size: int | None) -> tuple[int, int, float, float, float, float]:
-    """width, height, fx, fy, cx, cy in pixels."""
+    """Return width, height, fx, fy, cx, cy in pixels."""
     width, height = _number(entry, "w", name), _number(entry, "h", name)
     if width is None or height is None:
         if size is None:
-            raise DataError(f"{name}: no image size 'w' and 'h'; give one with --size")
+            raise DataError(f"{name}: no image size 'w' and 'h'; expected both, or --size")
         width = height = float(size)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DataError(f"{name}: {width:g} x {height:g} px; expected 1 to {MAX_SIDE} along a side")
+        raise DataError(f"{name}: {width:g} x {height:g} px; expected 1 to {MAX_SIDE} per side")
     fx, fy = _number(entry, "fl_x", name), _number(entry, "fl_y", name)
     angle_x, angle_y = _number(entry, "camera_angle_x", name), _number(entry, "camera_angle_y", name)
     if fx is None and angle_x is not None and 0 < angle_x < math.pi:

@@ -27,7 +27,7 @@ def look_at(
     fov: float = FIELD_OF_VIEW,
     name: str = "view",
 ) -> Camera:
-    """Camera at ``eye`` looking at ``target`` (unit frame), vertical field of view in degrees."""
+    """Return a camera at ``eye`` that looks at ``target`` (unit frame), with the vertical field of view in degrees."""
     eye = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -49,7 +49,7 @@ def fibonacci_views(
     fov: float = FIELD_OF_VIEW,
     name: str = "view",
 ) -> list[Camera]:
-    """``count`` square views on the Fibonacci sphere (conventions: Default views)."""
+    """Return ``count`` square views on the Fibonacci sphere (conventions: Default views)."""
     cameras = []
     for i in range(count):
         z = 0.9 * (1 - (2 * i + 1) / count)
@@ -68,7 +68,7 @@ def default_views(
     radius: float = RADIUS,
     fov: float = FIELD_OF_VIEW,
 ) -> list[Camera]:
-    """The ``train`` (24), ``check`` (4) or ``test`` (10) set: no two share a view."""
+    """Return the ``train`` (24), ``check`` (4) or ``test`` (10) set, which are disjoint."""
     return fibonacci_views(
         SET_VIEWS[which] if count is None else count, SET_SHIFT[which], size=size, radius=radius, fov=fov, name=which
     )
@@ -82,7 +82,7 @@ def orbit_views(
     radius: float = RADIUS,
     fov: float = FIELD_OF_VIEW,
 ) -> list[Camera]:
-    """``count`` views on a circle around +z at ``elevation`` degrees."""
+    """Return ``count`` views on a circle around +z at ``elevation`` degrees."""
     height, ring = radius * math.sin(math.radians(elevation)), radius * math.cos(math.radians(elevation))
     cameras = []
     for i in range(count):
@@ -93,10 +93,10 @@ def orbit_views(
 
 
 def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Numbers, ascending, of at most ``count`` cameras that stand far apart: farthest-point choice.
+    """Return the indices, ascending, of at most ``count`` cameras that are far apart, by farthest-point sampling.
 
-    It begins with the camera farthest from all others' centre. Ties go to the camera with the smaller position, so
-    that the order of the cameras does not matter.
+    Sampling begins with the camera farthest from the mean position. Ties are broken by position, so the order of the
+    cameras does not matter.
     """
     eyes = np.array([camera.position for camera in cameras])
     if len(eyes) <= count:
@@ -113,5 +113,5 @@ def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
 
 
 def pixel_width(size: int) -> float:
-    """Width of a pixel at the volume's centre in the default views, unit frame."""
+    """Return the width of a pixel at the volume's centre in the default views, unit frame."""
     return 2 * RADIUS * math.tan(math.radians(FIELD_OF_VIEW) / 2) / size

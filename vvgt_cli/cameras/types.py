@@ -11,7 +11,7 @@ from vvgt_cli.errors import DataError
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at integer + 0.5.
+    """A pinhole camera with OpenCV axes (x right, y down, z forward) and pixel centres at integer + 0.5.
 
     Attributes:
         rotation: (3, 3) float64 R of ``x_camera = R x_unit + t``, orthonormal, determinant +1.
@@ -32,14 +32,15 @@ class Camera:
     name: str = "view"
 
     def __post_init__(self) -> None:
+        """Convert pose arrays to float64 and check the camera."""
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise DataError(f"camera {self.name}: R {rotation.shape}, t {translation.shape}; expected (3, 3) and (3,)")
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-            raise DataError(f"camera {self.name}: pose is not finite")
+            raise DataError(f"camera {self.name}: the pose is not finite; expected finite numbers")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
-            raise DataError(f"camera {self.name}: rotation is not orthonormal with determinant +1")
+            raise DataError(f"camera {self.name}: not a rotation; expected an orthonormal matrix with determinant +1")
         if min(self.width, self.height) < 1 or not (self.fx > 0 and self.fy > 0):
             raise DataError(
                 f"camera {self.name}: {self.width} x {self.height} px, focal {self.fx}, {self.fy}; expected > 0"
@@ -54,7 +55,7 @@ class Camera:
         return result
 
     def resized(self, factor: float) -> Camera:
-        """The same view with ``factor`` times the pixels along each axis."""
+        """Return the same view with ``factor`` times the pixels along each axis."""
         return replace(
             self,
             fx=self.fx * factor,

@@ -22,7 +22,7 @@ from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.field.layered import open_parts
+from vvgt_cli.field.layered import open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import write_ply
@@ -75,7 +75,7 @@ class LoadedVolume:
         self.last: PreviousLook | None = None  # what the next conversion goes on from
         if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
-            content = open_parts(source.path, source.read)
+            content = open_content(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
 
     def send_live(self, console: MessageConsole) -> None:

@@ -17,7 +17,7 @@ from vvgt_cli.conversion.place import into_box, preview, upright
 from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
@@ -157,7 +157,7 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
             resident = Resident.of(source)
         yield resident
         return
-    with beside(None) as parts, blocked(run, dark, options, parts, Wanted(len(gaussians), size)) as found:
+    with store_beside(None) as store, blocked(run, dark, options, store, FieldNeeds(len(gaussians), size)) as found:
         found.source = lit(found.source)
         run.compile(for_blocks(found.source.kernels(kernels)), found.source.kernel_type())
         yield found

@@ -174,20 +174,20 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
 
 def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, Any]:
     """Describe one of several volumes of a file: size, type, and the range if that is quick to find."""
-    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.field.layered import open_content
     from vvgt_cli.volume import statistics
 
     facts: dict[str, Any] = {"choice": option, **({"name": name} if name not in ("", option.partition(" ")[2]) else {})}
     read = replace(read, stored=True, packed=True)
     try:
         try:
-            content = open_parts(file, read)
+            content = open_content(file, read)
         except SeveralSteps as error:
             facts["time_steps"] = error.steps
-            content = open_parts(file, replace(read, time=0))
+            content = open_content(file, replace(read, time=0))
         except SeveralComponents as error:
             facts["components"] = error.count
-            content = open_parts(file, replace(read, component=0))
+            content = open_content(file, replace(read, component=0))
         volume = content.volumes[0]
         facts |= {"dims": volume.dims, "dtype": volume.data.dtype.name}
         if len(content.volumes) > 1:
@@ -217,7 +217,7 @@ def _channels(content: Content) -> list[dict[str, Any]]:
 
 
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:
-    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.field.layered import open_content
     from vvgt_cli.look import unit_distance
     from vvgt_cli.look.histogram import fitting
     from vvgt_cli.volume import statistics
@@ -225,7 +225,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
 
     listed = contents(file, read)
     try:
-        content = open_parts(file, replace(read, packed=True))
+        content = open_content(file, replace(read, packed=True))
     except UsageError as error:  # a choice that is missing: the lists say how to make it
         if not listed or (read.array, read.component, read.time) != (None, None, None):
             raise

@@ -22,9 +22,9 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
-from vvgt_cli.gaussians.formats.page_live import light_sent, live_parts
+from vvgt_cli.gaussians.formats.page_live import live_page_data, parse_light
 from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, baked
+from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
@@ -158,13 +158,13 @@ class Cloud:
             check_labels([LabelTable("the page's labels", one.labels) for one in facts])
         live = replace(facts[0], others=tuple(facts[1:]))
         options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
-        return self._shown(Several(tuple(tables)), light, options)
+        return self._shown(LayerTables(tuple(tables)), light, options)
 
     def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
         """Return the cloud baked under looks and a light: the page's, or else the file's."""
         from vvgt_cli.conversion.live import lit
 
-        lighting = self.options.light if light is None else light_sent(light, self.options)
+        lighting = self.options.light if light is None else parse_light(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
         found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
@@ -222,7 +222,7 @@ def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"
         splats, elements, more = columns_of(file, cloud.name), SCRIPT, {}
     else:
-        [splats], [planes], facts = live_parts([(cloud.gaussians, cloud.options)])
+        [splats], [planes], facts = live_page_data([(cloud.gaussians, cloud.options)])
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
         held = base64.b64encode(planes).decode("ascii")
         elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'

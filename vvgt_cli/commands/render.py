@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import boxed
+from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, shown
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
-from vvgt_cli.gaussians.formats.levels import Levels, by_view
+from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
@@ -71,7 +71,7 @@ class RenderRequest:
         if self.camera is not None:
             return read_cameras(self.camera, self.size)
         cameras = orbit_views(self.orbit or 0, size=self.size or size or SIZE)
-        return [boxed(camera, upright_matrix(up))[0] for camera in cameras]
+        return [to_box_frame(camera, upright_matrix(up))[0] for camera in cameras]
 
 
 def _check_directory(request: RenderRequest, names: list[str]) -> None:
@@ -123,7 +123,7 @@ def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
         gaussians, header = open_gaussians(request.ply)
         gaussians = shown(request.ply, gaussians, header, request.function)
         return lambda camera: gaussians, gaussians, header
-    levels = Levels(manifest)
+    levels = StreamedLevels(manifest)
     coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
     turned = up_matrix(header.up)
 

@@ -222,7 +222,7 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
         for job in jobs:
             _work(run, request, job, views)
             if job.field is not None:
-                job.field.do.parts.remove()
+                job.field.run_pass.store.remove()
     return total
 
 

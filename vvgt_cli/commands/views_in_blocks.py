@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.boxed import boxed, render_in_box
+from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.commands.view_files import POINTS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Picture
-from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
@@ -57,8 +57,10 @@ def fields_of(
         raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: cpu")
     fields = []
     for folder, tf in functions.items():
-        parts = stack.enter_context(beside(str(folder)))
-        fields.append(stack.enter_context(blocked(run, replace(source, tf=tf), options, parts, Wanted(POINTS, size))))
+        store = stack.enter_context(store_beside(str(folder)))
+        fields.append(
+            stack.enter_context(blocked(run, replace(source, tf=tf), options, store, FieldNeeds(POINTS, size)))
+        )
     return fields
 
 
@@ -72,7 +74,7 @@ def draw_in_blocks(
     def inside(camera: Camera) -> np.ndarray:
         if not field.pictures:
             many = max(TOGETHER // (camera.width * camera.height), 1)
-            field.views.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
+            field.views.expect([Picture(to_box_frame(other, axes)[0], settings) for other in left[:many]])
             del left[:many]
         image = field.views.view(camera, settings)
         field.views.forget(Picture(camera, settings))

@@ -20,7 +20,7 @@ from vvgt_cli.conversion.index import (
 )
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import NONE, content_of, open_parts
+from vvgt_cli.field.layered import NONE, content_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
@@ -154,7 +154,7 @@ class Functions(Batch):
             return
         with run.stage("volume") as stage:
             given = source.volume
-            content = open_parts(source.path, source.read) if isinstance(given, str) else content_of(given)
+            content = open_content(source.path, source.read) if isinstance(given, str) else content_of(given)
             content.prepare()
             stage.note = f"{content.volumes[0].name}, for {len(self._requests)} functions"
         self._requests = [

@@ -140,9 +140,9 @@ class Clouds(Mapping[str, Result]):
 
     def _repr_html_(self) -> str | None:
         """What notebooks show; see `Result`."""
-        from vvgt_cli.gaussians.formats.page_file import framed
+        from vvgt_cli.gaussians.formats.page_file import iframe
 
         try:
-            return framed(self._html(self.volume), self.volume)
+            return iframe(self._html(self.volume), self.volume)
         except DataError:
             return None

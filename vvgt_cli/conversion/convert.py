@@ -23,7 +23,7 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_room
@@ -290,12 +290,12 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
             field = Resident.of(source)
         yield field
         return
-    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
-    with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
+    wanted = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
+    with store_beside(request.output) as store, blocked(run, request.source, options, store, wanted) as found:
         _tell(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
         yield found
-        parts.remove()
+        store.remove()
 
 
 def _tell(run: Run, request: ConvertRequest, source: Source) -> None:

@@ -18,7 +18,7 @@ from vvgt_cli.conversion.previous_frame import previous_frame
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_parts
+from vvgt_cli.field.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
@@ -134,7 +134,7 @@ class Series(Batch):
         with run.stage("frames") as stage:
             found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
             source = replace(source, statistics=found.whole)
-            if found.first.unasked:  # said once, not for every frame
+            if found.first.components_message:  # said once, not for every frame
                 steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
@@ -236,14 +236,14 @@ def survey(
     mapped, found = labels not in (None, NONE), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
-        content = open_parts(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
+        content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
             raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
         first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
         _check_frame(step, steps[0], content, first)
-        if k == 0 and labels is None and tf is None and content.one_field:
+        if k == 0 and labels is None and tf is None and content.single_volume:
             mapped = holds_table(content.path) or recognised(content.volumes[0])
-        if mapped and content.one_field:
+        if mapped and content.single_volume:
             found.update(labels_in(content.volumes[0]))
         numbers.append([statistics(volume) for volume in content.classified])
         digests += [volume_digest(volume) for volume in content.volumes]
@@ -317,11 +317,11 @@ def _functions(
     from vvgt_cli.look import read_transfer_function, unit_distance
     from vvgt_cli.look.resolve import parse_tf_range
 
-    if frames.labels is not None and frames.first.one_field:
+    if frames.labels is not None and frames.first.single_volume:
         return (_table(source.labels, frames.labels),), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))
-    given = read if read is not None and frames.first.one_field else shown[0]
+    given = read if read is not None and frames.first.single_volume else shown[0]
     return shown, unit_distance(source.unit_distance, frames.grid, given)
 
 

@@ -20,11 +20,11 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_in
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_parts
+from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import together
+from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
@@ -102,7 +102,7 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     if not isinstance(source.volume, str):
         return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
-    return open_parts(source.path, read)
+    return open_content(source.path, read)
 
 
 def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[MapLabel]:
@@ -162,7 +162,7 @@ def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> 
     left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
     seen = _fitted(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
     owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])
-    both = [together([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
+    both = [concatenate([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 

@@ -27,8 +27,8 @@ from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, LiveFacts
-from vvgt_cli.gaussians.types import together
+from vvgt_cli.gaussians.live_facts import GRADIENT, LAYER_ID, LiveFacts
+from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting
@@ -123,7 +123,7 @@ def _of_one(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
         foggy = fog_of_labels(field, labels)
         found = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
     else:
-        foggy = field.with_look(source.shown_by(fog(source.overall, source.tf)))
+        foggy = field.with_look(source.with_function(fog(source.overall, source.tf)))
         found = carrying(run, foggy, placed_by(run, foggy, request))
     return wide_enough(found, request.fit.size)
 
@@ -135,7 +135,7 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
     for number, layer in enumerate(source.layers):
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
         run.console.say(f"layer {number} of {count}: {layer.name}")
-        alone = field.with_look(source.alone(number))
+        alone = field.with_look(source.single_layer(number))
         said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(said, dims=source.volume.dims))
         try:
@@ -146,15 +146,15 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
         some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
         assert some.live is not None
-        live = np.zeros((len(some), NUMBER + 1), np.float32)
+        live = np.zeros((len(some), LAYER_ID + 1), np.float32)
         live[:, : some.live.shape[1]] = some.live
-        live[:, NUMBER] = number
+        live[:, LAYER_ID] = number
         parts.append(replace(some, live=live))
         left -= len(some)
     if not parts:
         raise NothingVisible(source.volume.name, source.name)
     first, *others = facts
-    return together(parts), replace(first, others=tuple(others))
+    return concatenate(parts), replace(first, others=tuple(others))
 
 
 def check_layers(source: Source) -> None:

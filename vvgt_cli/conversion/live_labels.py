@@ -48,7 +48,7 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
     table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
-    return field.with_look(field.source.labelled_by([table]))
+    return field.with_look(field.source.with_tables([table]))
 
 
 def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:

@@ -77,7 +77,7 @@ class Plan:
     @property
     def memory(self) -> float:
         """Bytes of the whole process at its most."""
-        return self.case.there + self.working_memory
+        return self.case.base_bytes + self.working_memory
 
     def after(self, stage: Stage) -> float:
         """Seconds of what follows a stage."""

@@ -14,7 +14,7 @@ from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts
 from vvgt_cli.gaussians.legend import legend_text
-from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, seen_under, shown_by
+from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
@@ -122,7 +122,7 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
     """
     if isinstance(tf, SeveralLooks):
         tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
-        return Several(tuple(table for table in tables if not isinstance(table, Several)))
+        return LayerTables(tuple(table for table in tables if not isinstance(table, LayerTables)))
     if not isinstance(tf, LabelTable):
         return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
     entries = {label.number: label for label in tf.labels}
@@ -132,11 +132,11 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
 def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
     """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame.
 
-    ``pixel``: as for `shown_by`.
+    ``pixel``: as for `apply_look`.
     """
-    seen = gaussians.take(seen_under(gaussians, table, pixel))
+    seen = gaussians.take(visible_under(gaussians, table, pixel))
     assert seen.live is not None
-    found = shown_by(seen, table, pixel)
+    found = apply_look(seen, table, pixel)
     there = np.flatnonzero(opacity(found) >= MIN_ALPHA)
     found, gradient = found.take(there), seen.live[there, GRADIENT]
     if lighting is None:

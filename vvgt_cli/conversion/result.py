@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of
-from vvgt_cli.gaussians.formats.page_file import framed
+from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.rules import INRIA, rule_of
 from vvgt_cli.look.lighting import LightOptions
@@ -147,7 +147,7 @@ class Result:
         page = format_of("x.html")
         assert page is not None
         try:
-            return framed(encoded(page, self.gaussians, self.ply, name), name)
+            return iframe(encoded(page, self.gaussians, self.ply, name), name)
         except DataError:
             return None
 

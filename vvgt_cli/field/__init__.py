@@ -1,1 +1,1 @@
-"""A volume under its function, labels, layers and light: in memory, or in blocks."""
+"""A volume with its look (functions, labels, layers, light), in memory or in blocks."""

@@ -1,4 +1,4 @@
-"""Base cells of blocks: the moments of each, its normal where it is lit, and what of the block rays see."""
+"""Tasks over blocks: moments and normals of base cells, rays, and values and normals at points."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import CELLS, ROW, BlockStore
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.parts import CELLS, ROW, Parts
-from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, leave_rays
+from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Box, Layers, Scalars
 from vvgt_cli.files import atomic_write
 
@@ -21,33 +21,35 @@ Reader = Scalars | Layers
 
 @dataclass(frozen=True)
 class Blockwise:
-    """A task for every block of cells.
+    """A task with one step per block of cells.
 
     Attributes:
-        reader, grid: what is read, and how it is cut.
-        parts: where what comes of it goes.
+        reader: reader of boxes.
+        grid: division of the volume into blocks and cells.
+        store: destination of the results.
     """
 
     reader: Reader
     grid: CellGrid
-    parts: Parts
+    store: BlockStore
 
     def __len__(self) -> int:
+        """Return the number of blocks."""
         return len(self.grid.blocks)
 
     def box(self, number: int, halo: int) -> Box:
-        """Block ``number`` with ``halo`` voxels around it."""
+        """Read block ``number`` with ``halo`` voxels around it."""
         lo, hi = self.grid.blocks.at(number)
         return self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
 
 
 @dataclass(frozen=True)
 class CellBlocks(Blockwise):
-    """Integrate the base cells of blocks.
+    """The integration of base cells.
 
     Attributes:
-        rays: that are cast on the way, None for none.
-        light: that falls on the volume: cells then have normals.
+        rays: rays to cast while a block is in memory, None for none.
+        light: lighting; with it cells get normals.
     """
 
     rays: RayFile | None = None
@@ -55,13 +57,13 @@ class CellBlocks(Blockwise):
     kind: str = CELLS
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
-        grid, parts = self.grid, self.parts
+        """Save the cells of block ``number``, what its rays see, and a summary of each tile."""
+        grid, store = self.grid, self.store
         box = self.box(number, HALO if self.light is None else LIT_HALO)
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
         normals = [np.empty((0, 3))]
         with (
-            atomic_write(parts.path(CELLS, number, ".rows"), overwrite=True) as temporary,
+            atomic_write(store.path(CELLS, number, ".rows"), overwrite=True) as temporary,
             open(temporary, "wb") as stream,
         ):
             for tile in grid.tiles(number):
@@ -79,13 +81,13 @@ class CellBlocks(Blockwise):
                 field.append(summary[1])
                 deepest = max(deepest, summary[2])
         if self.rays is not None:
-            leave_rays(self.rays, box, number, grid.blocks, self.light, parts)
+            save_rays(self.rays, box, number, grid.blocks, self.light, store)
         if self.light is not None:
-            path = parts.path(CELLS, number, NORMALS)
+            path = store.path(CELLS, number, NORMALS)
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.save(stream, np.concatenate(normals))
         edges = [grid.tile_cells >> grid.march] * 3, [grid.tile_cells >> grid.field] * 3
-        parts.save(
+        store.save(
             CELLS,
             number,
             tiles=np.array(tiles, np.int64).reshape(-1, 3),
@@ -96,7 +98,7 @@ class CellBlocks(Blockwise):
         )
 
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cells with extinction of a tile (x, y, z) in a box."""
+        """Return the indices and moments of the cells with extinction in a tile (x, y, z) of a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
         from vvgt_cli.dvr.bricks import visible_blocks
 
@@ -113,13 +115,13 @@ class CellBlocks(Blockwise):
         return region_cells(region, lo + which * edge, exponent)
 
     def _normals(self, box: Box, moments: np.ndarray) -> np.ndarray:
-        """(n, 3) at the centroids of cells."""
+        """Return normals (n, 3) at the centroids of cells."""
         half, step = np.array(self.grid.half), np.array(self.grid.step)
         points = (moments[:, FIRST] / moments[:, [MASS]] + half) / step - 0.5
         return normals_in(box, points, step)[:, :3]
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Of a tile's cells ``local`` (n, 3): mass in cells of the march, opacity of the field, largest of a cell."""
+        """Return a tile's mass in cells of the visibility march, its opacity field, and its largest opacity."""
         from vvgt_cli.closed_form.surface_offset import opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
@@ -131,7 +133,7 @@ class CellBlocks(Blockwise):
 
 
 def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Normals and extinction (n, 4) at voxel coordinates ``points`` (n, 3) of the volume that lie in a box."""
+    """Return normals and extinction (n, 4) at the volume's voxel coordinates ``points`` (n, 3), all inside a box."""
     from vvgt_cli.closed_form.lit import point_normals
 
     out = np.empty((len(points), 4))
@@ -141,19 +143,20 @@ def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RayBlocks(Blockwise):
-    """Cast rays through blocks: a pass for pictures that were not known before. Attributes: as of `CellBlocks`."""
+    """The casting of rays, for pictures requested after the cells were integrated; attributes as in `CellBlocks`."""
 
     rays: RayFile
     light: Light | None = None
 
     @property
     def kind(self) -> str:
+        """Kind of the results."""
         return self.rays.kind
 
     def __call__(self, number: int) -> None:
-        """Leave what block ``number`` shows of them."""
+        """Save what the rays see of block ``number``."""
         box = self.box(number, HALO if self.light is None else LIT_HALO)
-        leave_rays(self.rays, box, number, self.grid.blocks, self.light, self.parts)
+        save_rays(self.rays, box, number, self.grid.blocks, self.light, self.store)
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,7 @@ class PointBlocks(Blockwise):
     kind: str
 
     def __call__(self, number: int) -> None:
-        """Leave those of the points that lie in block ``number``."""
+        """Save those at points in block ``number``."""
         lo, hi = self.grid.blocks.at(number)
         points = np.load(self.points, mmap_mode="r")
         low, high = np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == self.grid.dims, np.inf, hi - 0.5)
@@ -172,28 +175,28 @@ class PointBlocks(Blockwise):
         found = np.empty((0, 4))
         if len(which):
             found = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
-        self.parts.save(self.kind, number, which=which, found=found)
+        self.store.save(self.kind, number, which=which, found=found)
 
 
 @dataclass(frozen=True)
 class ValueBlocks(Blockwise):
-    """Values at the points of Gaussians.
+    """Values at the sample points of Gaussians.
 
     Attributes:
         gaussians: file of centres and axes (n, 12) in voxels.
-        kind: of the parts.
+        kind: kind of the results.
     """
 
     gaussians: str
     kind: str
 
     def __call__(self, number: int) -> None:
-        """Leave the values of those points that lie in block ``number``: numbers of them, over all Gaussians."""
+        """Save the values at points in block ``number``, with the points' numbers over all Gaussians."""
         from vvgt_cli.closed_form.gaussian_samples import POINTS, offsets, reach, sample_points
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")
-        far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # of points along each axis, at most
+        far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # largest distance along each axis
         near = (rows[:, :3] + far >= lo - 0.5) & (rows[:, :3] - far < hi - 0.5)
         which = np.flatnonzero(near.all(axis=1))
         found, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
@@ -207,21 +210,21 @@ class ValueBlocks(Blockwise):
             )  # fmt: skip
             row, column = np.nonzero(np.isfinite(samples))
             found, numbers = samples[row, column], which[row] * POINTS + column
-        self.parts.save(self.kind, number, numbers=numbers, found=found)
+        self.store.save(self.kind, number, numbers=numbers, found=found)
 
 
 @dataclass(frozen=True)
 class ExtinctionBlocks(Blockwise):
-    """Mean extinction of the cells that shadows and occlusion are marched through.
+    """Mean extinction of the cells in which shadows and occlusion are computed.
 
-    ``cell``: voxels along their edge, of which blocks hold whole ones.
+    Their edge is ``cell`` voxels, which divides that of a block.
     """
 
     cell: int
     kind: str = "extinction"
 
     def __call__(self, number: int) -> None:
-        """Leave those of block ``number``."""
+        """Save the cells of block ``number``."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
         from vvgt_cli.dvr.shadows import cell_extinction
 
@@ -229,31 +232,31 @@ class ExtinctionBlocks(Blockwise):
         out = np.empty(tuple(-(-n // self.cell) for n in box.values.shape), np.float32)
         empty = empty_distance(brick_ranges(box.values), box.optics)
         cell_extinction(box.voxels, box.optics, empty, self.cell, out)
-        self.parts.save(self.kind, number, extinction=out)
+        self.store.save(self.kind, number, extinction=out)
 
     def gathered(self) -> np.ndarray:
-        """(cz, cy, cx) float32 of the whole volume.
+        """Return the cells of the whole volume, (cz, cy, cx) float32.
 
         Raises:
-            DataError: a part is missing or damaged.
+            DataError: a result is missing or damaged.
         """
         out = np.empty(tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.float32)
         for number in range(len(self)):
             x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])
-            part = self.parts.load(self.kind, number)["extinction"]
+            part = self.store.load(self.kind, number)["extinction"]
             out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
         return out
 
 
-def read_rows(parts: Parts, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Moments (count, 13) and places in their tile (count, 3) int32 of a tile's cells.
+def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read moments (count, 13) and indices within the tile (count, 3) int32 of a tile's cells.
 
-    ``offset`` counts the cells of the block before them.
+    ``offset`` is the number of cells of the block before these.
 
     Raises:
-        DataError: the file is not whole.
+        DataError: the file is truncated.
     """
-    path = parts.path(CELLS, number, ".rows")
+    path = store.path(CELLS, number, ".rows")
     try:
         with open(path, "rb") as stream:
             stream.seek(offset * ROW)
@@ -261,7 +264,7 @@ def read_rows(parts: Parts, number: int, offset: int, count: int) -> tuple[np.nd
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
     if len(content) < count * ROW:
-        raise DataError(f"{path}: not whole; remove {path.with_suffix('.npz')} and run the same command again")
+        raise DataError(f"{path}: truncated; remove {path.with_suffix('.npz')} and run the same command again")
     split = count * MOMENTS * 8
     moments = np.frombuffer(content, np.float64, count * MOMENTS).reshape(count, MOMENTS)
     return moments, np.frombuffer(content, np.uint8, offset=split).reshape(count, 3).astype(np.int32)

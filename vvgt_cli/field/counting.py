@@ -1,4 +1,4 @@
-"""What the values of a volume are, counted block by block: `Access` to volumes that are never in memory as a whole."""
+"""Statistics of values, counted block by block: `Access` to volumes that are never whole in memory."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
+from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import Content, content_of, open_parts
-from vvgt_cli.field.parts import COUNTS, HISTOGRAM, LABELS, Parts
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, Place
 from vvgt_cli.field.settings import counted_boxes, slices_at_once
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
@@ -22,30 +22,32 @@ from vvgt_cli.volume.tallies import Tally, counted, statistics_of, tally, with_l
 
 @dataclass(frozen=True)
 class CountBlocks:
-    """Count the values of blocks, and take samples of them.
+    """The counting of values, with samples of them.
 
     Attributes:
-        place, boxes: what is read, and how it is cut.
-        slices: of a box that are in memory at once.
-        parts: where what is counted goes.
-        kind: of the parts.
-        limits: data values, of a second pass: their histogram.
-        labels: the different values are kept, whose type is too wide to be counted.
+        place: origin of the volume.
+        boxes: its division.
+        slices: slices of a box that are in memory at a time.
+        store: destination of the results.
+        kind: kind of the results.
+        limits: range of the histogram, in a second pass.
+        labels: collect the distinct values of a type that is too wide to be counted.
     """
 
     place: Place
     boxes: Boxes
     slices: int
-    parts: Parts
+    store: BlockStore
     kind: str
     limits: tuple[float, float] | None = None
     labels: bool = False
 
     def __len__(self) -> int:
+        """Return the number of boxes."""
         return len(self.boxes)
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``."""
+        """Count box ``number``."""
         volume = self.place.volume()
         lo, hi = self.boxes.at(number)
         size = np.minimum(SAMPLE, self.boxes.dims)
@@ -64,9 +66,9 @@ class CountBlocks:
             for n in range(wanted):
                 if z <= places[n, 2] < end[2]:
                     bricks[n] = _brick(volume, values, begin, end, places[n], size)
-            del values  # before the next slices are read
+            del values  # free them before the next slices are read
         assert found is not None, "a box has a slice"
-        self.parts.save(
+        self.store.save(
             self.kind,
             number,
             counts=found.counts,
@@ -79,14 +81,14 @@ class CountBlocks:
         )
 
     def merged(self) -> Tally:
-        """The sum over all blocks.
+        """Return the sum over all boxes.
 
         Raises:
-            DataError: a part is missing or damaged.
+            DataError: a result is missing or damaged.
         """
         whole: Tally | None = None
         for number in range(len(self)):
-            part = self.parts.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
+            part = self.store.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
             lo, hi, low, high = part["ends"].tolist()
             nan, finite = part["numbers"].tolist()
             one = Tally(part["counts"], lo, hi, (low, high), nan, finite, part["histogram"])
@@ -95,54 +97,54 @@ class CountBlocks:
         return whole
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bricks (n, z, y, x) of stored values, and the voxels (n,) that each stands for."""
-        found = [self.parts.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
+        """Return sampled bricks (n, z, y, x) of stored values, and how many voxels (n,) each stands for."""
+        found = [self.store.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
         return np.concatenate([part["samples"] for part in found]), np.concatenate([part["weights"] for part in found])
 
     def unique(self) -> np.ndarray:
-        """The different finite values (n,), ascending."""
-        found = [self.parts.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
+        """Return the distinct finite values (n,), ascending."""
+        found = [self.store.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
         return np.unique(np.concatenate(found))
 
 
 def _brick(
     volume: Volume, values: np.ndarray, begin: np.ndarray, end: np.ndarray, first: np.ndarray, size: np.ndarray
 ) -> np.ndarray:
-    """``size`` voxels from ``first`` on (3,), of the ``values`` from ``begin`` to ``end`` where they hold them."""
+    """Return ``size`` voxels from ``first`` (3,), from the loaded ``values`` if they lie in ``begin`` to ``end``."""
     if (first + size > end).any():
         return read_block(volume, first, first + size)
     (x, y, z), (i, j, k) = first - begin, size
     return values[z : z + k, y : y + j, x : x + i]
 
 
-class Counted:
-    """`vvgt_cli.field.layered.Access` block by block: every volume is counted once, when it is asked for."""
+class BlockAccess:
+    """`vvgt_cli.field.layered.Access` block by block; each volume is counted once, on first use."""
 
     def __init__(
-        self, parts: Parts, edge: int, run: Callable[[CountBlocks], object], histogram: bool
+        self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
-        """Take what does the tasks.
+        """Prepare for counting.
 
         Args:
-            parts: where what is counted goes.
-            edge: voxels along the edge of blocks.
-            run: does the blocks of a task that are missing.
-            histogram: is needed, also of types that are not counted value by value.
+            store: destination of the results.
+            edge: edge of blocks in voxels.
+            run: runs the missing blocks of a task.
+            histogram: whether a histogram is needed even for types that are not counted value by value.
         """
-        self._parts, self._edge, self._run, self._histogram = parts, edge, run, histogram
+        self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """A file, of which nothing is read yet, or what is in memory."""
+        """Open a file without reading its values, or accept content in memory."""
         if not isinstance(source, str):
             content = content_of(source)
             for volume in (*content.volumes, *content.classified):
                 self._places[id(volume)] = volume, Place(volume, read)
             return content
         read = replace(read, stored=True, packed=True)
-        content = open_parts(source, read)
+        content = open_content(source, read)
         for number, volume in enumerate(content.volumes):
             self._places[id(volume)] = volume, Place(source, read, number)
         if content.color:
@@ -151,11 +153,11 @@ class Counted:
         return content
 
     def place(self, volume: Volume) -> Place:
-        """Where a volume comes from that was opened here."""
+        """Return the origin of a volume that was opened here."""
         return self._places[id(volume)][1]
 
     def counts(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
-        """What did it, and what came of it.
+        """Return the counting task of a volume, its counts and its statistics.
 
         Raises:
             DataError: no voxel has a finite value.
@@ -169,14 +171,14 @@ class Counted:
         self._count += 1
         if not readable_in_blocks(volume):
             raise UsageError(
-                f"{volume.name}: compressed in one piece, which is read front to back; unpack it (raw, .nhdr and .nii "
-                "files are mapped), or store it in chunks (Zarr, HDF5)"
+                f"{volume.name}: compressed as one stream, which cannot be read in blocks; decompress it (raw, .nhdr "
+                "and .nii files are mapped), or store it in chunks (Zarr, HDF5)"
             )
         edge = self._edge
         boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
         labels = not counted(volume) and volume.data.dtype.kind in "iu"
         first = CountBlocks(
-            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._parts, COUNTS + suffix, labels=labels
+            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._store, COUNTS + suffix, labels=labels
         )
         self._run(first)
         whole = with_limits(first.merged(), volume)
@@ -188,14 +190,14 @@ class Counted:
         return first, whole, statistics_of(whole, volume, histogram)
 
     def statistics(self, volume: Volume) -> Statistics:
-        """Of its data values."""
+        """Return the statistics of a volume's data values."""
         return self.counts(volume)[2]
 
     def labels(self, volume: Volume) -> list[int]:
-        """Those that it holds, ascending.
+        """Return the labels that a volume holds, ascending.
 
         Raises:
-            DataError: data values that are no whole numbers, or too many of them.
+            DataError: data values are not integers, or there are too many distinct ones.
         """
         task, whole, _ = self.counts(volume)
         if counted(volume):
@@ -208,12 +210,12 @@ class Counted:
                 self._run(task)
             stored = task.unique()
         if len(stored) > MOST:
-            raise Unsuitable(f"{volume.name}: more than {MOST} different values; expected a label map")
+            raise Unsuitable(f"{volume.name}: more than {MOST} distinct values; expected a label map")
         values = np.unique(volume.slope * stored + volume.intercept)
         if (values != np.round(values)).any():
             odd = values[values != np.round(values)][0]
             raise Unsuitable(
-                f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected a label map, of whole numbers: "
-                "of scalars leave out --labels"
+                f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected integers, as in a label map: "
+                "omit --labels for scalars"
             )
         return [int(value) for value in values]

@@ -1,4 +1,4 @@
-"""Blocks on Dask's workers: of this machine, of a scheduler that is there already, or of jobs under SLURM."""
+"""Blocks on Dask workers: on this machine, of a running scheduler, or in SLURM jobs."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from vvgt_cli.field.runners import Progress, Task
 from vvgt_cli.resources import asked_memory
 
 LOCAL, SLURM = "local", "slurm"
-AGAIN = 30.0  # seconds until a job that has ended is followed by another
+AGAIN = 30.0  # seconds between checks for jobs that have ended
 ANSWER = 120.0  # seconds for SLURM to answer
 TRIES = 3  # of a block whose worker was lost
 WAIT = "15s"  # for a scheduler to answer
 
 
 def _need(name: str) -> Any:
-    """A package of the extra `cluster`.
+    """Import a package of the extra `cluster`.
 
     Raises:
-        DataError: it is not installed.
+        DataError: the package is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -36,46 +36,48 @@ def _need(name: str) -> Any:
         raise DataError(f"--scheduler: {name} is not installed; try: pip install 'vvgt[cluster]'") from None
 
 
-class Dask:
-    """See the module. A context: workers that are started for it stay from pass to pass, and end with it.
+class DaskRunner:
+    """A runner on Dask workers, and the context within which workers started for it stay alive.
 
     Attributes:
-        workers: that are asked for.
+        workers: number of workers requested.
     """
 
     def __init__(self, scheduler: str, workers: int, threads: int) -> None:
-        """``scheduler`` is "local", "slurm" or an address; ``threads`` of all local workers, or of each job.
+        """Check the scheduler: "local", "slurm" or an address; ``threads`` are shared by local workers, or per job.
 
         Raises:
-            DataError: Dask is not installed, or SLURM.
-            UsageError: jobs without a size of memory.
+            DataError: Dask or SLURM is not installed.
+            UsageError: SLURM jobs have no memory size.
         """
         _need("distributed")
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are lines of our own
         self._scheduler, self.workers, self._threads = scheduler, workers, threads
         self._stack, self._client = ExitStack(), None
         self._futures: Sequence[Any] = ()
-        self._lost: str | None = None  # why no worker will come any more
+        self._lost: str | None = None  # why no worker will ever answer
         if scheduler == SLURM:
             _need("dask_jobqueue")
             if shutil.which("sbatch") is None:
                 raise DataError(
-                    "--scheduler slurm: there is no sbatch here; run it on a node that submits jobs, or try local"
+                    "--scheduler slurm: sbatch not found; run this on a node that submits jobs, or try local"
                 )
             if asked_memory() is None:
-                raise UsageError("--scheduler slurm: give --memory, which every job asks for, as --memory 16G")
+                raise UsageError("--scheduler slurm: no memory size for its jobs; expected --memory, as --memory 16G")
 
-    def __enter__(self) -> Dask:
+    def __enter__(self) -> DaskRunner:
+        """Return the runner."""
         return self
 
     def __exit__(self, *error: object) -> None:
+        """End the workers that were started."""
         self._stack.close()
 
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Do the tasks; those of a worker that was lost are done anew, by another.
+        """Run the tasks; those of a lost worker are repeated on another.
 
         Raises:
-            DataError: no scheduler, jobs that are refused or have all ended, or workers that are lost again and again.
+            DataError: there is no scheduler, jobs are refused or have all ended, or workers are lost repeatedly.
         """
         if not numbers:
             return
@@ -89,14 +91,14 @@ class Dask:
                     progress(done, len(numbers))
         except distributed.KilledWorker as error:
             raise DataError(
-                f"workers were ended {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
+                f"workers were killed {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
             ) from error
         except CancelledError:
-            told = f"--scheduler {self._scheduler}: it has ended, or cancelled the blocks; the same command goes on"
-            raise DataError(self._lost or told) from None
+            ended = f"--scheduler {self._scheduler}: it ended or cancelled the blocks; run the same command to resume"
+            raise DataError(self._lost or ended) from None
 
     def _connected(self) -> Any:
-        """A client of the scheduler; what is started for it ends with the context."""
+        """Return a client of the scheduler; a cluster started for it ends with the context."""
         distributed = _need("distributed")
         if self._scheduler in (LOCAL, SLURM):
             cluster = self._stack.enter_context(self._local() if self._scheduler == LOCAL else self._jobs())
@@ -108,7 +110,7 @@ class Dask:
         except (OSError, ValueError) as error:
             raise DataError(
                 f"--scheduler {self._scheduler}: no Dask scheduler answers there; start one with 'dask scheduler' "
-                "(it says its address), or try --scheduler local"
+                "(it prints its address), or try --scheduler local"
             ) from error
         return self._stack.enter_context(client)
 
@@ -122,7 +124,7 @@ class Dask:
         )  # fmt: skip
 
     def _jobs(self) -> Any:
-        """One worker a job; account, partition and time are those of Dask's own settings, `jobqueue.slurm`.
+        """Return a cluster of one worker per job; account, partition and time are Dask's settings, `jobqueue.slurm`.
 
         Raises:
             DataError: a job is refused, or SLURM does not answer.
@@ -136,7 +138,7 @@ class Dask:
                 scheduler_options={"dashboard_address": None},
             )  # fmt: skip
         except (OSError, RuntimeError, TypeError, ValueError) as error:
-            raise DataError(f"--scheduler slurm: {error}; settings are those of jobqueue.slurm in Dask's") from error
+            raise DataError(f"--scheduler slurm: {error}; check jobqueue.slurm in Dask's settings") from error
         try:
             tried = _asked(["sbatch", "--test-only"], cluster.job_script())
         except subprocess.TimeoutExpired:
@@ -144,58 +146,58 @@ class Dask:
             raise DataError(f"--scheduler slurm: sbatch does not answer within {ANSWER:g} s; try later") from None
         if tried.returncode:
             cluster.close()
-            said = [line.strip() for line in tried.stderr.splitlines() if line.strip()] or ["no reason given"]
-            why = next((line for line in said if "error" in line.lower()), said[-1])
+            lines = [line.strip() for line in tried.stderr.splitlines() if line.strip()] or ["no reason given"]
+            why = next((line for line in lines if "error" in line.lower()), lines[-1])
             raise DataError(
-                f"--scheduler slurm: sbatch refuses the job ({why}); account, partition and time are those of "
+                f"--scheduler slurm: sbatch refuses the job ({why}); check account, partition and time in "
                 "jobqueue.slurm in Dask's settings"
             )
         return cluster
 
     def _keep(self, cluster: Any) -> None:
-        """Ask for the jobs, and again for those that have ended, until the context does.
+        """Submit the jobs, and replacements for those that end early, until the context ends.
 
-        Where all have ended and no worker answers, the tasks are cancelled. A job that ends before its worker has
-        answered is followed by another, `TRIES` times for each that was asked for.
+        If all jobs have ended and no worker answers, the tasks are cancelled. A job that ends before its worker has
+        answered is replaced, `TRIES` times per requested worker.
         """
         cluster.scale(jobs=self.workers)
-        over = threading.Event()
+        closed = threading.Event()
 
         async def again(names: Sequence[Any]) -> None:
-            await cluster.scale_down(names)  # or it waits for their workers for ever, and gives one's name anew
+            await cluster.scale_down(names)  # otherwise it waits for their workers forever, and reuses a name
             cluster.scale(jobs=self.workers)
 
         def watch() -> None:
             before: set[str] = set()
             left = TRIES * self.workers
-            while not over.wait(AGAIN):
-                found, all_of_them = jobs_gone(cluster)
-                if over.is_set() or self._client is None:
+            while not closed.wait(AGAIN):
+                found, none_left = jobs_gone(cluster)
+                if closed.is_set() or self._client is None:
                     continue
-                gone = {name: job for name, job in found.items() if job in before}  # no job that has only just ended
+                gone = {name: job for name, job in found.items() if job in before}  # not one that has only just ended
                 before = set(found.values())
-                if gone and all_of_them:
+                if gone and none_left:
                     self._lost = (
-                        "--scheduler slurm: all jobs have ended, with blocks left to do; why is in the files of their "
-                        f"output (slurm-{min(gone.values(), key=int)}.out, or where jobqueue.slurm in Dask's settings "
-                        "puts it); the same command goes on with what is done"
+                        "--scheduler slurm: all jobs ended before all blocks were done; see their output "
+                        f"(slurm-{min(gone.values(), key=int)}.out, or where jobqueue.slurm in Dask's settings puts "
+                        "it), then run the same command to resume"
                     )
-                    with suppress(Exception):  # a pass that has just ended: the next look has the next one's blocks
+                    with suppress(Exception):  # the pass may have just ended: the next check sees the next pass
                         self._client.cancel(self._futures, force=True)
                     continue
                 names = list(gone)[:left]
                 left -= len(names)
                 cluster.loop.add_callback(again, names)
 
-        self._stack.callback(over.set)
+        self._stack.callback(closed.set)
         threading.Thread(target=watch, daemon=True).start()
 
 
 def jobs_gone(cluster: Any) -> tuple[dict[Any, str], bool]:
-    """Numbers of the jobs of a cluster that SLURM does not know any more, without a worker that answers.
+    """Find the jobs of a cluster that SLURM no longer knows and whose workers do not answer.
 
     Returns:
-        Them by the cluster's name of their workers, and whether there are no others and no worker at all.
+        Job numbers by the cluster's name for their worker, and whether no other job and no worker is left.
     """
     answering = {worker.get("name") for worker in cluster.scheduler_info["workers"].values()}
     silent = {
@@ -210,7 +212,7 @@ def jobs_gone(cluster: Any) -> tuple[dict[Any, str], bool]:
         asked = _asked(["squeue", "--all", "--noheader", "--format=%A", f"--jobs={','.join(sorted(silent.values()))}"])
     except (OSError, subprocess.TimeoutExpired):
         return {}, False
-    if asked.returncode and "nvalid job id" not in asked.stderr:  # what squeue says of jobs long ended
+    if asked.returncode and "nvalid job id" not in asked.stderr:  # squeue's error for jobs that ended long ago
         return {}, False
     known = set(asked.stdout.split())
     gone = {name: job for name, job in silent.items() if job not in known}
@@ -218,11 +220,11 @@ def jobs_gone(cluster: Any) -> tuple[dict[Any, str], bool]:
 
 
 def _asked(command: list[str], given: str = "") -> subprocess.CompletedProcess[str]:
-    """What a command of SLURM says."""
+    """Run a SLURM command."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith("SQUEUE_")}  # no filters
     return subprocess.run(command, input=given, capture_output=True, text=True, timeout=ANSWER, env=plain)
 
 
 def _environment(threads: int) -> dict[str, str]:
-    """Of a worker of so many threads."""
+    """Return the environment variables of a worker with this number of threads."""
     return {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}

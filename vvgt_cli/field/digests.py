@@ -1,4 +1,4 @@
-"""Digests of what a run depends on: manifests and checkpoints tell by them whether files are theirs."""
+"""Digests of a run's inputs, by which manifests and checkpoints recognise their files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import slabs
 from vvgt_cli.volume.stored import chunks_of, read_block
 
-AT_ONCE = 1 << 22  # voxels that are read at once, or a row of chunks
-LARGEST = 16 << 30  # bytes of values that are read once more
+AT_ONCE = 1 << 22  # voxels that are read at a time, or a row of chunks
+LARGEST = 16 << 30  # bytes of values that are read a second time
 
 
 def digest(*parts: Any) -> str:
-    """sha256 of values, hexadecimal: arrays by type, shape and bytes, dataclasses by their fields, the rest by repr."""
+    """Return the SHA-256 of values: of arrays by type, shape and bytes, of dataclasses by fields, else by repr."""
     state = hashlib.sha256()
     for part in parts:
         _feed(state, part)
@@ -39,7 +39,7 @@ def _feed(state: Any, part: Any) -> None:
 
 
 def values_digest(volumes: Sequence[Volume]) -> str | None:
-    """sha256 of the values of volumes, hexadecimal, the same in memory and in blocks; None of more than `LARGEST`."""
+    """Return the SHA-256 of volumes' values, the same in memory and in blocks; None above `LARGEST` bytes."""
     if sum(volume.data.nbytes for volume in volumes) > LARGEST:
         return None
     state = hashlib.sha256()
@@ -52,7 +52,7 @@ def values_digest(volumes: Sequence[Volume]) -> str | None:
 
 
 def _slice_digests(volume: Volume) -> Iterator[bytes]:
-    """sha256 of each slice; rows of chunks are read at once, and no chunk twice."""
+    """Yield the SHA-256 of each slice; whole rows of chunks are read at a time, and no chunk twice."""
     nx, ny, nz = volume.dims
     deep, wide, _ = chunks_of(volume)
     wide *= max(AT_ONCE // (deep * wide * nx), 1)
@@ -67,7 +67,7 @@ def _slice_digests(volume: Volume) -> Iterator[bytes]:
 
 
 def volume_digest(volume: Volume) -> str:
-    """sha256 of a volume's content: grid, type, scaling and values; not of its name, place or orientation."""
+    """Return the hexadecimal SHA-256 of a volume's grid, type, scaling and values, not its name or placement."""
     state = hashlib.sha256()
     _feed(state, volume.dims)
     for number in (*volume.spacing, volume.slope, volume.intercept):
@@ -78,7 +78,7 @@ def volume_digest(volume: Volume) -> str:
 
 
 def cameras_digest(cameras: Sequence[Camera]) -> str:
-    """sha256 of names, poses and lenses; the size is left out."""
+    """Return the hexadecimal SHA-256 of cameras' names, poses and lenses, independent of the image size."""
     state = hashlib.sha256()
     for camera in cameras:
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) / camera.height

@@ -1,4 +1,4 @@
-"""A picture of a volume in blocks while it is made."""
+"""A picture of a volume in blocks while it is being rendered."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, more_rays
 
 @dataclass
 class Drawing:
-    """A picture that is being made: of its blocks' pixels alone, as screens are large.
+    """A partially rendered picture, which stores only the pixels of its blocks.
 
     Attributes:
-        key: of the picture.
-        camera, settings, blocks: as of `Picture`.
+        key: digest of the picture.
+        camera, settings, blocks: the fields of `Picture`.
     """
 
     key: str
@@ -27,31 +27,31 @@ class Drawing:
     blocks: Blocks | None
 
     @cached_property
-    def seen(self) -> np.ndarray:
-        """(n, 4) float32 of the pixels of `everywhere`, row by row."""
-        return np.zeros((int(self.everywhere().sum()), 4), np.float32)
+    def colors(self) -> np.ndarray:
+        """Colours (n, 4) float32 of the pixels of `pixel_mask`, row by row."""
+        return np.zeros((int(self.pixel_mask().sum()), 4), np.float32)
 
-    def everywhere(self) -> np.ndarray:
-        """(h, w) bool: its pixels."""
+    def pixel_mask(self) -> np.ndarray:
+        """Return the mask (h, w) of the pixels to render."""
         shape = self.camera.height, self.camera.width
         return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
 
     def image(self) -> np.ndarray:
-        """(h, w, 4), zero outside the blocks."""
+        """Return the picture (h, w, 4), zero outside the blocks."""
         whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
-        whole[self.everywhere()] = self.seen
+        whole[self.pixel_mask()] = self.colors
         return whole
 
-    def first(self) -> list[Rays]:
-        """Rays of the first pass."""
-        return first_rays(self.settings, self.everywhere())
+    def first_pass(self) -> list[Rays]:
+        """Return the rays of the first pass."""
+        return first_rays(self.settings, self.pixel_mask())
 
-    def more(self) -> list[Rays]:
-        """Rays of the second."""
-        return more_rays(self.settings, self.image(), self.everywhere())
+    def second_pass(self) -> list[Rays]:
+        """Return the rays of the second pass."""
+        return more_rays(self.settings, self.image(), self.pixel_mask())
 
     def add(self, rays: Rays, shown: np.ndarray) -> None:
-        """Mix in what ``rays`` show, (pixels, rays, 4) float64."""
+        """Average in the colours that ``rays`` see, (pixels, rays, 4) float64."""
         offsets, mask, known = rays
-        at = mask[self.everywhere()]
-        self.seen[at] = (known * self.seen[at] + shown.sum(axis=1)) / (known + len(offsets))
+        at = mask[self.pixel_mask()]
+        self.colors[at] = (known * self.colors[at] + shown.sum(axis=1)) / (known + len(offsets))

@@ -1,4 +1,4 @@
-"""`Field`: a volume under its function, labels, layers and light, in memory (`Resident`) or in blocks."""
+"""`Field`: a volume with its look (functions, labels, layers, light), in memory (`Resident`) or in blocks."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.scene import PreparedVolume
 
-AT_ONCE = 1 << 17  # Gaussians whose samples are in memory
+AT_ONCE = 1 << 17  # Gaussians whose samples are held in memory at a time
 
 
 class Picture(NamedTuple):
-    """A picture of the volume: the arguments of `vvgt_cli.dvr.render_view`."""
+    """One view of the volume: the arguments of `vvgt_cli.dvr.render_view`."""
 
     camera: Camera
     settings: RenderSettings
@@ -33,67 +33,67 @@ class Picture(NamedTuple):
 
 
 class ViewRenderer(Protocol):
-    """Renders pictures of a volume."""
+    """A renderer of pictures of a volume."""
 
     def expect(self, pictures: Sequence[Picture]) -> None:
-        """Announce pictures: a volume in blocks draws all that it knows of in one pass."""
+        """Announce pictures, so that a volume in blocks can render them in a single pass."""
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """Return a picture (h, w, 4) float32, premultiplied RGBA; with ``blocks`` zero elsewhere."""
+        """Return a picture (h, w, 4) float32, premultiplied RGBA; zero outside ``blocks`` where they are given."""
 
     def forget(self, picture: Picture) -> None:
-        """Release a picture that is not asked for again."""
+        """Release a picture that will not be requested again."""
 
 
 class Field(Protocol):
-    """What a conversion asks of a volume.
+    """Everything a conversion needs to know about a volume.
 
     Attributes:
-        source: the volume, whose values may lie in its file, and its look.
-        views: its pictures.
+        source: the volume and its look; the values may still be in the file.
+        views: renderer of its pictures.
     """
 
     views: ViewRenderer
 
     @property
-    def source(self) -> Source: ...
+    def source(self) -> Source:
+        """The volume and its look."""
 
     def workload(self, size: int, gaussians: int) -> Workload:
-        """Return what the costs of stages depend on, for images of ``size`` px and a budget of Gaussians."""
+        """Return the counts and timings that stage costs depend on, for ``size`` px images and a Gaussian budget."""
 
     def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
-        """Return the closed form: the pyramid of cells, and Gaussians of those that fit the budget."""
+        """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """Return mean value, spread and gradient under Gaussians of the box frame, (K, 5) float32.
-
-        See `vvgt_cli.closed_form.gaussian_samples.values_of`.
+        """Return the mean value, spread and gradient under Gaussians of the box frame, (K, 5) float32.
 
         Raises:
-            UsageError: an optics grid, which has no values.
+            UsageError: the source is an optics grid, which has no scalar values.
         """
 
     def with_look(self, source: Source) -> Field:
-        """Return the volume under another look: a `Source` that ``self.source`` made of itself.
+        """Return the field of the same volume with another look.
 
-        The statistics of a layer on its own are found here.
+        Args:
+            source: a variant of ``self.source``; the statistics of a single layer are computed here.
         """
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """Return the directions (K, 3) of the mean gradient around Gaussians of the box frame; None without light."""
+        """Return the mean gradient directions (K, 3) around Gaussians of the box frame; None without light."""
 
     def digest(self) -> str | None:
-        """Return the SHA-256 of the values of all volumes; None where there are more than `LARGEST` bytes of them."""
+        """Return the SHA-256 of all volumes' values; None if they exceed `LARGEST` bytes."""
 
 
 @dataclass
 class Resident:
-    """A field whose values are in memory, and which draws its own pictures.
+    """A field with its values in memory, which renders its own pictures.
 
     Attributes:
-        source: what was read.
-        scene: its values laid out for the kernels.
-        views: its pictures; None makes it draw them itself.
+        source: the volume and its look.
+        scene: the values, laid out for the kernels.
+        views: renderer of its pictures; None selects the field itself.
     """
 
     source: Source
@@ -101,44 +101,45 @@ class Resident:
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
 
     def __post_init__(self) -> None:
+        """Use the field itself as the renderer if none is given."""
         self.views = self.views or self
 
     @classmethod
     def of(cls, source: Source) -> Resident:
-        """Return the field of a source, laid out for the kernels."""
+        """Return the field of a source, with its values laid out for the kernels."""
         return cls(source, source.scene())
 
     @cached_property
     def layout(self) -> PreparedVolume:
-        """The one scalar field for the kernels."""
+        """The scalar field, laid out for the kernels."""
         from vvgt_cli.dvr.scene import PreparedVolume
 
         return self.source.layout or PreparedVolume.of(self.source.volume)
 
     def workload(self, size: int, gaussians: int) -> Workload:
-        """See `Field.workload`."""
+        """Implement `Field.workload`."""
         return measure(self.scene, size, gaussians)
 
     def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
-        """See `Field.pyramid`."""
+        """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import initialise
 
         return initialise(self.scene, options, progress)
 
     def expect(self, pictures: Sequence[Picture]) -> None:
-        """Do nothing: each picture is drawn when it is asked for."""
+        """Do nothing: each picture is rendered on request."""
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `ViewRenderer.view`."""
+        """Implement `ViewRenderer.view`."""
         from vvgt_cli.dvr import render_view
 
         return render_view(self.scene, camera, settings, blocks)
 
     def forget(self, picture: Picture) -> None:
-        """Do nothing: no picture is kept."""
+        """Do nothing: no picture is cached."""
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """See `Field.normals`."""
+        """Implement `Field.normals`."""
         if self.scene.light is None:
             return None
         from vvgt_cli.closed_form.lit import at_points, mean_normals, normal_points
@@ -147,10 +148,10 @@ class Resident:
         return mean_normals(points, at_points(self.scene, points), self.scene.half)
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """See `Field.sample`."""
+        """Implement `Field.sample`."""
         from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 
-        self.source.one_field()
+        self.source.require_scalar_field()
         scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)
         nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
         for k in range(0, len(gaussians), AT_ONCE):
@@ -162,7 +163,7 @@ class Resident:
         return values
 
     def with_look(self, source: Source) -> Resident:
-        """See `Field.with_look`."""
+        """Implement `Field.with_look`."""
         from vvgt_cli.volume import statistics
 
         if source.layers[0].volume is not self.source.layers[0].volume:
@@ -174,5 +175,5 @@ class Resident:
         return values_digest(self.source.volumes)
 
     def digest(self) -> str | None:
-        """See `Field.digest`."""
+        """Implement `Field.digest`."""
         return self._digest

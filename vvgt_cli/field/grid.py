@@ -1,8 +1,7 @@
-"""How a volume is cut: blocks that are read, tiles of cells that are kept, coarse grids that are marched through.
+"""The division of a volume: blocks that are read, tiles of cells that are stored, coarse grids for marching.
 
-A tile is a cube of base cells, 64 along each axis or fewer where they are wide, a block a box of whole tiles. What is
-kept of a tile depends on the volume and the base cells alone, so that everything that follows is the same to the byte
-whatever blocks were read.
+A tile is a cube of at most 64 base cells along each axis, a block a box of whole tiles. A tile's data depend only on
+the volume and the base cells, so all results are the same to the byte whatever the blocks.
 """
 
 from __future__ import annotations
@@ -13,31 +12,32 @@ from dataclasses import dataclass
 import numpy as np
 
 TILE_BITS = 6  # a tile has at most 2^6 base cells along its edge
-TILE_VOXELS = 7  # and 2^7 voxels, where it has 2^3 cells or more: memory holds blocks of whole tiles
+TILE_VOXELS = 7  # and 2^7 voxels, unless that is fewer than 2^3 cells: blocks of whole tiles must fit in memory
 FEWEST_BITS = 3
-PIECES = 8  # along the longest axis, into which rays are cut; each of a power of two voxels
+PIECES = 8  # along the longest axis, at whose faces rays are cut; their edge is a power of two voxels
 SMALLEST_PIECE, LARGEST_PIECE = 16, 128
 Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """A volume of ``dims`` voxels cut into boxes of ``edge`` voxels, both (x, y, z); numbered x fastest."""
+    """A volume of ``dims`` voxels divided into boxes of ``edge`` voxels, both (x, y, z); numbered with x fastest."""
 
     dims: Triple
     edge: Triple
 
     @property
     def shape(self) -> Triple:
-        """Boxes along each axis."""
+        """Number of boxes along each axis."""
         nx, ny, nz = (-(-n // e) for n, e in zip(self.dims, self.edge, strict=True))
         return nx, ny, nz
 
     def __len__(self) -> int:
+        """Return the number of boxes."""
         return math.prod(self.shape)
 
     def at(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """First voxel (3,) of a box, and that behind its last one, int64."""
+        """Return the first voxel (3,) of a box and the end of its range, exclusive, int64."""
         nx, ny, _ = self.shape
         index = np.array([number % nx, number // nx % ny, number // (nx * ny)], np.int64)
         lo = index * np.array(self.edge, np.int64)
@@ -46,14 +46,14 @@ class Boxes:
 
 @dataclass(frozen=True)
 class CellGrid:
-    """The base cells of a volume and what is made of them.
+    """The base cells of a volume, and the coarser grids derived from them.
 
     Attributes:
-        blocks: that are read, of whole tiles.
+        blocks: the boxes that are read, each of whole tiles.
         exponent: a cell's edges are 2^exponent voxels, (x, y, z).
-        half, step: of the volume, as `vvgt_cli.dvr.Scene` has them.
-        march: the cells that visibility is marched through are 2^march times as wide.
-        field: those of the field of opacity, 2^field times.
+        half, step: half extents and voxel edges of the volume, as in `vvgt_cli.dvr.Scene`.
+        march: cells of the visibility march are 2^march times as wide.
+        field: cells of the opacity field are 2^field times as wide.
         bits: a tile has 2^bits base cells along its edge.
     """
 
@@ -67,33 +67,33 @@ class CellGrid:
 
     @property
     def dims(self) -> np.ndarray:
-        """Voxels (3,) of the volume."""
+        """Size of the volume in voxels, (3,)."""
         return np.array(self.blocks.dims, np.int64)
 
     @property
     def cell(self) -> np.ndarray:
-        """Edges (3,) of a base cell, voxels."""
+        """Edges of a base cell in voxels, (3,)."""
         result: np.ndarray = 2.0 ** np.array(self.exponent)
         return result
 
     @property
     def cell_edge(self) -> np.ndarray:
-        """Edges (3,) of a base cell, unit-frame lengths."""
+        """Edges of a base cell in unit-frame lengths, (3,)."""
         result: np.ndarray = self.cell * np.array(self.step)
         return result
 
     @property
     def tile_cells(self) -> int:
-        """Base cells along the edge of a tile."""
+        """Number of base cells along the edge of a tile."""
         return 1 << self.bits
 
     @property
     def tile(self) -> np.ndarray:
-        """Edges (3,) of a tile, voxels."""
+        """Edges of a tile in voxels, (3,)."""
         return np.round(self.tile_cells * self.cell).astype(np.int64)
 
     def tiles(self, number: int) -> np.ndarray:
-        """Numbers (n, 3) int64, (x, y, z), of the tiles in a block."""
+        """Return the indices (n, 3) int64, (x, y, z), of the tiles in a block."""
         lo, hi = self.blocks.at(number)
         first, last = lo // self.tile, -(-hi // self.tile)
         local = np.argwhere(np.ones((last - first)[::-1]))[:, ::-1]
@@ -101,17 +101,17 @@ class CellGrid:
         return result
 
     def coarse_shape(self, wider: int) -> np.ndarray:
-        """Cells (3,) along each axis, x first, of the grid of cells 2^``wider`` times as wide."""
+        """Return the size (3,), x first, of the grid of cells 2^``wider`` times as wide."""
         return np.ceil(self.dims / (self.cell * 2.0**wider)).astype(np.int64)
 
 
 def tile_bits(exponent: np.ndarray, least: int) -> int:
-    """`CellGrid.bits` of cells of 2^``exponent`` (3,) voxels, of which 2^``least`` must lie in one tile."""
+    """Return `CellGrid.bits` for cells of 2^``exponent`` (3,) voxels, with at least 2^``least`` along a tile's edge."""
     return max(min(TILE_BITS, TILE_VOXELS - int(exponent.max())), FEWEST_BITS, least)
 
 
 def piece_edge(dims: Triple) -> int:
-    """Voxels along the edge of the pieces that rays are cut into: they follow from the volume, not from the blocks."""
+    """Return the edge in voxels of the pieces that rays are cut into, which is independent of the blocks."""
     edge = SMALLEST_PIECE
     while edge < LARGEST_PIECE and edge * PIECES < max(dims):
         edge *= 2

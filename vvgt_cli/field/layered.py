@@ -1,4 +1,4 @@
-"""Volumes that are not one scalar field: label maps, colours, channels, and layers that add up (docs/layers.md)."""
+"""Volumes other than one scalar field: label maps, colours, channels, and summed layers (docs/layers.md)."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
 
 AUTO, NONE = "auto", "none"
-COLOR, ALL = "color", "all"  # of --component
+COLOR, ALL = "color", "all"  # values of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
-MOST_CHANNELS = 6  # that are shown together unasked: of more, colours are hard to tell apart
-DARK, BRIGHT = 0.5, 0.998  # shares of a channel's voxels between which its opacity rises
+MOST_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
+DARK, BRIGHT = 0.5, 0.998  # quantiles of a channel's voxels between which its opacity rises
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a file holds.
+    """The content of a file.
 
     Attributes:
-        volumes: the scalar field; or red, green, blue and perhaps opacity; or a channel each; or label maps.
-        color: they are colours.
-        colors: RGB of each channel, None where the file says none.
-        path: of the file, None where it is in memory.
-        overlapping: they are the layers of a segmentation whose segments overlap.
-        layer: number of the one component that was asked for, None where none was.
-        stored: values stay where they are: what is made of them is made block by block.
-        names: of the channels, where they have any.
-        unasked: they are all channels although none was asked for: what a reader says of them, else None.
+        volumes: the scalar field; or red, green, blue and optionally opacity; or one volume per channel; or label maps.
+        color: the volumes are colours.
+        colors: RGB of each channel, None where the file gives none.
+        path: path of the file, None for content in memory.
+        overlapping: the volumes are layers of a segmentation with overlapping segments.
+        layer: number of the requested component, None for all.
+        stored: values stay in the file, and derived volumes are computed block by block.
+        names: names of the channels, where they have any.
+        components_message: the reader's message about several components if all are shown by default, else None.
     """
 
     volumes: tuple[Volume, ...]
@@ -64,16 +64,16 @@ class Content:
     layer: int | None = None
     stored: bool = False
     names: Sequence[str] = ()
-    unasked: str | None = None
+    components_message: str | None = None
 
     @property
-    def one_field(self) -> bool:
-        """Whether it is scalars or labels alone."""
+    def single_volume(self) -> bool:
+        """Whether this is a single volume of scalars or labels."""
         return not self.color and len(self.volumes) == 1
 
     @cached_property
     def classified(self) -> tuple[Volume, ...]:
-        """What functions are of: opacity or luminance of colours, else the volumes themselves."""
+        """Volumes that functions apply to: opacity or luminance of colours, else the volumes themselves."""
         if not self.color:
             return self.volumes
         source = self.volumes[3] if len(self.volumes) > 3 else _luminance(self.stored, *self.volumes[:3])
@@ -81,54 +81,55 @@ class Content:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Of the first volume, whose values are in memory: for one function after the other."""
+        """Statistics of the first volume, which must be in memory; cached for several functions."""
         return statistics(self.volumes[0])
 
     @cached_property
     def layout(self) -> PreparedVolume:
-        """Of the first volume, as `statistics`."""
+        """Layout of the first volume for the kernels; cached for several functions."""
         from vvgt_cli.dvr.scene import PreparedVolume
 
         return PreparedVolume.of(self.volumes[0])
 
     def held(self) -> Content:
-        """The same with the values of arrays that are computed on demand in memory."""
+        """Return the same content, with lazily computed arrays loaded into memory."""
         volumes = tuple(map(held, self.volumes))
         return (
             self if all(a is b for a, b in zip(volumes, self.volumes, strict=True)) else replace(self, volumes=volumes)
         )
 
     def prepare(self) -> None:
-        """Count and lay out a scalar field now, and not under every function."""
-        if self.one_field:
-            _ = self.statistics, self.layout  # both are kept
+        """Compute a scalar field's statistics and layout once, instead of once per function."""
+        if self.single_volume:
+            _ = self.statistics, self.layout  # both are cached
 
 
 class Access(Protocol):
-    """How volumes are opened, and what their values are: in memory, or block by block."""
+    """Access to volumes and statistics of their values, in memory or block by block."""
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """A file, or what is there already."""
+        """Open a file, or content that is already open."""
 
-    def statistics(self, volume: Volume) -> Statistics: ...
+    def statistics(self, volume: Volume) -> Statistics:
+        """Return the statistics of a volume's data values."""
 
     def labels(self, volume: Volume) -> list[int]:
-        """Those that it holds, ascending."""
+        """Return the labels that a volume holds, ascending."""
 
 
 class InMemory:
-    """`Access` to volumes that are read as a whole."""
+    """`Access` to volumes that are read whole."""
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """See `open_parts`."""
-        return open_parts(source, read) if isinstance(source, str) else content_of(source).held()
+        """Implement `Access.open`."""
+        return open_content(source, read) if isinstance(source, str) else content_of(source).held()
 
     def statistics(self, volume: Volume) -> Statistics:
-        """See `vvgt_cli.volume.statistics`."""
+        """Implement `Access.statistics`."""
         return statistics(volume)
 
     def labels(self, volume: Volume) -> list[int]:
-        """See `labels_in`."""
+        """Implement `Access.labels`."""
         return labels_in(volume)
 
 
@@ -136,40 +137,47 @@ IN_MEMORY = InMemory()
 
 
 def content_of(source: Volume | Content) -> Content:
-    """A volume as the content of a file that holds nothing else."""
+    """Wrap a volume as content, unless it is content already."""
     return source if isinstance(source, Content) else Content((source,))
 
 
-def open_parts(source: str, read: ReadOptions) -> Content:
-    """A volume; where ``read.component`` is "color" or "all", or the file says that it holds colours, its components.
+def open_content(source: str, read: ReadOptions) -> Content:
+    """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    Up to `MOST_CHANNELS` channels of a microscope are "all" where none is asked for.
+    Components are returned for "color" and "all", for a file of colours, and by default for up to `MOST_CHANNELS`
+    channels of a microscope.
 
     Raises:
-        DataError, UsageError: as `open_volume`; components that are no colours.
+        DataError, UsageError: see `open_volume`; also for components that are not colours.
     """
     asked = read.component if read.component in (COLOR, ALL) else None
     try:
         volume = open_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
-        unasked = not (asked or error.color or overlapping)
-        if unasked and not (error.channels and error.count <= MOST_CHANNELS):
+        by_default = not (asked or error.color or overlapping)
+        if by_default and not (error.channels and error.count <= MOST_CHANNELS):
             raise
         if asked == COLOR and error.count not in (3, 4):
-            raise UsageError(
-                f"{source}: {error.count} components; expected three or four for --component color"
-            ) from None
+            raise UsageError(f"{source}: {error.count} components; expected 3 or 4 for --component color") from None
         parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
         if asked == COLOR or (error.color and not asked and not overlapping):
             return Content(parts, True, stored=read.stored)
         colors = error.colors or [None] * error.count
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
         return Content(
-            named, False, colors, source, overlapping, None, read.stored, error.names, str(error) if unasked else None
+            named,
+            False,
+            colors,
+            source,
+            overlapping,
+            None,
+            read.stored,
+            error.names,
+            str(error) if by_default else None,
         )
     if asked:
-        raise UsageError(f"{source}: one component; leave out --component {asked}")
+        raise UsageError(f"{source}: one component; expected several: omit --component {asked}")
     layer = read.component if isinstance(read.component, int) else None
     return Content((volume,), path=source, layer=layer, stored=read.stored)
 
@@ -177,8 +185,8 @@ def open_parts(source: str, read: ReadOptions) -> Content:
 def is_plain(
     opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
-    """Whether it is one scalar field under a function; a label map that is recognised is not."""
-    if not opened.one_field or layers or labels not in (None, NONE):
+    """Return whether the content is one scalar field under a function, and not a recognised label map."""
+    if not opened.single_volume or layers or labels not in (None, NONE):
         return False
     return (
         tf is not None
@@ -196,21 +204,22 @@ def layers_of(
     whole: Sequence[Statistics] = (),
     access: Access = IN_MEMORY,
 ) -> list[Layer]:
-    """The layers that a file's content makes.
+    """Return the layers of a file's content.
 
     Args:
         opened: the content.
-        tf: function, None makes one; of colours its opacity is taken, over their luminance or opacity.
-        labels: table of labels, its file, ``auto``, ``none`` or None.
-        tf_range, distance: of functions.
-        whole: statistics of `Content.classified` over a whole series; none: the volumes' own.
-        access: to the values.
+        tf: function, None for an automatic one; for colours it gives opacity by luminance or stored opacity.
+        labels: label table, its file, ``auto``, ``none`` or None.
+        tf_range: range option of the functions.
+        distance: unit distance option of the functions.
+        whole: statistics of `Content.classified` over a whole series, by default those of the volumes.
+        access: access to the values.
 
     Raises:
-        DataError: labels that do not fit the table.
-        UsageError: a table and a function at once.
+        DataError: the labels do not match the table.
+        UsageError: there is both a label table and a function.
     """
-    labels = _asked(opened, tf, labels, access)
+    labels = _chosen_labels(opened, tf, labels, access)
     if labels not in (None, NONE):
         own = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
@@ -227,33 +236,33 @@ def layers_of(
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
     for volume, one, its in zip(sources, shown, numbers, strict=True):
-        given = function if function is not None and opened.one_field else one
+        given = function if function is not None and opened.single_volume else one
         there = bool(one.support(its.lo, its.hi))
         layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened), there))
     return layers
 
 
-def _asked(
+def _chosen_labels(
     opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None, access: Access
 ) -> str | LabelTable | None:
-    """The labels asked for, ``auto`` where the content is recognised; see `layers_of`."""
+    """Return the requested labels, or ``auto`` for a recognised label map; arguments as in `layers_of`."""
     volume = opened.volumes[0]
     if opened.overlapping:
         if tf is not None or labels == NONE:
             raise UsageError(
-                f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: leave out "
+                f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: omit "
                 "--tf and --labels none, or take one layer with --component N"
             )
         return labels or AUTO
-    if labels not in (None, NONE) and not opened.one_field:
-        raise UsageError(f"{volume.name}: several components; expected one of labels: choose it with --component N")
+    if labels not in (None, NONE) and not opened.single_volume:
+        raise UsageError(f"{volume.name}: several components; expected a label map: choose one with --component N")
     if labels not in (None, NONE) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
-    if labels is None and tf is None and opened.one_field:
+    if labels is None and tf is None and opened.single_volume:
         own = holds_table(opened.path)
         if own or recognised(volume, access.labels):
             reason = "its segments" if own else "its name and its few integers"
-            warnings.warn(f"{volume.name}: taken as a label map, by {reason} (--labels none: as scalars)", stacklevel=3)
+            warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
             return AUTO
     return labels
 
@@ -264,37 +273,37 @@ def functions_of(
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float] = "data",
 ) -> list[TransferFunction]:
-    """What `Content.classified` is shown by, on data values; arguments as `layers_of`, ``numbers`` of each."""
+    """Return a function on data values per volume of `Content.classified`; ``numbers`` are the volumes' statistics."""
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
         return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
-    if opened.one_field:
+    if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
             return [from_histogram(numbers[0], one.hounsfield, one.density)]
         return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
-    if opened.unasked:
-        _say_all(opened, tf)
+    if opened.components_message:
+        _warn_all_channels(opened, tf)
     names = opened.names or [""] * len(numbers)
     return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
 
 
-def _say_all(opened: Content, tf: TransferFunction | None) -> None:
-    """Say that all channels are shown; refuse a function, of which it is not known whose it is."""
+def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
+    """Warn that all channels are shown; refuse a function, which could belong to any of them."""
     if tf is not None:
-        raise UsageError(f"{opened.unasked} (--tf is of one channel; with all, each is shown by its opacity)")
+        raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
         f"{k}{f' {name!r}' if name else ''} {_hex(channel_color(k, color))}"
         for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
     ]
     warnings.warn(
-        f"{opened.path}: {len(shown)} channels, all shown: {', '.join(shown)} (--channel N: one of them)", stacklevel=4
+        f"{opened.path}: {len(shown)} channels, all shown: {', '.join(shown)} (try --channel N for one)", stacklevel=4
     )
 
 
 def channel_color(number: int, color: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """RGB in [0, 1] that a channel is shown in: the file's, else the usual one of its number."""
+    """Return the colour of a channel, RGB in [0, 1]: the file's, else the default for its number."""
     return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
 
 
@@ -303,7 +312,7 @@ def _hex(rgb: Sequence[float]) -> str:
 
 
 def _white(opened: Content) -> float:
-    """Data value of colours that is 1."""
+    """Return the data value that stands for a colour of 1."""
     kind = opened.volumes[0].data.dtype
     return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0
 
@@ -311,9 +320,9 @@ def _white(opened: Content) -> float:
 def _overlapping(
     opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None, access: Access
 ) -> list[Layer]:
-    """Of layers (.seg.nrrd) or segments (DICOM) that overlap, each under its own, or all under one table.
+    """Return overlapping layers (.seg.nrrd) or segments (DICOM), each under its own table, or all under one.
 
-    Empty ones are left out.
+    Empty ones are skipped.
     """
     found = []
     for k, volume in enumerate(opened.volumes):
@@ -321,7 +330,7 @@ def _overlapping(
             table = segments_of(str(opened.path), k) if own else labels
             found.append(_labelled(volume, table, distance, access))
     if not found:
-        raise DataError(f"{opened.path}: no label but 0 in any of its layers; expected some to show")
+        raise DataError(f"{opened.path}: no label other than 0 in any layer; expected some to show")
     return found
 
 
@@ -334,13 +343,13 @@ def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | N
     elif any(numbers):
         table = distinct(numbers)
     else:
-        raise DataError(f"{volume.name}: no label but 0; expected some to show")
+        raise DataError(f"{volume.name}: no label other than 0; expected some to show")
     shows = any(label.opacity > 0 for label in table.labels)
     return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
 
 
 def _luminance(stored: bool, *bands: Volume) -> Volume:
-    """(nz, ny, nx) float32, in the data values of the colours; where they are ``stored`` made block by block."""
+    """Return the luminance (nz, ny, nx) float32 of colours, in their data values; lazy if they are ``stored``."""
 
     def block(slices: tuple[slice, ...]) -> np.ndarray:
         z, y, x = slices
@@ -365,7 +374,7 @@ def _channel(
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
 ) -> TransferFunction:
-    """A channel in its colour; the function's opacity, or a ramp over its brighter voxels."""
+    """Return the function of a channel: its colour with the given function's opacity, or a ramp over bright voxels."""
     from vvgt_cli.look.resolve import percentiles
 
     rgb = channel_color(number, color)
@@ -380,7 +389,7 @@ def _channel(
 
 
 def _function(name: str, lo: float, hi: float, rgb: Sequence[float]) -> TransferFunction:
-    """One colour, opacity from 0 at ``lo`` to 1 at ``hi``."""
+    """Return a function of one colour, with opacity from 0 at ``lo`` to 1 at ``hi``."""
     x = np.array([lo, hi])
     opacity, colors = PiecewiseOpacity(x, np.array([0.0, 1.0])), ColorMap(x, np.array([rgb, rgb], float))
     return TransferFunction(name, opacity, colors, opacity_unit_share=UNIT_SHARE, opacity_unit_label="automatic")

@@ -1,4 +1,4 @@
-"""A volume's field, wherever its values are: in memory, or in blocks where it is asked for or quicker."""
+"""Opening a volume's field in blocks, on request or where that is faster or needs less memory."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.errors import SeveralComponents, Unsuitable, UsageError
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
-from vvgt_cli.field.counting import Counted
+from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.layered import NONE, Content, content_of, open_parts
-from vvgt_cli.field.parts import Parts
-from vvgt_cli.field.runners import Here, Processes, Runner
+from vvgt_cli.field.layered import NONE, Content, content_of, open_content
+from vvgt_cli.field.runners import InProcess, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -36,12 +36,12 @@ from vvgt_cli.volume.stored import Stored, is_file_backed
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 3  # of parts: one more whenever what is in them changes
+LAYOUT = 3  # version of the stored blocks: increase it whenever their content changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
-LARGE = 0.25  # of the free memory: a file of less is read as ever
-PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
-ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # files of which a folder has one
-INDEXES = (".pvti", ".pvd", ".series")  # of files elsewhere
+LARGE = 0.25  # share of the free memory: smaller files are always read whole
+PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
+ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
+INDEXES = (".pvti", ".pvd", ".series")  # files that name other files
 PACKED = (
     ".h5",
     ".hdf5",
@@ -52,21 +52,22 @@ PACKED = (
     ".czi",
     ".nd2",
     ".vtkhdf",
-)  # files of few bytes may hold many voxels
-RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
-OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes a voxel of the kernels' copy; others 4
-LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
+)  # compressed: small files may hold many voxels
+RANGES, LAYER_VOXEL = 0.15, 20  # bytes per voxel: the map of empty space, an optics grid
+OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes per voxel of the kernels' copy; other types 4
+LAYERED_BYTES = 60  # per voxel of an optics grid while a block is in memory
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What a field is opened for.
+class FieldNeeds:
+    """The purpose that a field is opened for, which its stored blocks depend on.
 
     Attributes:
-        gaussians, size: budget, and pixels of the screen.
-        degree: of harmonics that are asked for.
-        most: base cells, None: as many as memory holds.
-        values: it is to stand for any function, so the histogram of its values is needed, too.
+        gaussians: budget of Gaussians.
+        size: edge of the screen in pixels.
+        degree: degree of spherical harmonics that was requested.
+        most: largest number of base cells, None for as many as fit in memory.
+        values: Gaussians will carry values for any function, which needs the histogram as well.
     """
 
     gaussians: int
@@ -77,45 +78,46 @@ class Wanted:
 
 
 @contextmanager
-def beside(output: str | None) -> Iterator[Parts]:
-    """Where blocks are kept: beside the output, so that the same command goes on there after it was ended.
-
-    They are removed where the same command would end the same way.
-    """
+def store_beside(output: str | None) -> Iterator[BlockStore]:
+    """Provide a block store next to the output to resume from, removed after errors that would only repeat."""
     if output is None or output == STDOUT:
         with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-            yield Parts(Path(folder) / "blocks")
+            yield BlockStore(Path(folder) / "blocks")
         return
     target = Path(output).absolute()
-    parts = Parts(target.with_name(f".{target.name[:80]}.blocks"))
+    store = BlockStore(target.with_name(f".{target.name[:80]}.blocks"))
     try:
-        yield parts
+        yield store
     except (UsageError, Unsuitable):
-        parts.remove()
+        store.remove()
         raise
 
 
 @contextmanager
-def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Parts, wanted: Wanted) -> Iterator[Blocked]:
-    """A field in blocks; its workers end with the context, its parts stay.
+def blocked(
+    run: Run, request: SourceRequest, options: BlockOptions, store: BlockStore, needs: FieldNeeds
+) -> Iterator[Blocked]:
+    """Open a field in blocks; its workers end with the context, its stored blocks stay.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.field.source.load`; a pipe, or compressed values that can be read front to
-            back only.
-        Later: other shards' blocks are missing.
+        DataError, UsageError: see `vvgt_cli.field.source.load`; also for a pipe, or compressed values that can only
+            be read from front to back.
+        MissingBlocks: other shards' blocks are missing.
     """
-    request, told = _settled(request, options, wanted.size)
-    if told:
-        run.console.say(told)
-    settings = _settings(request, wanted)
-    edge = parts.kept_edge(settings) if options.size is None else options.size
+    request, message = _resolved(request, options, needs.size)
+    if message:
+        run.console.say(message)
+    settings = _settings(request, needs)
+    edge = store.kept_edge(settings) if options.size is None else options.size
     edge = edge or _edge(request, options)
     with _runner(options) as runner:
-        do = Pass(runner, parts, run.console.bar, options.shard)
-        if parts.open({**settings, "blocks": edge}, ours=options.shard is None):
-            run.console.say(f"going on with the blocks in {parts.folder}")
+        run_pass = Pass(runner, store, run.console.bar, options.shard)
+        if store.open({**settings, "blocks": edge}, ours=options.shard is None):
+            run.console.say(f"resuming with the blocks in {store.folder}")
         run.compile(COUNT_WHOLE + COUNT_REAL)
-        access = Counted(parts, edge, lambda task: do(task, "count"), wanted.values or needs_histogram(request))
+        access = BlockAccess(
+            store, edge, lambda task: run_pass(task, "count"), needs.values or needs_histogram(request)
+        )
         with run.stage("read") as stage:
             source = load(request, access)
             reader, visible = _reader(source, access)
@@ -128,48 +130,48 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
                 other = replace(other, statistics=access.statistics(other.volume))
             return other, *_reader(other, access)
 
-        yield Blocked(source, reader, do, edge, visible, key, look)
+        yield Blocked(source, reader, run_pass, edge, visible, key, look)
 
 
 def _edge(request: SourceRequest, options: BlockOptions) -> int:
-    """Voxels along the edge of blocks, by the memory and what a voxel takes of it."""
+    """Return the edge of blocks in voxels, by free memory and bytes per voxel."""
     given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
-        content = open_parts(given, read)
-        volume, layered = content.volumes[0], layered or not content.one_field
+        content = open_content(given, read)
+        volume, layered = content.volumes[0], layered or not content.single_volume
         layered |= request.tf is None and (holds_table(content.path) or named_so(volume))
     else:
         volume = content_of(given).volumes[0]
     return block_edge(volume, options, LAYERED_BYTES if layered else None)
 
 
-def _settled(request: SourceRequest, options: BlockOptions, size: int) -> tuple[SourceRequest, str | None]:
-    """The request as workers take it too: absolute paths, the level of a file that has several; and what to say."""
+def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple[SourceRequest, str | None]:
+    """Return the request for workers, with absolute paths and a resolution level, and a message or None."""
     if not isinstance(request.volume, str):
         return request, None
     path = request.volume
     if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
-        raise UsageError(f"{path}: a pipe is read front to back, once; blocks need a file")
+        raise UsageError(f"{path}: a pipe, which can only be read once; expected a file to read in blocks")
     absolute = _absolute(path)
     layers = tuple(
         replace(layer, volume=_absolute(layer.volume)) if isinstance(layer.volume, str) else layer
         for layer in request.layers
     )
-    read, told = _at_level(request.read, absolute, options, size)
+    read, message = _at_level(request.read, absolute, options, size)
     if isinstance(read.mask, str):
         read = replace(read, mask=str(Path(read.mask).absolute()))
-    return replace(request, volume=absolute, read=read, layers=layers), told
+    return replace(request, volume=absolute, read=read, layers=layers), message
 
 
 def _absolute(path: str) -> str:
-    """A path as other processes find it, too; a scheme's name is one already."""
+    """Return a path that is valid in other processes; names with a scheme stay as they are."""
     scheme = path.partition(":")[0] in SCHEMES and not os.path.exists(path)
     return path if scheme else str(Path(path).absolute())
 
 
-def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
-    """What reads boxes of a source, and about how many of its voxels are visible."""
+def _reader(source: Source, access: BlockAccess) -> tuple[Reader, float]:
+    """Return the reader of a source's boxes, and its approximate number of visible voxels."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.field.reader import Layers, Scalars
@@ -196,7 +198,7 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
 
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
-    """The level of a file of several: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
+    """Select a resolution level: the requested one, else the coarsest that is fine enough for the screen."""
     from vvgt_cli.cameras.sets import pixel_width
     from vvgt_cli.closed_form.closed_form import MIN_CELL
     from vvgt_cli.volume.registry import level_shapes
@@ -205,7 +207,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     if not shapes:
         if options.level is not None:
             raise UsageError(
-                f"{path}: no OME-Zarr, N5 or Imaris image, which alone have levels; leave out --level {options.level}"
+                f"{path}: has no resolution levels; expected OME-Zarr, N5 or Imaris: omit --level {options.level}"
             )
         return read, None
     if options.level is not None:
@@ -213,11 +215,11 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     fits = [n for n, shape in enumerate(shapes) if shape and 2 / max(shape) <= MIN_CELL * pixel_width(size)]
     level = max(fits, default=0)
     sizes = " x ".join(map(str, reversed(shapes[level])))
-    return replace(read, level=level), f"level {level} of {len(shapes)} ({sizes}): finer ones the screen cannot tell"
+    return replace(read, level=level), f"level {level} of {len(shapes)} ({sizes}): fine enough for the screen"
 
 
 def files_of(path: str) -> list[Path]:
-    """The slices in a folder or of a glob; a file, or a folder of anything else, itself; none where nothing is."""
+    """Return the slices of a folder or glob, or the file or other folder itself; an empty list if nothing exists."""
     from vvgt_cli.volume.tiff.slices import matching, slices_of
 
     if not os.path.exists(path):
@@ -226,10 +228,10 @@ def files_of(path: str) -> list[Path]:
 
 
 def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
-    """Blocks where nothing is asked for: of a large volume or a lazy array; None: it is read as a whole.
+    """Return block options for a large volume or a lazy array, None to read the volume whole.
 
     Raises:
-        DataError, UsageError: as `read_volume`.
+        DataError, UsageError: see `read_volume`.
     """
     given = request.volume
     if not isinstance(given, str) and any(isinstance(one.data, Stored) for one in content_of(given).volumes):
@@ -242,10 +244,10 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
 
 
 def better_in_blocks(request: SourceRequest) -> bool:
-    """Whether a volume in a file is large (`HELD`), or does not fit in memory with the rest.
+    """Return whether a volume in a file is large (`HELD`), or would not fit in memory with everything else.
 
     Raises:
-        DataError, UsageError: as `read_volume`.
+        DataError, UsageError: see `read_volume`.
     """
     from vvgt_cli.closed_form.closed_form import MAX_BASE_CELLS
 
@@ -260,13 +262,13 @@ def better_in_blocks(request: SourceRequest) -> bool:
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     index = os.path.isfile(place) and place.lower().endswith(INDEXES)
     away = path.partition(":")[0] in STEPPED
-    packed = away or zarr or h5 or tiff or index  # few bytes may hold many voxels
+    packed = away or zarr or h5 or tiff or index  # small files may hold many voxels
     size = sum(file.stat().st_size for file in files)
     if not packed and size < HELD and (free is None or size <= LARGE * free):
         return False
     try:
-        content = open_parts(path, replace(request.read, stored=True, packed=True))
-    except SeveralComponents:  # to be chosen: said where it is read
+        content = open_content(path, replace(request.read, stored=True, packed=True))
+    except SeveralComponents:  # reported when it is read
         return False
     volumes = content.volumes
     if not all(map(is_file_backed, volumes)):
@@ -278,11 +280,11 @@ def better_in_blocks(request: SourceRequest) -> bool:
     own = LAYER_VOXEL if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
     held = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size
-    return held + (own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free
+    return held + (own + RANGES) * voxels + PROGRAM + CELL_BYTES * min(voxels, MAX_BASE_CELLS) > free
 
 
 def needs_histogram(request: SourceRequest) -> bool:
-    """Whether a function follows from the histogram of the values, and not from their range alone."""
+    """Return whether a function depends on the histogram of the values, and not only on their range."""
     from vvgt_cli.look import read_transfer_function
 
     if request.tf is None:
@@ -295,14 +297,14 @@ def needs_histogram(request: SourceRequest) -> bool:
 def _runner(options: BlockOptions) -> Runner:
     threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
     if options.scheduler is not None:
-        from vvgt_cli.field.dask_runner import Dask
+        from vvgt_cli.field.dask_runner import DaskRunner
 
-        return Dask(options.scheduler, options.workers, threads)
-    return Processes(options.workers, threads) if options.workers > 1 else Here()
+        return DaskRunner(options.scheduler, options.workers, threads)
+    return Processes(options.workers, threads) if options.workers > 1 else InProcess()
 
 
-def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
-    """All that parts depend on."""
+def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
+    """Return everything that stored blocks depend on."""
     tf = request.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
@@ -313,13 +315,13 @@ def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
         "series": digest(*request.statistics),
-        "gaussians": [wanted.gaussians, wanted.degree, wanted.most, wanted.values],
-        "size": wanted.size,
+        "gaussians": [needs.gaussians, needs.degree, needs.most, needs.values],
+        "size": needs.size,
     }
 
 
 def _facts(volume: Any) -> list[Any]:
-    """A file's name, size and time, or what else a volume or table is."""
+    """Return a file's name, size and time, or a digest of anything else."""
     if not isinstance(volume, str):
         held = content_of(volume).volumes if isinstance(volume, Volume | Content) else ()
         return [digest(*(one.data for one in held)) if held else repr(volume)]

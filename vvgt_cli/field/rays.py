@@ -1,7 +1,7 @@
-"""Rays through a volume of which only blocks are in memory.
+"""Rays through a volume in blocks.
 
-A ray is cut at the faces of pieces, which follow from the volume alone. What a piece shows of a ray composes, front to
-back, with what the others do to what a ray through the whole volume sees: the same bytes whatever the blocks.
+Rays are cut at the faces of pieces, which depend only on the volume. The colours that a ray sees in each piece are
+composited front to back, so the result is the same to the byte whatever the blocks.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, piece_edge
-from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.stored import give_back
 
 SUFFIX = ".rays.npy"
-RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it
-LONGEST = 1.0  # voxels of a segment, which ends within a voxel of its piece
+RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # number of a ray in its bundle, and its colour in a piece
+LONGEST = 1.0  # step in voxels, so that the last one ends within a voxel of its piece
 HALO, LIT_HALO = 1, 2  # voxels around a block that are read with it
 
 
@@ -37,10 +37,10 @@ class Bundle(NamedTuple):
     """Rays of one picture.
 
     Attributes:
-        camera: in the box frame.
-        step: between samples, voxels.
+        camera: camera in the box frame.
+        step: distance between samples in voxels.
         pixels: (n, 2) int64 columns and rows.
-        offsets: (m, 2) places of each pixel's rays, from its centre.
+        offsets: (m, 2) offsets of each pixel's rays from its centre.
     """
 
     camera: Camera
@@ -49,27 +49,28 @@ class Bundle(NamedTuple):
     offsets: np.ndarray
 
     def __len__(self) -> int:
+        """Return the number of rays."""
         return len(self.pixels) * len(self.offsets)
 
 
 @dataclass(frozen=True)
 class RayFile:
-    """Bundles in a file beside the parts, where every worker finds them.
+    """Bundles in a file in the block store, where every worker finds them.
 
     Attributes:
-        path: of the file.
-        kind: of the parts that they leave: the same rays have the same.
+        path: path of the file.
+        kind: kind of the results, which is the same for the same rays.
     """
 
     path: str
     kind: str
 
     @classmethod
-    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, parts: Parts) -> RayFile:
-        """Write them; ``frame`` is the volume's, which is cut into ``blocks``.
+    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
+        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``.
 
         Raises:
-            DataError: the system refuses.
+            DataError: the file cannot be written.
         """
         arrays: dict[str, np.ndarray] = {}
         for k, bundle in enumerate(bundles):
@@ -79,23 +80,23 @@ class RayFile:
             arrays[f"pixels{k}"] = bundle.pixels.astype(np.int32)
             arrays[f"offsets{k}"] = bundle.offsets
         name = f"rays-{digest(blocks, *arrays.values())[:16]}"
-        path = parts.folder / f"{name}.npz"
+        path = store.folder / f"{name}.npz"
         if not path.is_file():
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, allow_pickle=False, **arrays)
         return cls(str(path), name)
 
-    def bundles(self) -> list[Cast]:
-        """As kernels take them, read once a process.
+    def bundles(self) -> list[KernelBundle]:
+        """Return the bundles for the kernels, read once per process.
 
         Raises:
-            DataError: the file is damaged, or gone.
+            DataError: the file is damaged or missing.
         """
         return _read(self.path)
 
 
-class Cast(NamedTuple):
-    """A `Bundle` as kernels take it."""
+class KernelBundle(NamedTuple):
+    """A `Bundle` in the layout of the kernels."""
 
     eye: np.ndarray
     basis: np.ndarray
@@ -106,7 +107,7 @@ class Cast(NamedTuple):
 
 
 @lru_cache(maxsize=2)
-def _read(path: str) -> list[Cast]:
+def _read(path: str) -> list[KernelBundle]:
     try:
         with np.load(path) as found:
             out = []
@@ -114,27 +115,30 @@ def _read(path: str) -> list[Cast]:
                 numbers = found[f"camera{k}"]
                 pixels = np.ascontiguousarray(found[f"pixels{k}"], np.int64)
                 basis = np.ascontiguousarray(numbers[3:12].reshape(3, 3))
-                out.append(Cast(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, found[f"offsets{k}"]))
+                out.append(
+                    KernelBundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, found[f"offsets{k}"])
+                )
             return out
-    except Exception as error:  # whatever zipfile and numpy raise
+    except Exception as error:  # zipfile and numpy raise many types
         raise DataError(f"{path}: cannot be read ({error}); run the same command again") from error
 
 
 def pieces_of(dims: tuple[int, int, int]) -> Boxes:
-    """A volume cut into pieces."""
+    """Return a volume's division into pieces."""
     edge = piece_edge(dims)
     return Boxes(dims, (edge, edge, edge))
 
 
-def leave_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, parts: Parts) -> None:
-    """Cast all rays through the pieces of block ``number``, and leave what they show.
+def save_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, store: BlockStore) -> None:
+    """Cast all rays through the pieces of a block, and save what they see.
 
     Args:
-        rays: of what pictures.
-        block: with `HALO` voxels around it, or `LIT_HALO`.
-        number, blocks: which it is; blocks are of whole pieces.
-        light: that falls on the volume, None for none.
-        parts: where it goes, as a part of the rays' own kind.
+        rays: the rays.
+        block: voxels of the block, with `HALO` or, under light, `LIT_HALO` voxels around it.
+        number: number of the block.
+        blocks: all blocks, each of whole pieces.
+        light: lighting, None for none.
+        store: destination of the result.
     """
     pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
     lo, hi = blocks.at(number)
@@ -145,13 +149,13 @@ def leave_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Lig
         for k, seen in _piece_rays(rays, block.part(first - halo, last + halo), first, last, blocks.dims, light):
             table.append((piece, k, len(seen)))
             found.append(seen)
-    with atomic_write(parts.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
+    with atomic_write(store.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
         np.save(stream, np.concatenate(found) if found else np.empty(0, RAY))
-    parts.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
+    store.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 
 def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
-    """Numbers of the boxes from voxel ``lo`` to ``hi`` (3,), which are faces of some."""
+    """Yield the numbers of the boxes from voxel ``lo`` to ``hi`` (3,), which lie on faces of boxes."""
     nx, ny, _ = boxes.shape
     a, b = lo // boxes.edge, -(-hi // np.array(boxes.edge))
     for k, j, i in itertools.product(*(range(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))):
@@ -161,7 +165,7 @@ def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
 def _piece_rays(
     rays: RayFile, box: Box, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Of the piece from voxel ``lo`` to ``hi`` (3,): number of a bundle, and those of its rays that show something."""
+    """Yield, for the piece from voxel ``lo`` to ``hi`` (3,), bundle numbers and the rays that see anything."""
     from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
     empty = empty_distance(brick_ranges(box.values), box.optics)
@@ -188,7 +192,7 @@ def _piece_rays(
 
 
 def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., None]:
-    """The kernel of a box's kind, with what it reads of it."""
+    """Return the kernel for this kind of box and light, with the box's arguments bound."""
     from functools import partial
 
     from vvgt_cli.dvr import march
@@ -200,16 +204,16 @@ def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., N
     return partial(kernel, box.voxels, box.optics, box.texels, empty, light)
 
 
-def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Places (n,) int64, ascending, of the pixels of a bundle that may meet the box from ``lo`` to ``hi`` (3,), voxels.
+def meeting(cast: KernelBundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Return the indices (n,) int64, ascending, of pixels whose rays may meet the box ``lo`` to ``hi`` (3,), voxels.
 
-    Those within the rectangle around the picture of the box's corners; all, where a corner is not in front of the eye.
+    These are the pixels in the bounding rectangle of the projected corners, or all if a corner is behind the eye.
     """
     corners = np.array(list(itertools.product(*zip(lo, hi, strict=True))), np.float64) - cast.eye
     across, down, ahead = np.linalg.solve(cast.basis.T, corners.T)
     if ahead.min() <= 1e-6 * np.abs(ahead).max():
         return np.arange(len(cast.pixels))
-    edge, lens = 1.0, cast.lens  # a pixel's own width, and what rounding moves
+    edge, lens = 1.0, cast.lens  # margin for a pixel's own width and for rounding
     x, y = across / ahead / lens[0] + lens[2] - 0.5, down / ahead / lens[1] + lens[3] - 0.5
     column, row = cast.pixels.T
     inside = (column >= x.min() - edge) & (column <= x.max() + edge) & (row >= y.min() - edge) & (row <= y.max() + edge)
@@ -217,19 +221,21 @@ def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return result
 
 
-def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> Generator[np.ndarray]:
-    """What whole rays see, (n, m, 4) float64 premultiplied, bundle by bundle, from what blocks ``numbers`` have left.
+def composed(
+    rays: RayFile, store: BlockStore, numbers: Sequence[int], dims: tuple[int, int, int]
+) -> Generator[np.ndarray]:
+    """Yield the colours of whole rays, (n, m, 4) float64 premultiplied, per bundle, from results of blocks ``numbers``.
 
     Raises:
-        DataError: a part is missing or damaged.
+        DataError: a result is missing or damaged.
     """
     pieces, bundles, kind = pieces_of(dims), rays.bundles(), rays.kind
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
     held: dict[int, np.ndarray] = {}
     for number in numbers:
-        path = parts.path(kind, number, SUFFIX)
+        path = store.path(kind, number, SUFFIX)
         offset = 0
-        for piece, k, count in parts.load(kind, number)["table"].tolist():
+        for piece, k, count in store.load(kind, number)["table"].tolist():
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:
@@ -248,7 +254,7 @@ def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[in
 
 
 def _mapped(path: os.PathLike[str], count: int) -> np.ndarray:
-    """The rays of a part, left in their file."""
+    """Return the rays of a result, memory-mapped."""
     try:
         found: np.ndarray = np.load(path, mmap_mode="r")
         if found.dtype == RAY and len(found) == count:
@@ -260,9 +266,9 @@ def _mapped(path: os.PathLike[str], count: int) -> np.ndarray:
 
 
 def front_to_back(pieces: Boxes, eye: np.ndarray, numbers: Sequence[int]) -> list[int]:
-    """``numbers`` of pieces so that of two that a ray from ``eye`` (3,), voxels, meets, the nearer comes first.
+    """Sort the ``numbers`` of pieces front to back for all rays from ``eye`` (3,), voxels.
 
-    Along a ray every index goes one way only, away from the eye's.
+    Along a ray, each index changes in one direction only, away from the eye's.
     """
     edge = np.array(pieces.edge)
     own = np.floor((eye + 0.5) / edge)

@@ -1,4 +1,4 @@
-"""What is read of a box of voxels, by any process: values and their optics, as the kernels take them."""
+"""Boxes of voxels, read by any process: values and their optics in the layout of the kernels."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import numpy as np
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
-from vvgt_cli.field.layered import Content, content_of, open_parts
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
 from vvgt_cli.volume.types import triple
 
 OPEN = 16  # files that a process keeps open
-FEW_SAMPLES = 512  # bricks of layers: each is read for itself
-CLASSIFIED = -1  # in the place of a component: what the opacity of colours follows from
+FEW_SAMPLES = 512  # bricks of layers, each of which is read separately
+CLASSIFIED = -1  # stands for the volume that determines the opacity of colours
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a volume comes from.
+    """The origin of a volume, by which any process can open it.
 
     Attributes:
-        source, read: as `open_parts` takes them; or a volume that is in memory.
-        component: number of it in the file's content, or `CLASSIFIED`.
+        source, read: arguments of `open_content`; or a volume in memory.
+        component: number of the component in the file's content, or `CLASSIFIED`.
     """
 
     source: str | Volume
@@ -37,25 +37,25 @@ class Place:
     component: int = 0
 
     def volume(self) -> Volume:
-        """The volume, opened once a process."""
+        """Return the volume, opened once per process."""
         content = _opened(self.source, self.read) if isinstance(self.source, str) else content_of(self.source)
         return content.classified[0] if self.component == CLASSIFIED else content.volumes[self.component]
 
 
 @lru_cache(maxsize=OPEN)
 def _opened(source: str, read: ReadOptions) -> Content:
-    return open_parts(source, read)
+    return open_content(source, read)
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box of voxels, as the kernels take it.
+    """A box of voxels in the layout of the kernels.
 
     Attributes:
-        values: (z, y, x) that optics are over; of an optics grid its extinction.
-        grid: (z, y, x, 4) float32 of an optics grid, else None.
-        optics: over ``values``.
-        begin: (3,) first voxel of it in the volume, (x, y, z).
+        values: (z, y, x) values that the optics apply to; extinction for an optics grid.
+        grid: (z, y, x, 4) float32 texels of an optics grid, else None.
+        optics: tables over ``values``.
+        begin: (3,) first voxel in the volume, (x, y, z).
     """
 
     values: np.ndarray
@@ -65,16 +65,16 @@ class Box:
 
     @property
     def voxels(self) -> Voxels:
-        """`values` as kernels take them."""
+        """`values` in the kernels' type."""
         return Voxels(self.values)
 
     @property
     def texels(self) -> Texels | None:
-        """`grid` as kernels take it."""
+        """`grid` in the kernels' type."""
         return None if self.grid is None else Texels(self.grid)
 
     def part(self, lo: np.ndarray, hi: np.ndarray) -> Box:
-        """The voxels ``lo`` to ``hi`` (3,) of the volume that lie in it, laid out anew."""
+        """Return a copy of the voxels ``lo`` to ``hi`` (3,) of the volume that lie in this box."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
@@ -83,7 +83,7 @@ class Box:
 
 
 def _kept(values: np.ndarray) -> np.ndarray:
-    """C-contiguous and read-only, as kernels are compiled for."""
+    """Return values C-contiguous and read-only, as kernels are compiled for."""
     out = np.ascontiguousarray(values)
     out = out.copy() if out.base is not None and out is values else out
     out.flags.writeable = False
@@ -92,12 +92,12 @@ def _kept(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scalars:
-    """Reads boxes of one scalar field.
+    """A reader of boxes of one scalar field.
 
     Attributes:
-        place: of the volume.
-        rule: how stored values become those that kernels read.
-        optics: over these.
+        place: origin of the volume.
+        rule: mapping from stored values to those that kernels read.
+        optics: tables over the kernels' values.
     """
 
     place: Place
@@ -106,16 +106,16 @@ class Scalars:
 
     @property
     def all_places(self) -> tuple[Place, ...]:
-        """Where each volume comes from."""
+        """Origin of each volume."""
         return (self.place,)
 
     @property
     def voxel_bytes(self) -> int:
-        """Of a voxel while it is read."""
+        """Bytes per voxel while a box is read."""
         return self.rule.dtype.itemsize + 8
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
-        """The voxels ``lo`` to ``hi`` (3,), x first.
+        """Read the voxels ``lo`` to ``hi`` (3,), x first.
 
         Raises:
             DataError: the file ends early, or a chunk is damaged.
@@ -125,7 +125,7 @@ class Scalars:
             values = stored
         else:
             values = np.empty(stored.shape, self.rule.dtype)
-            for z, plane in enumerate(stored):  # in between it is float64
+            for z, plane in enumerate(stored):  # by planes: the intermediate is float64
                 values[z] = self.rule.apply(plane)
         values.flags.writeable = False
         return Box(values, None, self.optics, lo.astype(np.int64))
@@ -133,15 +133,15 @@ class Scalars:
 
 @dataclass(frozen=True)
 class Layers:
-    """Reads boxes of the optics grid that layers add up to.
+    """A reader of boxes of the optics grid that layers add up to.
 
     Attributes:
-        layers: they, without their volumes.
-        places: where the volume of each comes from, and its colours.
-        grid: their common grid: a volume of one voxel, with the dims beside it.
+        layers: the layers, without their volumes.
+        places: origins of each layer's volume and colours.
+        grid: geometry of the common grid: a volume of one voxel.
         dims: voxels along (x, y, z).
         scale: unit-frame lengths per world length.
-        optics: over extinction.
+        optics: tables over extinction.
     """
 
     layers: tuple[Layer, ...]
@@ -154,11 +154,11 @@ class Layers:
 
     @property
     def all_places(self) -> tuple[Place, ...]:
-        """Where each volume comes from."""
+        """Origin of each volume."""
         return tuple(place for places in self.places for place in places)
 
     def __getstate__(self) -> dict[str, object]:
-        """What other processes get: they open the volumes for themselves."""
+        """Return the fields alone: other processes open the volumes themselves."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
@@ -171,7 +171,7 @@ class Layers:
         return found
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
-        """See `Scalars.box`."""
+        """Implement `Scalars.box`."""
         texels = grid_box(self._opened, hollow(self.grid, self.dims), lo, hi)
         texels *= np.float32(1 / self.scale)
         values = np.ascontiguousarray(texels[..., 3])
@@ -179,7 +179,7 @@ class Layers:
         return Box(values, texels, self.optics, lo.astype(np.int64))
 
     def visible(self) -> float:
-        """About how many voxels are visible: samples of them are read."""
+        """Return the approximate number of visible voxels, from samples."""
         from vvgt_cli.closed_form.samples import SAMPLE, estimate, samples_in, visible_share
 
         places, weights = samples_in(self.dims, np.zeros(3, np.int64), np.array(self.dims))
@@ -190,5 +190,5 @@ class Layers:
 
 
 def hollow(volume: Volume, dims: Sequence[int]) -> Volume:
-    """The grid of a volume of ``dims`` (x, y, z) voxels, without values."""
+    """Return a volume's grid with ``dims`` (x, y, z) voxels, without values."""
     return replace(volume, data=np.broadcast_to(np.uint8(0), tuple(dims)[::-1]), slope=1.0, intercept=0.0)

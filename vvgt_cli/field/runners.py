@@ -1,4 +1,4 @@
-"""Who does the tasks: this process, processes of this machine, or a Dask cluster."""
+"""Runners of tasks: this process, or worker processes of this machine."""
 
 from __future__ import annotations
 
@@ -19,65 +19,70 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 Progress = Callable[[int, int], None]
-IDLE = 3  # pools that broke one after the other without a block done: it is not chance
+IDLE = 3  # consecutive pools that broke without finishing a block
 
 
 class Task(Protocol):
-    """Does one block and leaves its part, of a kind."""
+    """A task that processes blocks one by one, and saves results of one kind."""
 
     @property
-    def kind(self) -> str: ...
+    def kind(self) -> str:
+        """Kind of the results."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """Return the number of blocks."""
 
-    def __call__(self, number: int) -> None: ...
+    def __call__(self, number: int) -> None:
+        """Process block ``number`` and save its result."""
 
 
 class Runner(Protocol):
-    """Does tasks, each at least once; ``workers`` are at work at once. A context: with it ends what was started."""
+    """A runner that processes each block at least once, and the context of its workers."""
 
     @property
-    def workers(self) -> int: ...
+    def workers(self) -> int:
+        """Number of workers that run in parallel."""
 
-    def __enter__(self) -> Any: ...
+    def __enter__(self) -> Any:
+        """Return the runner."""
 
-    def __exit__(self, *error: object) -> None: ...
+    def __exit__(self, *error: object) -> None:
+        """End the workers."""
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None: ...
-
-
-class Alone:
-    """A runner of which nothing is left between two passes."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None: ...
+    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+        """Process the blocks ``numbers``."""
 
 
-class Here(Alone):
-    """One block after the other, in this process."""
+class InProcess:
+    """A runner that processes one block after the other in this process."""
 
     workers = 1
 
+    def __enter__(self) -> Self:
+        """Return the runner."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Do nothing: there are no workers."""
+
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Do the tasks in the order of ``numbers``."""
+        """Process blocks in the order of ``numbers``."""
         for done, number in enumerate(numbers, 1):
             task(number)
             if progress:
                 progress(done, len(numbers))
 
 
-def _begin(threads: int, alive: Connection) -> None:
-    """Before a process imports its kernels: how many threads they have; what is to be said the first process says."""
+def _start_worker(threads: int, alive: Connection) -> None:
+    """Set up a worker before it imports kernels: their threads, and no warnings, which the parent process prints."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
     os.environ["NUMBA_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
-    Thread(target=_end, args=(alive,), daemon=True).start()
+    Thread(target=_exit_with_parent, args=(alive,), daemon=True).start()
 
 
-def _end(alive: Connection) -> None:
-    """End, within a block too, when the other end is closed: by the first process, or because that has ended."""
+def _exit_with_parent(alive: Connection) -> None:
+    """Exit, even within a block, when the parent process closes its end of the pipe or dies."""
     with suppress(OSError):
         alive.poll(None)
     discard_leftovers()
@@ -85,8 +90,8 @@ def _end(alive: Connection) -> None:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """Processes begun within hear no interrupt, which a terminal sends to all; the first one does, afterwards."""
+def _interrupts_blocked() -> Iterator[None]:
+    """Block the interrupt signal, which terminals send to all processes, in processes started within the context."""
     mask = getattr(signal, "pthread_sigmask", lambda *_: ())
     before = mask(getattr(signal, "SIG_BLOCK", 0), {signal.SIGINT})
     try:
@@ -96,40 +101,42 @@ def _deaf() -> Iterator[None]:
 
 
 class Processes:
-    """Processes of this machine, kept for all passes; what a killed one had begun is begun anew by others."""
+    """A pool of worker processes for all passes; blocks of a killed worker are repeated by others."""
 
     def __init__(self, workers: int, threads: int) -> None:
-        """Of ``threads`` in all."""
+        """Share ``threads`` among ``workers``."""
         self.workers, self.threads = workers, max(threads // workers, 1)
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> Self:
+        """Return the runner."""
         return self
 
     def __exit__(self, *error: object) -> None:
+        """End the pool, without waiting for it after an error."""
         if self._pool is not None:
             self._pool.shutdown(wait=error[0] is None, cancel_futures=True)
             self._alive.close()
             self._pool = None
 
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Do the tasks.
+        """Process the blocks ``numbers``.
 
         Raises:
-            DataError: processes end again and again without a block done.
+            DataError: workers are killed repeatedly without finishing a block.
         """
         from concurrent.futures import ProcessPoolExecutor, as_completed
         from concurrent.futures.process import BrokenProcessPool
 
-        left, idle = list(numbers), 0 if self._pool is None else -1  # that of an earlier pass may have broken since
+        left, idle = list(numbers), 0 if self._pool is None else -1  # an earlier pass's pool may have broken since
         while left:
             before = len(left)
             if self._pool is None:
                 context = get_context("spawn")
                 reader, self._alive = context.Pipe(duplex=False)
-                self._pool = ProcessPoolExecutor(self.workers, context, _begin, (self.threads, reader))
+                self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (self.threads, reader))
             try:
-                with _deaf():
+                with _interrupts_blocked():
                     waiting = {self._pool.submit(task, number): number for number in left}
                 for future in as_completed(waiting):
                     future.result()
@@ -144,6 +151,6 @@ class Processes:
                 raise
             if idle >= IDLE:
                 raise DataError(
-                    f"worker processes were ended {IDLE} times without a block done (out of memory?); try --blocks "
+                    f"workers were killed {IDLE} times before finishing a block (out of memory?); try --blocks "
                     "with a smaller size, fewer --workers, or more --memory"
                 )

@@ -1,4 +1,4 @@
-"""What is asked of a run in blocks, and the sizes that follow from the memory."""
+"""Options of a run in blocks, and block sizes that fit in memory."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
-LARGEST, SMALLEST = 256, 16  # voxels along the edge of a block; larger ones are no quicker
-SHARED = 256  # of a shard, whatever the memory of its node: all shards must agree
-MAX_FIELD = 1 << 24  # cells of the field of opacity
-A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
-COUNTED = 3  # bytes a voxel, of types that are counted, beside it
+LARGEST, SMALLEST = 256, 16  # voxels along the edge of a block; larger ones are no faster
+SHARED = 256  # edge for shards, whatever the memory of their nodes: all must agree
+MAX_FIELD = 1 << 24  # cells of the opacity field
+BLOCK_SHARE = 0.3  # of a worker's memory that a block's voxels may take; a conversion takes as much again
+COUNTED = 3  # extra bytes per voxel of types whose values are counted
 ALWAYS = 300 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
 
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """How a volume is gone through.
+    """Options for processing a volume in blocks.
 
     Attributes:
-        size: voxels along the edge of a block, None: by the memory.
-        workers: processes.
-        scheduler: "local", "slurm" or the address of a Dask scheduler; None: without Dask.
-        shard: part (from 1) and count of a job array, None for the whole.
-        level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
+        size: edge of a block in voxels; None chooses it by free memory.
+        workers: number of processes.
+        scheduler: "local", "slurm" or the address of a Dask scheduler; None runs without Dask.
+        shard: index (from 1) and count of a job array; None processes all blocks.
+        level: resolution level of a multi-resolution file, or "full"; None chooses the one that matches the screen.
     """
 
     size: int | None = None
@@ -40,26 +40,27 @@ class BlockOptions:
     level: int | str | None = None
 
     def __post_init__(self) -> None:
+        """Check the block size."""
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):
-            raise UsageError(f"--blocks {self.size}: expected auto, or a power of two from {SMALLEST} on")
+            raise UsageError(f"--blocks {self.size}: expected auto, or a power of two of at least {SMALLEST}")
 
 
 def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) -> int:
-    """Voxels along the edge of a block (of rows of which the file is mapped: across them).
+    """Return the edge of a block in voxels; in mapped files it is that across rows, which are read whole.
 
-    ``voxel``: bytes that one takes, None: by the volume's type.
+    ``voxel`` is the number of bytes per voxel, by default that of the volume's type.
 
     Raises:
-        UsageError: not even the smallest fits the memory.
+        UsageError: not even the smallest block fits in memory.
     """
     free = free_memory()
     if options.size is not None or free is None or options.shard is not None:
         return options.size or SHARED
-    room = A_BLOCK * max(free - ALWAYS, 0) / max(options.workers if options.scheduler in (None, "local") else 1, 1)
+    room = BLOCK_SHARE * max(free - ALWAYS, 0) / max(options.workers if options.scheduler in (None, "local") else 1, 1)
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge, voxel) > room:
         edge //= 2
-    whole = max(edge, 1 << TILE_VOXELS)  # what is integrated at once is whole tiles
+    whole = max(edge, 1 << TILE_VOXELS)  # whole tiles are integrated at a time
     if block_bytes(volume, whole, voxel) > max(free - ALWAYS, 0):
         need = block_bytes(volume, whole, voxel) + ALWAYS
         raise UsageError(
@@ -70,7 +71,7 @@ def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) 
 
 
 def block_bytes(volume: Volume, edge: int, voxel: int | None = None) -> int:
-    """Bytes that a block takes while it is integrated; ``voxel`` of which a voxel."""
+    """Return the bytes that a block takes during integration; ``voxel`` as in `block_edge`."""
     sizes = [min(e + 2, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
     one = volume.data.dtype.itemsize
     beside = 0 if volume.data.dtype == np.float32 else 4 if one > 2 else COUNTED
@@ -78,7 +79,7 @@ def block_bytes(volume: Volume, edge: int, voxel: int | None = None) -> int:
 
 
 def shape_of(volume: Volume, edge: int) -> Triple:
-    """Voxels (x, y, z) along a block: rows of a mapped file are read whole, as they lie together."""
+    """Return the size of a block in voxels (x, y, z); contiguous rows of a mapped file are read whole."""
     if isinstance(volume.data, Stored):
         return edge, edge, edge
     across = 1 << max(math.ceil(math.log2(max(volume.dims[0], 2))), 4)
@@ -86,21 +87,21 @@ def shape_of(volume: Volume, edge: int) -> Triple:
 
 
 def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
-    """The boxes in which values are counted: of whole steps of the lattice of samples."""
+    """Return the boxes in which values are counted, aligned to the lattice of samples."""
     x, y, z = (max(e, spacing) for e in shape_of(volume, edge))
     return Boxes(volume.dims, (x, y, z))
 
 
 def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
-    """Slices of a box of ``boxes`` that hold as many voxels as a block of ``edge``."""
+    """Return how many slices of a box hold as many voxels as a block of ``edge``."""
     x, y, _ = boxes.edge
     return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
 
 
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least: int = 1) -> CellGrid:
-    """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels.
+    """Return the grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels.
 
-    Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
+    Blocks are made of whole tiles, ray pieces and cubes of ``least`` voxels, all powers of two.
     """
     from vvgt_cli.closed_form.moments import blocks
     from vvgt_cli.closed_form.surface_offset import field_coarsening

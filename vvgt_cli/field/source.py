@@ -1,4 +1,4 @@
-"""What a run starts from: a volume under a transfer function, read and checked."""
+"""The input of a run: a volume and its look, read and checked."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": st
 
 @dataclass(frozen=True)
 class SourceRequest:
-    """What to read.
+    """The volume to read, and the look to show it with.
 
     Attributes:
-        volume: path, `example:NAME`, or "-" for raw values on standard input; or what is there already.
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume in memory.
         read: how to read it.
-        tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
+        tf: transfer-function file, colour-map name or function; None derives one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
-        unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
-        statistics: what the functions' nodes follow from in place of the volume's own: those of the whole series, of
-            every component.
-        light: what falls on it; without options what the function's file says, else nothing.
-        labels: table of its labels, the file of one, "auto", "none", or None: "auto" where it is recognised.
-        layers: what is laid over it, each under its own look but the light.
+        unit_distance: a length, "paraview" or "mean-spacing"; None is the function's own distance, else "paraview".
+        statistics: one per component, of the whole series; they replace the volume's own in placing the functions'
+            nodes.
+        light: lighting; by default that of the function's file, if it has any.
+        labels: label table or its file, "auto" or "none"; None is "auto" for a recognised label map.
+        layers: volumes laid over it, each with its own look but the same light.
     """
 
     volume: str | Volume | Content
@@ -56,27 +56,27 @@ class SourceRequest:
 
     @property
     def path(self) -> str:
-        """Of the volume's file.
+        """Path of the volume's file.
 
         Raises:
-            UsageError: a volume that is there already.
+            UsageError: the volume is already in memory.
         """
         if not isinstance(self.volume, str):
             raise UsageError(f"{content_of(self.volume).volumes[0].name}: a volume in memory; expected a path here")
         return self.volume
 
     def paths(self) -> list[str]:
-        """What of it is read from files."""
+        """Return the paths of all files that will be read."""
         given = [self.volume, self.tf, self.labels, self.read.mask]
         given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
         return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
-    """``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
+    """Parse a layer, ``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
 
     Raises:
-        UsageError: a key that is none.
+        UsageError: there is no file, or an unknown key.
     """
     path, *rest = re.split(r",(?=[a-z]+=)", text)
     given: dict[str, Any] = {}
@@ -99,15 +99,15 @@ def parse_layer(text: str, space: str | None = None) -> SourceRequest:
 
 @dataclass(frozen=True)
 class Source:
-    """What was read, and all that it is shown by: something of it is visible.
+    """A volume that was read and its look, which leaves at least something visible.
 
     Attributes:
-        layers: what adds up to it; one where it is a scalar field.
-        volume: the scalar field, or the grid that the layers add up on.
-        statistics: of the first layer's volume.
-        lighting: what falls on it, None for nothing.
-        layout: the volume's, where it is known.
-        series: as ``statistics``, of all frames of the series that it is one of, a layer each; else none.
+        layers: the layers that are summed; a scalar field has one.
+        volume: the scalar field, or the common grid of the layers.
+        statistics: statistics of the first layer's volume.
+        lighting: the lighting, None for none.
+        layout: the volume's layout for the kernels, where it is known.
+        series: for a frame of a series, statistics over all frames, one per layer; else empty.
     """
 
     layers: tuple[Layer, ...]
@@ -119,82 +119,84 @@ class Source:
 
     @property
     def overall(self) -> Statistics:
-        """What frames of a series share: of all of them, else its own."""
+        """Statistics over the whole series, or of the volume if it is not part of one."""
         return self.series[0] if self.series else self.statistics
 
-    def alone(self, number: int) -> Source:
+    def single_layer(self, number: int) -> Source:
         """Return one of the layers as a source of its own, unlit, with the statistics of the first layer."""
         layer = self.layers[number]
         return Source((layer,), layer.volume, self.statistics, series=self.series[number : number + 1])
 
     @property
     def volumes(self) -> list[Volume]:
-        """Every volume that is read: that of each layer, and its colours."""
+        """Every volume that is read: each layer's scalars and colours."""
         return [volume for layer in self.layers for volume in (layer.volume, *(layer.colors or ()))]
 
     @property
     def gridded(self) -> bool:
-        """Whether it is an optics grid: anything but one scalar field under a function."""
+        """Whether this is an optics grid: anything other than one scalar field under a function."""
         return len(self.layers) > 1 or not self.layers[0].interpolated
 
     @property
     def tf(self) -> TransferFunction | LabelTable:
-        """Of the first layer."""
+        """Transfer function or label table of the first layer."""
         return self.layers[0].tf
 
     @property
     def unit_distance(self) -> float:
-        """World length that the opacity of the first layer refers to."""
+        """World length that the first layer's opacity refers to."""
         return self.layers[0].unit_distance
 
     @property
     def unit_label(self) -> str:
-        """How it was chosen."""
+        """How the unit distance was chosen."""
         return self.layers[0].unit_label
 
     @property
     def name(self) -> str:
-        """Of the function, or of all layers."""
+        """Name of the function, or the names of all layers."""
         return " + ".join(layer.name for layer in self.layers) if self.gridded else self.tf.name
 
     @property
     def labels_alone(self) -> bool:
-        """Whether all of it is labels."""
+        """Whether every layer is a label map."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
 
-    def one_field(self) -> None:
+    def require_scalar_field(self) -> None:
         """Refuse an optics grid.
 
         Raises:
-            UsageError: labels, channels or several volumes: there is no one value at a place.
+            UsageError: there are labels, channels or several layers, so a point has no single scalar value.
         """
         if self.gridded:
             raise UsageError(
-                f"{self.name}: labels, channels or layers, which have no one value at a place; expected one scalar "
-                "field (--labels none takes numbers as values)"
+                f"{self.name}: labels, channels or layers, which have no single value at a point; expected one scalar "
+                "field (try --labels none to read label numbers as values)"
             )
 
-    def shown_by(self, tf: TransferFunction) -> Source:
-        """The same volume under another function on data values, unlit.
+    def with_function(self, tf: TransferFunction) -> Source:
+        """Return the same volume under another function on data values, unlit.
 
         Raises:
-            UsageError: an optics grid.
+            UsageError: the source is an optics grid.
         """
         from vvgt_cli.look import unit_distance
 
-        self.one_field()
+        self.require_scalar_field()
         distance, label = unit_distance(None, self.volume, tf)
         layer = replace(self.layers[0], tf=tf, unit_distance=distance, unit_label=label)
         return replace(self, layers=(layer,), lighting=None)
 
-    def labelled_by(self, tables: Sequence[LabelTable]) -> Source:
-        """The same label maps under other tables, one a layer, opacity per `UNIT_SHARE` of the longest edge; unlit.
+    def with_tables(self, tables: Sequence[LabelTable]) -> Source:
+        """Return the same label maps under other tables, one per layer, unlit.
+
+        Opacity is per `UNIT_SHARE` of the longest edge.
 
         Raises:
-            UsageError: not labels alone.
+            UsageError: some layer is not a label map.
         """
         if not self.labels_alone:
-            raise UsageError(f"{self.name}: not labels alone; expected one label map (--labels)")
+            raise UsageError(f"{self.name}: has layers other than labels; expected one label map (--labels)")
         distance = UNIT_SHARE * 2 / self.volume.unit_frame().scale
         layers = [
             replace(layer, tf=table, unit_distance=distance, unit_label=table.name)
@@ -203,7 +205,7 @@ class Source:
         return replace(self, layers=tuple(layers), lighting=None)
 
     def look(self) -> str:
-        """Digest of all that gives the volume its colours, other volumes included."""
+        """Return a digest of everything that determines the colours, other volumes included."""
         if isinstance(self.tf, TransferFunction) and not self.gridded:
             return digest(self.tf.opacity_nodes, self.tf.color_map)
         parts: list[Any] = []
@@ -215,15 +217,15 @@ class Source:
         return digest(*parts)
 
     def optics(self) -> str | None:
-        """Digest of an optics grid's tables, functions and unit distances, not of its volumes; None of scalars."""
+        """Return a digest of an optics grid's tables, functions and unit distances; None for a scalar field."""
         return digest(*self._optics())[:OPTICS] if self.gridded else None
 
     def shown_as(self) -> str:
-        """Digest of functions, tables, unit distances and light, not of any volume."""
+        """Return a digest of functions, tables, unit distances and light, but not of any volume."""
         return digest(*self._optics(), self.lighting and self.lighting.text())[:OPTICS]
 
     def _optics(self) -> list[Any]:
-        """Tables, functions and unit distances."""
+        """Return the tables, functions and unit distances as a flat list."""
         parts: list[Any] = []
         for layer in self.layers:
             tf = layer.tf
@@ -235,18 +237,18 @@ class Source:
         return parts
 
     def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The kernels of a command, of the kind of scene and light that this is."""
+        """Return the names of a command's kernels for this kind of scene and light."""
         lit = names if self.lighting is None else for_light(names, self.lighting.attenuated)
         return for_grid(lit) if self.gridded else lit
 
     def kernel_type(self) -> str:
-        """Name of the type in which kernels read the volume's values."""
+        """Return the name of the type in which kernels read the volume's values."""
         from vvgt_cli.dvr.scene import kernel_type
 
         return "float32" if self.gridded else kernel_type(self.volume)
 
     def scene(self) -> Scene:
-        """The volume laid out for the kernels."""
+        """Return the volume, laid out for the kernels."""
         from vvgt_cli.dvr import Scene
 
         if self.gridded:
@@ -258,11 +260,11 @@ class Source:
 
 
 def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
-    """Read the function, then the volume, and bring them together; ``access`` reads it as a whole or in blocks.
+    """Read the function and the volume; ``access`` decides whether the volume is read whole or in blocks.
 
     Raises:
-        DataError: a file that is not what it must be, or a function that shows nothing of this volume.
-        UsageError: options that do not fit the file.
+        DataError: a file is not valid, or the function leaves the volume invisible.
+        UsageError: the options do not suit the file.
     """
     return load_all(request, (request.tf,), access)[0]
 
@@ -270,10 +272,10 @@ def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
 def load_all(
     request: SourceRequest, tfs: Sequence[str | TransferFunction | None], access: Access = IN_MEMORY
 ) -> list[Source]:
-    """One volume under each of several functions; ``request.tf`` is not used.
+    """Read one volume and return it under each of several functions; ``request.tf`` is ignored.
 
     Raises:
-        DataError, UsageError: as `load`.
+        DataError, UsageError: see `load`.
     """
     from vvgt_cli.look import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.look.resolve import parse_tf_range
@@ -281,15 +283,15 @@ def load_all(
     tf_range = parse_tf_range(request.tf_range)
     functions = [
         read_transfer_function(tf) if isinstance(tf, str) else tf for tf in tfs
-    ]  # small: their errors come first
+    ]  # functions are small: report their errors before reading the volume
     if None in functions and tf_range != "data":
-        raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
+        raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
     content = access.open(request.volume, request.read)
     held = content is request.volume and access is IN_MEMORY  # for several functions
     if not is_plain(content, functions[0], request.labels, request.layers, access):
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
-    unit_distance(request.unit_distance, volume)  # its errors come first
+    unit_distance(request.unit_distance, volume)  # report its errors first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     numbers = content.statistics if held else access.statistics(volume)
     sources = []
@@ -301,8 +303,8 @@ def load_all(
             shown = from_histogram(whole, volume.hounsfield, volume.density)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
-                f"{volume.name}: every voxel is {whole.lo:g}, so that only the box is seen; check --dtype, --component "
-                "or --array, or give a --tf",
+                f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
+                "or --array, or pass --tf",
                 stacklevel=2,
             )
         check_visible(shown, numbers)
@@ -316,16 +318,16 @@ def _layered(
     request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float],
     access: Access,
 ) -> Source:  # fmt: skip
-    """The optics grid that a volume and its layers add up to."""
+    """Return the optics grid that is the sum of a volume and its layers."""
     lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
         try:
             inner = access.open(other.volume, other.read)
-        except SeveralSteps as error:  # of a page, they are not its frames
+        except SeveralSteps as error:  # a layer's time steps are not frames
             name, last = getattr(other.volume, "name", other.volume), error.steps - 1
             raise UsageError(
-                f"{name}: {error.steps} time steps; expected one for a layer: --layer FILE,time=N (0 to {last})"
+                f"{name}: {error.steps} time steps; expected one per layer: --layer FILE,time=N (0 to {last})"
             ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     numbers = access.statistics(layers[0].volume)
@@ -335,10 +337,10 @@ def _layered(
 
 
 def _check_seen(layers: Sequence[Layer], access: Access) -> None:
-    """Refuse layers of which nothing is visible; of several one may be hidden, which is said of functions.
+    """Refuse layers that are all invisible; warn about a single invisible function among others.
 
     Raises:
-        DataError: each is transparent wherever it has values.
+        DataError: every layer is transparent wherever it has values.
     """
     from vvgt_cli.look import check_visible
 
@@ -356,7 +358,7 @@ def _check_seen(layers: Sequence[Layer], access: Access) -> None:
 
 
 def describe_source(source: Source) -> str:
-    """One line: grid, type, values, function, unit distance."""
+    """Return one line that describes a source: grid, type, values, function, unit distance."""
     volume, numbers = source.volume, source.statistics
     grid = " x ".join(map(str, volume.dims))
     holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
@@ -368,7 +370,7 @@ def describe_source(source: Source) -> str:
 
 
 def volume_record(source: Source) -> dict[str, Any]:
-    """The volume as reports show it."""
+    """Return the volume's entry in a report."""
     volume, numbers = source.volume, source.statistics
     return {
         "name": volume.name,
@@ -383,7 +385,7 @@ def volume_record(source: Source) -> dict[str, Any]:
 
 
 def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
-    """The transfer function as reports show it."""
+    """Return the transfer function's entry in a report."""
     return {
         "name": source.name if len(source.layers) > 1 else source.tf.name,
         "given": request.tf is not None,

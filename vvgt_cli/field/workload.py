@@ -1,4 +1,4 @@
-"""`Workload`: what of a scene and a machine the costs of stages depend on (docs/optimize.md, "The plan")."""
+"""`Workload`: the counts and timings that stage costs depend on (fit: docs/optimize.md, "The plan")."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
 SPLAT = 3.35e-3  # seconds of `_splats`'s picture on the two cores that costs were fitted on
-PROBE = 80  # pixels along the edge of the view that is timed
-VIEW, FINER = 0.7, 1.2  # of the view that is timed: a training view, and as much again where it is to judge by
-LARGE, SMALL = 300, 200  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
+PROBE = 80  # pixels along the edge of the timed view
+VIEW, FINER = 0.7, 1.2  # time of a training view per timed view, and of a reference view per training view
+LARGE, SMALL = 300, 200  # largest edge of training views in pixels: larger ones gain nothing (docs/optimize.md)
 PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
 
 
 @dataclass(frozen=True)
 class Workload:
-    """Counts of a scene, and a machine's pace.
+    """Counts of a scene, and the speed of the machine.
 
     Attributes:
-        gaussians: that there will be: the budget, or as many as there are cells.
-        cells: of the closed form's base.
-        voxels: in bricks that are not empty.
-        size: pixels along the edge of the screen that the file is made for.
-        view: seconds of a training view of ``edge`` px, one ray a pixel.
-        pace: how many times as long as the machine of the fit this one takes.
-        there: bytes that the program and the volume have taken when the plan is made.
-        degree: of the Gaussians' harmonics.
-        visible: voxels that have extinction, about.
+        gaussians: expected number of Gaussians: the budget, or the number of cells if smaller.
+        cells: base cells of the closed form.
+        voxels: voxels in non-empty bricks.
+        size: edge of the target screen in pixels.
+        view: seconds for a training view of ``edge`` px with one ray per pixel.
+        pace: time taken relative to the machine that the costs were fitted on.
+        base_bytes: memory in use by the program and the volume when the plan is made.
+        degree: degree of the Gaussians' harmonics.
+        visible: approximate number of voxels with extinction.
         step: (3,) voxel edges, unit frame.
     """
 
@@ -46,91 +46,91 @@ class Workload:
     size: int
     view: float
     pace: float = 1.0
-    there: float = PROGRAM
+    base_bytes: float = PROGRAM
     degree: int = 0
     visible: float = 0.0
     step: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def edge(self) -> int:
-        """Pixels along the edge of a large training view."""
+        """Edge of a large training view in pixels."""
         return view_edge(self.size, small=False)
 
     @cached_property
-    def judged(self) -> int:
-        """Pixels of a test view that are drawn: all, or blocks."""
+    def test_view_pixels(self) -> int:
+        """Number of pixels that are rendered of a test view: all, or those of blocks."""
         return self._pixels(ENOUGH)
 
     @cached_property
     def check_view_pixels(self) -> int:
-        """Pixels of a check view that are drawn: all, or blocks."""
+        """Number of pixels that are rendered of a check view: all, or those of blocks."""
         return self._pixels(FEW)
 
     def _pixels(self, enough: int) -> int:
         blocks = spread_blocks(self.size, self.size, enough=enough)
         return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
 
-    def judging(self, pixels: int) -> float:
-        """Seconds of a reference of so many pixels."""
+    def reference_seconds(self, pixels: int) -> float:
+        """Return the seconds for a reference of this many pixels."""
         return FINER * self.view * pixels / self.edge**2
 
     @property
     def check_view_seconds(self) -> float:
-        """Seconds of a check view's reference."""
-        return self.judging(self.check_view_pixels)
+        """Seconds for the reference of a check view."""
+        return self.reference_seconds(self.check_view_pixels)
 
     def at(self, pace: float) -> Workload:
-        """The same on a machine that takes ``pace`` times as long; what was timed stays."""
+        """Return the workload on a machine that takes ``pace`` times as long; measured times stay."""
         return replace(self, pace=self.pace * pace)
 
 
 def view_edge(size: int, small: bool) -> int:
-    """Pixels along the edge of a training view: the size that the file is made for, or half of it, within bounds."""
+    """Return the edge of a training view in pixels: the target size, or half of it, within bounds."""
     return min(size // 2, SMALL) if small else min(size, LARGE)
 
 
 def expected_wide(gaussians: int, size: int) -> bool:
-    """A guess before the Gaussians are there: fewer than pixels of a view twice as large as small ones are wide."""
+    """Guess whether Gaussians will be wide: there are fewer than pixels in a view twice as large as a small one."""
     return gaussians <= (2 * view_edge(size, small=True)) ** 2
 
 
 def measure(scene: Scene, size: int, gaussians: int) -> Workload:
-    """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
+    """Measure a scene's workload: count it, time a small view, and time a picture of Gaussians for the pace."""
     from vvgt_cli.closed_form.samples import visible_voxels
     from vvgt_cli.dvr.layout import BRICK
 
     x, y, z = (float(edge) for edge in scene.step)
-    case = Workload(
+    workload = Workload(
         gaussians=gaussians,
         cells=0.0,
         voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
         size=size,
         view=VIEW * _view_seconds(scene, view_edge(size, small=False)),
         pace=pace(),
-        there=PROGRAM + _volume_bytes(scene),
+        base_bytes=PROGRAM + _volume_bytes(scene),
         visible=visible_voxels(scene),
         step=(x, y, z),
     )
-    return for_budget(case, gaussians)
+    return for_budget(workload, gaussians)
 
 
-def for_budget(case: Workload, gaussians: int) -> Workload:
-    """The same case with another budget; nothing is timed again."""
+def for_budget(workload: Workload, gaussians: int) -> Workload:
+    """Return the workload for another budget, without measuring again."""
     from vvgt_cli.closed_form.closed_form import expected_cells
 
-    cells = expected_cells(case.visible, np.array(case.step), case.size, gaussians)
-    return replace(case, cells=cells, gaussians=int(min(gaussians, cells)))
+    cells = expected_cells(workload.visible, np.array(workload.step), workload.size, gaussians)
+    return replace(workload, cells=cells, gaussians=int(min(gaussians, cells)))
 
 
 def _volume_bytes(scene: Scene) -> int:
-    """Of the values, and of the copy where the kernels need another type."""
+    """Return the bytes of the values, and of the copy if the kernels need another type."""
     data, values = scene.volume.data, scene.values
     grid = 0 if scene.grid is None else scene.grid.nbytes
     return data.nbytes + grid + (0 if np.may_share_memory(data, values) else values.nbytes)
 
 
 def _view_seconds(scene: Scene, size: int) -> float:
-    """Of a check view with one ray a pixel and half-voxel steps, from one of `PROBE` px."""
+    """Estimate the seconds for a check view with one ray per pixel and half-voxel steps from one of `PROBE` px."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.dvr import RenderSettings, render_view
 
@@ -141,7 +141,7 @@ def _view_seconds(scene: Scene, size: int) -> float:
 
 
 def _quickest(call: Callable[[], object], calls: int = 3) -> float:
-    """Seconds of the quickest of some calls."""
+    """Return the seconds of the fastest call."""
     taken = []
     for _ in range(calls):
         begin = time.perf_counter()
@@ -151,7 +151,7 @@ def _quickest(call: Callable[[], object], calls: int = 3) -> float:
 
 
 def pace() -> float:
-    """How many times as long as the machine of the fit this one takes: to draw Gaussians, on as many threads."""
+    """Return this machine's time relative to the machine of the fit, drawing Gaussians on as many threads."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.splat import render
 
@@ -161,7 +161,7 @@ def pace() -> float:
 
 
 def _splats(count: int, width: float) -> Gaussians:
-    """Faint balls of standard deviation ``width``, the same each time."""
+    """Return faint balls of standard deviation ``width``, the same each time."""
     rng = np.random.default_rng(0)
     means, colors = rng.uniform(-0.5, 0.5, (count, 3)), rng.random((count, 3))
     quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))

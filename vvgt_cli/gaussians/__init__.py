@@ -1,4 +1,4 @@
-"""Gaussians and the standard .ply."""
+"""Gaussians and the standard `.ply`."""
 
 from vvgt_cli.gaussians.header import PlyHeader
 from vvgt_cli.gaussians.ply import PlyOptions, as_stored, describe, in_unit_frame, read_ply, write_ply

@@ -1,4 +1,4 @@
-"""What a file says of its own error: the volume it was made of, how near it is to that, and how long it took."""
+"""A file's record of its own error: the source volume, how closely it was matched, and how long that took."""
 
 from __future__ import annotations
 
@@ -8,35 +8,36 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-WORD = "certificate"  # of the comment
-REPRODUCIBLE = "SOURCE_DATE_EPOCH"  # set: files that can be made again, byte by byte (reproducible-builds.org)
+WORD = "certificate"  # keyword of the comment
+REPRODUCIBLE = "SOURCE_DATE_EPOCH"  # if set, files are reproducible byte by byte (reproducible-builds.org)
 _LAST = 253_402_300_799  # second of the year 9999
 
 
 def epoch() -> int | None:
-    """Seconds since 1970 at which files are to say they were made; None where nothing, or no such number, is given."""
+    """Return the time stamp for files, seconds since 1970, from `SOURCE_DATE_EPOCH`; None if unset or invalid."""
     text = os.environ.get(REPRODUCIBLE, "")
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 16 and int(text) <= _LAST else None
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was measured when Gaussians were made; it holds for these Gaussians alone.
+    """Measurements made during a conversion, valid only for the Gaussians of that file.
 
     Attributes:
-        volume: the volume's name, without its folder.
-        sha256: digest of its values, hexadecimal; None of a volume too large to read once more.
-        look: digest of functions, label tables, opacity distances and light.
-        size, rule: pixels of the screen, and name of the rule of `vvgt_cli.gaussians.rules`, that they are scored by.
-        psnr: dB, mean of the first scored views against the volume.
+        volume: name of the volume, without its folder.
+        sha256: hexadecimal digest of its values; None for a volume too large to be read twice.
+        look: digest of functions, label tables, unit distances and light.
+        size: edge of the target screen in pixels.
+        rule: name of the rule of `vvgt_cli.gaussians.rules` that the scores used.
+        psnr: mean PSNR in dB of the first scored views against the volume.
         views: number of these views.
-        live_psnr: dB of a live file as `vvgt recolor` shows it under its own function; None of others.
-        conditions: name of a viewing condition and dB of each that was scored, worst first.
-        texture: on smooth areas from near, of the Gaussians and of the volume, levels of 255; None where nothing is
-            opaque and smooth.
-        position_error: greatest distance of a centre in the file from where it was computed, in units of the world.
-        seconds: wall time until the scores; None where `SOURCE_DATE_EPOCH` asks for files that can be made again.
-        command: as it was given, without folders, outputs and what changes nothing; None from Python.
+        live_psnr: PSNR in dB of a live file recoloured with its own function; None for other files.
+        conditions: name and PSNR in dB of each viewing condition that was scored, worst first.
+        texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
+            nothing is opaque and smooth.
+        position_error: largest distance of a stored centre from the computed one, in world units.
+        seconds: wall time up to the scores; None if `SOURCE_DATE_EPOCH` requests reproducible files.
+        command: the command line without folders, outputs and options that do not affect the result; None from Python.
     """
 
     volume: str
@@ -54,20 +55,20 @@ class Certificate:
     command: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """By name, without what is not known."""
+        """Return the known values by name."""
         found = vars(self) | {"conditions": dict(self.conditions)}
         return {key: value for key, value in found.items() if value not in (None, {})}
 
     def line(self) -> str:
-        """The comment, without the word before it: ASCII on one line."""
+        """Return the header comment, one line of ASCII without the word "comment"."""
         return f"vvgt {WORD} {json.dumps(self.facts())}"
 
     @classmethod
     def of(cls, text: str) -> Certificate:
-        """What `line` wrote behind its word.
+        """Parse the JSON that `line` writes after its keyword.
 
         Raises:
-            ValueError: anything else.
+            ValueError: the text is something else.
         """
         found = json.loads(text)
         if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):

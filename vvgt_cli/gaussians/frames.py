@@ -1,4 +1,4 @@
-"""Moving Gaussians between frames: similarities and other linear maps of means, scales and rotations."""
+"""Linear transforms of Gaussians between frames: similarities and others, of means, scales and rotations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.types import Gaussians
 
 _HALF = math.sqrt(0.5)
 _IDENTITY = np.eye(3)
-_RIGID = 1e-4  # departure of A^T A from 1 up to which a map is taken as a rotation or a reflection
+_RIGID = 1e-4  # deviation of A^T A from 1 up to which a map counts as a rotation or reflection
 
 # SuperSplat and its relatives show PLY (x, y, z) as (-x, -y, z) with +y up on the screen, so "up" is PLY -y.
 # Each matrix takes the named volume axis to (0, -1, 0); the quaternion (w, x, y, z) is the same rotation.
@@ -31,7 +31,7 @@ UP_NAMES = tuple(_UP)
 
 
 def up_matrix(up: str) -> np.ndarray:
-    """(3, 3) float64 rotation that takes the volume axis ``up`` to the viewers' up, PLY -y.
+    """Return the rotation (3, 3) float64 that takes the volume axis ``up`` to the viewers' up, PLY -y.
 
     Raises:
         UsageError: ``up`` is not one of `UP_NAMES`.
@@ -42,12 +42,12 @@ def up_matrix(up: str) -> np.ndarray:
 
 
 def upright_matrix(up: str) -> np.ndarray:
-    """(3, 3) float64 rotation that takes the volume axis ``up`` to +z, which views have upwards; 1 for "none"."""
+    """Return the rotation (3, 3) float64 that takes the volume axis ``up`` to +z, which is up in views."""
     return _IDENTITY if up == "none" else up_matrix("z").T @ up_matrix(up)
 
 
 def _quaternion_product(left: tuple[float, ...], right: np.ndarray) -> np.ndarray:
-    """Hamilton product of one quaternion (w, x, y, z) with (K, 4), float64."""
+    """Return the Hamilton product of one quaternion (w, x, y, z) with (K, 4), float64."""
     w, x, y, z = left
     table = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     result: np.ndarray = right @ table.T
@@ -55,7 +55,7 @@ def _quaternion_product(left: tuple[float, ...], right: np.ndarray) -> np.ndarra
 
 
 def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
-    """Bake in (or, with ``inverse``, take out) the rotation of `up_matrix`; "none" returns the same object."""
+    """Apply the rotation of `up_matrix`, or undo it with ``inverse``; "none" returns the same object."""
     matrix = up_matrix(up)
     w, x, y, z = _UP[up][1]
     if np.array_equal(matrix, _IDENTITY):
@@ -74,26 +74,22 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
 
 
 def rescale(gaussians: Gaussians, factor: float, before: np.ndarray, after: np.ndarray) -> Gaussians:
-    """``factor * (mean + before) + after`` for the means, in float64; log-scales grow by ln ``factor``.
-
-    Args:
-        factor: > 0, new lengths per old length.
-        before, after: (3,) shifts in old and new lengths.
-    """
+    """Scale by ``factor`` > 0 and shift by (3,): means become ``factor * (mean + before) + after``, in float64."""
     means = (gaussians.means.astype(np.float64) + before) * factor + after
     log_scales = gaussians.log_scales.astype(np.float64) + math.log(factor)
     return replace(gaussians, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
 
 
 def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """``A m`` for means, ``A S A^T`` for covariances; opacities and colours stay, harmonics turn with the Gaussians.
+    """Transform means to ``A m`` and covariances to ``A S A^T``; opacities and colours stay.
 
-    The identity gives the same object. Harmonics are turned, or reflected, by the orthogonal matrix nearest to A.
+    The identity returns the same object. Harmonics are rotated, or reflected, by the orthogonal matrix nearest to A.
 
-    Rotations and reflections turn the quaternions and leave the scales alone (-1 leaves a covariance as it is, so a
-    reflection turns as the rotation -A does); of other maps the principal axes are found anew, by singular values.
+    Rotations and reflections change the quaternions and keep the scales (a covariance is invariant under -1, so a
+    reflection acts like the rotation -A). For other maps, the principal axes are recomputed by singular values.
 
     Args:
+        gaussians: the Gaussians.
         matrix: (3, 3) A, not singular.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
@@ -120,7 +116,7 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
 
 
 def _gradients_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
-    """What Gaussians carry after a linear map: gradients go with its inverse transposed, their lengths stay."""
+    """Return `Gaussians.live` after a linear map: gradients transform by its inverse transpose, lengths stay."""
     if gaussians.live is None:
         return None
     live = gaussians.live.astype(np.float64)
@@ -131,14 +127,14 @@ def _gradients_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | 
 
 
 def factored(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (K, 4) and log scales (K, 3) of covariances ``M M^T``, M (K, 3, 3)."""
+    """Return quaternions (K, 4) and log scales (K, 3) of covariances ``M M^T``, M (K, 3, 3)."""
     axes, sigma, _ = np.linalg.svd(factors)
     quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
     return quaternions, np.log(np.maximum(sigma, np.finfo(np.float64).tiny))
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
+    """Return the rotation matrices (K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -149,7 +145,7 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(K, 4) unit quaternions (w, x, y, z) of (K, 3, 3), by Bar-Itzhack (2000): eigenvectors of symmetric matrices."""
+    """Return unit quaternions (K, 4), (w, x, y, z), of matrices (K, 3, 3), by eigenvectors (Bar-Itzhack 2000)."""
     r = np.moveaxis(rotations, 0, -1)
     table = np.zeros((4, 4, len(rotations)))
     table[0, 0] = r[0, 0] + r[1, 1] + r[2, 2]

@@ -1,8 +1,8 @@
-"""Real spherical harmonics as 3DGS has them: colours that depend on where a Gaussian is seen from.
+"""Real spherical harmonics in the convention of 3DGS: view-dependent colours.
 
 Order, constants and signs are those of Kerbl et al. (2023), `computeColorFromSH`: the real harmonics of degree 1, 2 and
-3, m from -l to l, with the Condon-Shortley phase. A direction leads from the eye to the Gaussian's centre. All float64;
-`vvgt_cli.splat.harmonics` has the kernels.
+3, m from -l to l, with the Condon-Shortley phase. Directions point from the eye to the Gaussian's centre. Everything is
+float64; the kernels are in `vvgt_cli.splat.harmonics`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ C1 = 0.4886025119029199
 C2 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
 C3 = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277
 _LARGEST = float(np.finfo(np.float32).max)
-_DIRECTIONS = 64  # on which rotations are solved: more than coefficients, spread evenly
+_DIRECTIONS = 64  # number of evenly spread directions to solve rotations on, more than coefficients
 
 
 def terms(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
-    """The 15 harmonics of degree 1 to 3 at a unit direction, scalars or arrays."""
+    """Return the 15 harmonics of degree 1 to 3 at a unit direction, given as scalars or arrays."""
     xx, yy, zz = x * x, y * y, z * z
     return (
         -C1 * y,
@@ -45,7 +45,7 @@ def terms(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 
 
 def term_slopes(x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
-    """Derivatives of the polynomials of `terms` by x, y and z; what is 0 for every direction is the number 0."""
+    """Return the derivatives of the polynomials of `terms` by x, y and z; those that vanish are the number 0."""
     xx, yy, zz = x * x, y * y, z * z
     a, b, c = C2
     p, q, r, s, t = C3
@@ -69,23 +69,23 @@ def term_slopes(x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
 
 
 def directions(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (K, 3) from ``eye`` (3,) to ``means`` (K, 3), and the distances (K,); 0 for one at the eye."""
+    """Return unit directions (K, 3) from ``eye`` (3,) to ``means`` (K, 3), 0 at the eye itself, and distances (K,)."""
     offset = np.asarray(means, np.float64) - eye
     distance = np.linalg.norm(offset, axis=1)
     return offset / np.where(distance > 0, distance, 1)[:, None], distance
 
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(K, M) harmonics of degree 1 to ``degree`` at unit directions (K, 3)."""
+    """Return the harmonics (K, M) of degree 1 to ``degree`` at unit directions (K, 3)."""
     d = np.asarray(directions, np.float64)
     found: np.ndarray = np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
     return found
 
 
 def basis_slopes(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(K, M, 3) derivatives of the polynomials of `basis` by the direction (K, 3).
+    """Return the derivatives (K, M, 3) of the polynomials of `basis` by the direction (K, 3).
 
-    The part along the direction means nothing: what moves a direction moves it across.
+    Only the component perpendicular to the direction is meaningful, as directions have unit length.
     """
     d = np.asarray(directions, np.float64)
     rows = [np.stack(np.broadcast_arrays(*row, d[:, 0])[:3], -1) for row in term_slopes(*d.T)[: HARMONICS[degree]]]
@@ -93,7 +93,7 @@ def basis_slopes(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
-    """(K, 3) float64 colours as they are seen from ``eye`` (3,), before what is negative is drawn as 0."""
+    """Return the colours (K, 3) float64 as seen from ``eye`` (3,), before negative values are clamped to 0."""
     colors: np.ndarray = gaussians.colors.astype(np.float64)
     if gaussians.harmonics is not None:
         toward, _ = directions(gaussians.means, eye)
@@ -102,7 +102,7 @@ def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
 
 
 def view_slopes(gaussians: Gaussians, eye: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients with respect to harmonics (K, M, 3) and means (K, 3), given those to `view_colors`, (K, 3)."""
+    """Return gradients with respect to harmonics (K, M, 3) and means (K, 3), given those for `view_colors`, (K, 3)."""
     if gaussians.harmonics is None:
         return np.zeros((len(gaussians), 0, 3)), np.zeros((len(gaussians), 3))
     toward, distance = directions(gaussians.means, eye)
@@ -114,10 +114,11 @@ def view_slopes(gaussians: Gaussians, eye: np.ndarray, slopes: np.ndarray) -> tu
 
 
 def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
-    """Harmonics of Gaussians under ``matrix``: seen along ``matrix @ d`` they show what they showed along d.
+    """Return the harmonics rotated by ``matrix``: along ``matrix @ d`` they have the values they had along d.
 
     Args:
-        matrix: (3, 3), a rotation or a reflection; of others the nearest of these is taken.
+        gaussians: the Gaussians.
+        matrix: (3, 3) rotation or reflection; of other matrices, the nearest of these is used.
     """
     if gaussians.harmonics is None:
         return None
@@ -128,10 +129,10 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
 
 
 def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:
-    """(M, M) that takes coefficients to those under an orthogonal ``matrix`` (3, 3); degrees do not mix.
+    """Return the matrix (M, M) that applies an orthogonal ``matrix`` (3, 3) to coefficients; degrees do not mix.
 
-    Solved on directions all over the sphere: to rounding, as every harmonic of a turned direction is a sum of those of
-    the same degree.
+    It is solved on directions all over the sphere, which is exact up to rounding: a rotated harmonic is a sum of
+    harmonics of the same degree.
     """
     points, inverses = _solver()
     moved = points @ matrix  # rows R^T d
@@ -144,7 +145,7 @@ def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:
 
 @cache
 def _solver() -> tuple[np.ndarray, list[np.ndarray]]:
-    """Directions (n, 3) on a Fibonacci sphere, and the pseudo-inverse of each degree's harmonics there."""
+    """Return directions (n, 3) on a Fibonacci sphere, and the pseudo-inverse of each degree's harmonics there."""
     z = 1 - (2 * np.arange(_DIRECTIONS) + 1) / _DIRECTIONS
     azimuth = 2 * np.pi * np.arange(_DIRECTIONS) * (math.sqrt(5) - 1) / 2
     across = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""The header of a 3DGS `.ply`: parsed and checked before a byte of data is touched."""
+"""The header of a 3DGS `.ply`, which is parsed and checked before any data is read."""
 
 from __future__ import annotations
 
@@ -28,31 +28,32 @@ REQUIRED = (
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
 TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
-MIP = "SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
-_ADVICE = "expected a binary little-endian 3DGS .ply, as vvgt and SuperSplat write it"
+MIP = "SplatRenderMode: mip"  # Brush's marker for opacity compensated for dilation
+_ADVICE = "expected a binary little-endian 3DGS .ply, as written by vvgt and SuperSplat"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileFacts:
-    """What a file says about its Gaussians in the comments of its header; None for what it does not say.
+    """Facts about Gaussians in the comments of a file's header; None where a file does not state one.
 
     Attributes:
         frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
         up: world axis that points up in viewers, one of `frames.UP_NAMES`.
-        scale, centre: of the volume's `UnitFrame`; a file in world space needs both.
+        scale, centre: the volume's `UnitFrame`; a file in world space needs both.
         unit_distance: world length that opacity refers to.
         unit_distance_label: how that distance was chosen; None is written as "given".
-        made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
-        space: anatomical space of the world, "RAS", "LPS" or "none"; written beside the affine.
-        affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
-        light: what fell on the scene.
+        made_for: edge of the target screen in pixels.
+        rule: name of the rendering rule that the Gaussians are made for.
+        space: anatomical space of the world, "RAS", "LPS" or "none"; written with the affine.
+        affine: 3 x 4 row-major, from voxel index (i, j, k, 1) of the volume to world position.
+        light: lighting of the scene.
         optics: digest of the tables and functions of an optics grid.
-        live: of the values that the Gaussians carry; None where they have one look alone.
-        length_unit: of the world, where that has no anatomical space (whose unit is mm).
+        live: the values that the Gaussians carry; None if they have a fixed look.
+        length_unit: unit of the world if it has no anatomical space (whose unit is mm).
         function: name of the transfer function.
-        certificate: what was measured when the Gaussians were made; None of Gaussians that were changed since.
-        legend: of the look that the file has (`legend.legend_text`); of a live file ``live`` says it.
-        date: when it was written, YYYY-MM-DD, of pages alone.
+        certificate: measurements of the conversion; None if the Gaussians were changed since.
+        legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
+        date: date of writing, YYYY-MM-DD, in pages only.
     """
 
     frame: str = "unit"
@@ -75,21 +76,21 @@ class FileFacts:
     date: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """The facts by name."""
+        """Return the facts by name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(FileFacts)}
 
 
 @dataclass(frozen=True)
 class PlyHeader(FileFacts):
-    """What the header says.
+    """The content of a header.
 
     Attributes:
         size: bytes up to and including the line `end_header`.
-        count: vertices.
+        count: number of vertices.
         dtype: one vertex, little-endian, packed.
-        sh_degree: spherical-harmonics degree that the file carries (0 to 3).
-        comments: comment lines, without the word.
-        version: of the vvgt that wrote it, None for other programs.
+        sh_degree: degree of the spherical harmonics in the file (0 to 3).
+        comments: comment lines, without the word "comment".
+        version: version of the vvgt that wrote the file, None for other programs.
     """
 
     size: int
@@ -101,7 +102,7 @@ class PlyHeader(FileFacts):
 
 
 def header_lines(content: bytes, name: str) -> tuple[list[str], int]:
-    """Header lines and the header's size in bytes."""
+    """Return the header's lines and its size in bytes."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise DataError(f"{name}: starts with {content[:8]!r}, not with 'ply'; {_ADVICE}")
     position = 0
@@ -124,7 +125,7 @@ def _vertex_count(words: list[str], name: str) -> int:
     if len(words) != 3 or words[1] != "vertex":
         raise DataError(
             f"{name}: element {' '.join(words[1:])!r}; expected one element, 'vertex' "
-            "(a mesh, or a compressed .ply? try splat-transform to convert it)"
+            "(is it a mesh or a compressed .ply? try splat-transform to convert it)"
         )
     if not (words[2].isdecimal() and words[2].isascii() and len(words[2]) < 16):
         raise DataError(f"{name}: vertex count {words[2]!r}; expected a whole number")
@@ -135,7 +136,7 @@ def _property(words: list[str], fields: dict[str, str], name: str) -> None:
     if len(words) != 3 or words[1] not in TYPES:
         raise DataError(f"{name}: property {' '.join(words[1:])!r}; expected a scalar type and a name")
     if words[2] in fields:
-        raise DataError(f"{name}: property {words[2]!r} stands twice in the header")
+        raise DataError(f"{name}: property {words[2]!r} appears twice in the header; expected it once")
     if (words[2] in REQUIRED or words[2].startswith("f_rest_")) and TYPES[words[1]] != "<f4":
         raise DataError(f"{name}: property {words[2]} is {words[1]}; expected float")
     fields[words[2]] = TYPES[words[1]]
@@ -150,24 +151,24 @@ def _sh_degree(fields: dict[str, str], name: str) -> int:
         raise DataError(f"{name}: {len(rest)} f_rest properties; expected {', '.join(map(str, REST_COUNTS))}")
     odd = set(rest) - set(rest_names(REST_COUNTS[len(rest)]))
     if odd:
-        raise DataError(f"{name}: property {min(odd)} among {len(rest)} f_rest properties; expected f_rest_0 and on")
+        raise DataError(f"{name}: property {min(odd)} among {len(rest)} f_rest properties; expected them from f_rest_0")
     return REST_COUNTS[len(rest)]
 
 
 def rest_names(degree: int) -> list[str]:
-    """Properties of the harmonics up to a degree: red's coefficients, then green's, then blue's."""
+    """Return the property names of harmonics up to a degree: red's coefficients, then green's, then blue's."""
     return [f"f_rest_{i}" for i in range(3 * HARMONICS[degree])]
 
 
 def parse_header(content: bytes, name: str) -> PlyHeader:
-    """Parse the first bytes of a file.
+    """Parse the header of a file.
 
     Args:
-        content: the file's beginning, holding the whole header.
-        name: what errors call the file.
+        content: the beginning of the file, with the whole header.
+        name: name of the file for errors.
 
     Raises:
-        DataError: another magic, format, element, property or type than a 3DGS `.ply` has.
+        DataError: the magic, format, elements, properties or types are not those of a 3DGS `.ply`.
     """
     lines, size = header_lines(content, name)
     formats, count, comments = [], None, []
@@ -196,10 +197,10 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
 
 
 def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dict[str, Any]:
-    """`FileFacts` and the version, from our own comments, for what they say; ``columns`` are the file's.
+    """Return the `FileFacts` and the version that a file's comments state, by name; ``columns`` are the file's.
 
     Raises:
-        DataError: a comment that begins as ours do and is not one.
+        DataError: a comment begins with "vvgt" and is not valid.
     """
     found: dict[str, Any] = {}
     lives: list[dict[str, Any]] = [{}]
@@ -219,9 +220,9 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
             else:
                 found |= _one_comment(word, text)
         except (ValueError, IndexError, UsageError):
-            raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
+            raise DataError(f"{name}: comment {comment[:80]!r}; expected one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
-        raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
+        raise DataError(f"{name}: in world space without scale and centre; expected both in its comments")
     return found | {"live": live_facts(lives, list(columns))}
 
 
@@ -229,7 +230,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
     """Return the facts of a comment ``vvgt WORD TEXT``.
 
     Raises:
-        ValueError, IndexError, UsageError: not a comment that `comment_lines` writes.
+        ValueError, IndexError, UsageError: the comment is not one that `comment_lines` writes.
     """
     words = text.split()
     if word == "frame":
@@ -274,7 +275,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
 
 
 def comment_lines(facts: FileFacts) -> list[str]:
-    """Header lines that hold the version and the facts; `parse_header` reads them."""
+    """Return the header lines with the version and the facts; `parse_header` reads them."""
     lines = [f"comment vvgt {VERSION}"]
     frame = f"comment vvgt frame {facts.frame}"
     if facts.scale is not None and facts.centre is not None:

@@ -1,4 +1,4 @@
-"""What a file says of its look for a legend: the function's nodes over the range of values, or the labels."""
+"""The legend of a look, stored in a file: the function's nodes over the range of values, or the labels."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import numpy as np
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 
-MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: a header has little room
+MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: space in a header is limited
 
 
 def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
-    """One line of JSON: values, unit and nodes (value, opacity, colour), or labels (name, colour) of how many.
+    """Return one line of JSON: value range, unit and nodes (value, opacity, colour), or labels (name, colour).
 
     Args:
-        tf: on data values; of what is neither a function nor a table of labels there is no legend.
-        lo, hi: range of the values.
-        unit: of the values, "" where it is not known.
+        tf: function on data values or label table; anything else has no legend, and None is returned.
+        lo: smallest value.
+        hi: largest value.
+        unit: unit of the values, "" if unknown.
     """
     if isinstance(tf, LabelTable):
         shown = [label for label in tf.labels if label.opacity > 0]
@@ -35,7 +36,7 @@ def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
     nodes: list[list[Any]] = []
     for x in places.tolist():
         below, above = (_node(tf, x, np.nextafter(x, side)) for side in (-np.inf, np.inf))
-        nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # of a step both
+        nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
     return json.dumps({"values": [lo, hi], "unit": unit, "nodes": nodes})
 
 
@@ -49,10 +50,10 @@ def _hex(rgb: Any) -> str:
 
 
 def checked(text: str) -> str:
-    """The text, if it is a legend's.
+    """Check that a text is a legend, and return it.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a legend.
     """
     found = json.loads(text)
     if not isinstance(found, dict) or not ("nodes" in found or "labels" in found):

@@ -1,4 +1,4 @@
-"""What a file of Gaussians that carry values says of the values, in comments of its header."""
+"""Facts about the values that Gaussians carry, in comments of a file's header."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
-COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
-CARRIED, ROW, NUMBER = slice(0, 3), 6, 7  # of what Gaussians carry: own columns, row of a label, number of a layer
-GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
-SAMPLED = 64  # nodes of a function that the header has no other way of holding
-MOST_LABELS = 500  # that a header has room for
-LONGEST = 12_000  # characters of a function: some loaders read no more than the first 10 KB of a header, ours 64
+COLUMNS, NXYZ, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
+VALUES, LABEL_ROW, LAYER_ID = slice(0, 3), 6, 7  # columns of `Gaussians.live`
+GRADIENT = slice(3, 6)  # columns of `Gaussians.live`, stored as normals in a file
+SAMPLED = 64  # nodes of a function that cannot be stored exactly
+MOST_LABELS = 500  # labels that fit in a header
+LONGEST = 12_000  # characters of a function: some loaders read only the first 10 KB of a header, ours 64
 WORD = "live"
 
 
 @dataclass(frozen=True)
 class LiveFacts:
-    """Of the volume that the values are of, and of the look that the file has.
+    """Facts about the volume that the values come from, and about the file's own look.
 
     Attributes:
         lo, hi: range of the data values.
-        dims: voxels along (x, y, z), which unit distances follow from.
+        dims: voxels along (x, y, z), which default unit distances depend on.
         histogram: (256,) counts over the range.
-        unit: of the values, "" where it is not known.
-        function: minimal JSON of the function that colours and opacities are of.
-        labels: of a label map, in the order of the rows that Gaussians carry; then there are no values and no function.
-        name: of one of several layers: its volume's.
-        distance: of one of several layers: world length that its opacity is per.
-        others: of several layers, or channels, those after the first.
+        unit: unit of the values, "" if unknown.
+        function: minimal JSON of the function that the file's colours and opacities come from.
+        labels: labels of a label map, indexed by the row that Gaussians carry; there is no function then.
+        name: name of the volume, for one of several layers.
+        distance: world length that the opacity refers to, for one of several layers.
+        others: the layers or channels after the first.
     """
 
     lo: float
@@ -56,47 +56,47 @@ class LiveFacts:
 
     @property
     def layers(self) -> tuple[LiveFacts, ...]:
-        """Each of several layers alone; of a file of one this one."""
+        """Each layer by itself; at least this one."""
         return (replace(self, others=()), *self.others)
 
     @property
     def grain(self) -> float:
-        """A voxel's edge, unit-frame length, were the box a cube."""
+        """Edge of a voxel, unit-frame length, as if the box were a cube."""
         return 2 / max(self.dims)
 
     @property
     def most_labels(self) -> int:
-        """Labels of the layer that has most, 0 where all carry values."""
+        """Number of labels of the layer with the most, 0 if all layers carry values."""
         return max(len(layer.labels) for layer in self.layers)
 
     @classmethod
     def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction, several: int = 1) -> LiveFacts:
-        """Of a volume, its statistics, and its function on data values; ``several``: layers in a file."""
+        """Return the facts for a volume, its statistics and function; ``several`` is the file's number of layers."""
         counts = tuple(int(n) for n in numbers.histogram)
         unit = "HU" if volume.hounsfield else ""
         lo, hi = numbers.lo, numbers.hi
         return cls(lo, hi, volume.dims, counts, unit, function_text(tf, lo, hi, several))
 
     def statistics(self) -> Statistics:
-        """As functions are put on the data by."""
+        """Return the statistics that place functions on the data."""
         return Statistics(self.lo, self.hi, 0, 0, np.array(self.histogram, np.int64), edges_of(self.lo, self.hi))
 
     def baked(self) -> dict[str, Any]:
-        """The function as JSON holds it."""
+        """Return the file's function as parsed JSON, {} without one."""
         return dict(json.loads(self.function)) if self.function else {}
 
     def tf(self, name: str) -> TransferFunction:
-        """The function that is baked in, on data values.
+        """Return the file's own function on data values.
 
         Raises:
-            DataError: the file ``name`` has none.
+            DataError: the file ``name`` has no function.
         """
         if not self.function:
-            raise DataError(f"{name}: its header has no function; give one with --tf")
+            raise DataError(f"{name}: no function in its header; expected one: pass --tf")
         return read(self.baked(), f"the function of {name}")
 
     def lines(self) -> list[str]:
-        """Comments; `parsed` reads them."""
+        """Return the comment lines; `one_comment` parses them."""
         if self.others:
             return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
@@ -112,14 +112,14 @@ class LiveFacts:
         ]
 
     def title(self) -> str:
-        """The comment that begins what a header says of one of several layers."""
+        """Return the comment line that introduces one of several layers."""
         return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name)}"
 
 
 def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) -> str:
-    """A function on data values as one line of minimal JSON; of what that cannot hold, `SAMPLED` nodes.
+    """Return a function on data values as one line of minimal JSON, resampled to `SAMPLED` nodes if necessary.
 
-    ``several``: functions that a header has room for.
+    ``several`` is the number of functions that must fit in a header.
     """
     try:
         text = json.dumps(json.loads(to_text(tf, "minimal")))
@@ -133,7 +133,7 @@ def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) 
 
 
 def label_text(label: Label) -> str:
-    """Return number, colour, opacity and name; characters of the name that are not ASCII are escaped."""
+    """Return number, colour, opacity and name as text; characters of the name that are not ASCII are escaped."""
     color = " ".join(f"{channel:.4g}" for channel in label.color)
     return f"{label.number} {color} {label.opacity:.6g} {json.dumps(label.name)}"
 
@@ -142,7 +142,7 @@ def one_comment(text: str) -> dict[str, Any]:
     """Return the facts of a comment, given the text after ``vvgt live``.
 
     Raises:
-        ValueError, IndexError: not one that `LiveFacts.lines` writes.
+        ValueError, IndexError: the comment is not one that `LiveFacts.lines` writes.
     """
     word, text = text.split(None, 1)
     words = text.split()
@@ -179,7 +179,7 @@ def _quoted(text: str) -> str:
     """Return the text that a JSON string holds.
 
     Raises:
-        ValueError: no JSON, or of another type.
+        ValueError: the text is not a JSON string.
     """
     found = json.loads(text)
     if not isinstance(found, str):
@@ -188,7 +188,7 @@ def _quoted(text: str) -> str:
 
 
 def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
-    """Facts of the comments of a file with these columns, a mapping a layer; None where one or the other is missing."""
+    """Merge the facts of comments, one mapping per layer; None if some, or some of the file's columns, are missing."""
     whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in found)
     whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in found)
     if not whole or (len(found) > 1 and LAYER not in columns):

@@ -1,8 +1,8 @@
-"""From optical mass to a splat's peak alpha.
+"""Conversion of optical mass to a splat's peak alpha.
 
-A splat blends ``alpha = o g`` with g a Gaussian of projected covariance S, and so takes away the optical depth
-``-ln(1 - o g)``, whose integral over the image is ``Li2(o) 2 pi sqrt(det S)``. It must equal the optical mass M that
-the Gaussian stands for. Viewers cut alpha below 1/255, which loses ``2 pi sqrt(det S) / 255``: it is added back.
+A splat blends ``alpha = o g``, where g is a Gaussian of projected covariance S. Its optical depth ``-ln(1 - o g)``
+integrates to ``Li2(o) 2 pi sqrt(det S)`` over the image, which must equal the optical mass M of the Gaussian. Viewers
+discard alpha below 1/255, which loses ``2 pi sqrt(det S) / 255``; that is added back.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from vvgt_cli.gaussians.constants import DILATION, MAX_ALPHA, MIN_ALPHA
 
 @functools.cache
 def _table() -> tuple[np.ndarray, np.ndarray]:
-    """o on [0, 0.99] and Li2(o) = sum o^k / k^2 there (700 terms: the rest is below 1e-7)."""
+    """Return o on [0, 0.99] and Li2(o) = sum o^k / k^2 (700 terms; the remainder is below 1e-7)."""
     o = np.linspace(0, MAX_ALPHA, 2001)
     k = np.arange(1, 701, dtype=np.float64)
     powers = np.multiply.accumulate(np.broadcast_to(o[:, None], (len(o), len(k))), axis=1)
@@ -24,32 +24,32 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 
 def dilogarithm(o: np.ndarray) -> np.ndarray:
-    """Li2(o) for o in [0, 0.99], any shape."""
+    """Return Li2(o) for o in [0, 0.99], any shape."""
     result: np.ndarray = np.interp(o, *_table())
     return result
 
 
 def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
-    """o in [0, 0.99] with Li2(o) = y; 0.99 where y is larger than Li2(0.99) = 1.59."""
+    """Return o in [0, 0.99] with Li2(o) = y; 0.99 where y exceeds Li2(0.99) = 1.59."""
     o, li2 = _table()
     result: np.ndarray = np.interp(y, li2, o)
     return result
 
 
 def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
-    """Peak alpha (n,) in [0, 0.99] of Gaussians with optical mass (n,) and principal variances (n, 3).
+    """Return the peak alpha (n,) in [0, 0.99] for optical masses (n,) and principal variances (n, 3).
 
-    3DGS has one opacity for all views: the mean over the views along the three principal axes, weighted by the
-    projected areas. ``pixel`` is a pixel's width at the Gaussian (unit-frame lengths): the renderer's dilation counts.
+    3DGS has one opacity for all views: this is the mean over the views along the three principal axes, weighted by
+    projected area. ``pixel`` is the width of a pixel at the Gaussian, unit-frame lengths, for the renderer's dilation.
     """
     areas = projected_areas(variances, pixel)
     return mean_opacity(mass[:, None] / areas + MIN_ALPHA, areas)
 
 
 def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.ndarray, pixel: float) -> np.ndarray:
-    """Peak alpha (n,) that keeps the optical mass of Gaussians of ``opacity`` (n,) when their shape changes.
+    """Return the peak alpha (n,) that preserves the optical mass of Gaussians of ``opacity`` (n,) in another shape.
 
-    Principal variances ``before`` and ``after`` (n, 3), axis by axis; ``pixel`` as in `peak_opacity`.
+    Principal variances ``before`` and ``after`` (n, 3) are in the same order of axes; see `peak_opacity` for ``pixel``.
     """
     areas = projected_areas(after, pixel)
     depths = np.maximum(dilogarithm(opacity) - MIN_ALPHA, 0)[:, None] * (projected_areas(before, pixel) / areas)
@@ -57,7 +57,7 @@ def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.nda
 
 
 def projected_areas(variances: np.ndarray, pixel: float) -> np.ndarray:
-    """(n, 3) ``2 pi sqrt(det S)`` as seen along each principal axis."""
+    """Return ``2 pi sqrt(det S)`` (n, 3) as seen along each principal axis."""
     wide = variances + DILATION * pixel**2  # (n, 3)
     result: np.ndarray = (
         2 * np.pi * np.sqrt(np.stack([wide[:, 1] * wide[:, 2], wide[:, 0] * wide[:, 2], wide[:, 0] * wide[:, 1]], 1))
@@ -66,7 +66,7 @@ def projected_areas(variances: np.ndarray, pixel: float) -> np.ndarray:
 
 
 def mean_opacity(li2: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """(n,) mean over the axes, weighted by ``areas`` (n, 3), of the alpha whose dilogarithm is ``li2`` (n, 3)."""
+    """Return the alpha (n,) with dilogarithm ``li2`` (n, 3), averaged over the axes with weights ``areas`` (n, 3)."""
     opacity = inverse_dilogarithm(li2)
     result: np.ndarray = np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
     return result

@@ -1,4 +1,4 @@
-"""Where results go: checked before the long work, written whole or not at all."""
+"""Outputs of a run: checked before the work begins, and written atomically."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from vvgt_cli.files import atomic_write, check_room, check_target, claim, is_str
 from vvgt_cli.gaussians.formats import ready
 
 STDOUT = "-"
-SMALLEST = 4096  # bytes: a disk that has not got them takes no file
+SMALLEST = 4096  # bytes that must be free on the disk
 
 
 @dataclass(frozen=True)
 class Output:
-    """One result.
+    """One output.
 
     Attributes:
-        option: what the command line calls it, for errors.
+        option: its option on the command line, for errors.
         path: a path, or "-" for standard output.
-        suffixes: names it may end in; none: any.
-        binary: not for a terminal.
-        splats: Gaussians, whose format may need a library.
+        suffixes: allowed file endings; empty allows any.
+        binary: binary data, which must not go to a terminal.
+        splats: the output is a file of Gaussians, whose format may need a library.
     """
 
     option: str
@@ -51,22 +51,23 @@ def _check_one(output: Output, overwrite: bool) -> None:
     except UsageError as error:
         raise UsageError(f"{output.option}: {error}") from None
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable")
+        raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable; choose another")
     check_room(path, SMALLEST)
     if output.splats:
         ready(path)
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: bool) -> None:
-    """Refuse what could not be written, or would replace something, before the work begins.
+    """Check before the work begins that all outputs can be written and replace nothing.
 
     Args:
-        outputs: what will be written.
-        inputs: what is read: no output may replace one.
-        overwrite: existing files may be replaced.
+        outputs: the outputs.
+        inputs: the input files, which no output may replace.
+        overwrite: whether existing files may be replaced.
 
     Raises:
-        UsageError: exists, is an input, two outputs in one place, no such directory, wrong ending, a terminal.
+        UsageError: an output exists, is an input or a terminal, has the wrong ending, no directory, or the same path
+            as another.
         DataError: the disk is full, or a library that a format needs is not installed.
     """
     taken: dict[str, str] = {}
@@ -77,16 +78,16 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
         if place in sources:
             raise UsageError(f"{output.option} {output.path}: is an input of this run; choose another name")
         if place in taken:
-            raise UsageError(f"{output.option} and {taken[place]} both go to {output.path}; choose two names")
+            raise UsageError(f"{output.option} and {taken[place]}: both write to {output.path}; choose two names")
         taken[place] = output.option
 
 
 @contextmanager
 def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: bool) -> Iterator[None]:
-    """`check_outputs`, and within the block nobody else may write them (`vvgt_cli.files.claim`).
+    """Check outputs by `check_outputs`, and lock them within the context (`vvgt_cli.files.claim`).
 
     Raises:
-        UsageError: as `check_outputs`, or another run is at work on one of them.
+        UsageError: see `check_outputs`; also if another run is writing one of them.
     """
     check_outputs(outputs, inputs, overwrite)
     with ExitStack() as claims:
@@ -98,7 +99,7 @@ def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: 
 
 
 def write_text(path: str, text: str, overwrite: bool) -> None:
-    """Write text to a file, whole or not at all, or to standard output."""
+    """Write text to a file, atomically, or to standard output."""
     if path == STDOUT:
         sys.stdout.write(text)
         return

@@ -1,4 +1,4 @@
-"""The standard 3DGS `.ply`: writer, and a reader that checks what it is given (docs/conventions.md)."""
+"""The standard 3DGS `.ply`: a writer and a validating reader (docs/conventions.md)."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, LAYER, NORMAL, NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, LABEL_ROW, LAYER, LAYER_ID, NXYZ, VALUES, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
 FRAMES = ("unit", "world")
 OPAQUE = 16.0  # logit of an opacity of 1 - 1e-7
-_HEADER_LIMIT = 1 << 20  # bytes; a header longer than this is not one
+_HEADER_LIMIT = 1 << 20  # bytes of the longest header that is accepted
 
 
 @dataclass(frozen=True)
 class PlyOptions(FileFacts):
-    """How a file is written, and what it says.
+    """Options for writing a file, and the facts in its header.
 
     Attributes:
-        sh_degree: 0 to 3, of the harmonics in the file: zeros where the Gaussians have none, and those above it left
-            out; None: as the Gaussians have them.
-        comments: write the facts and the version before `end_header`.
+        sh_degree: degree of the harmonics in the file, 0 to 3: missing ones are zeros, and higher ones are dropped;
+            None keeps the Gaussians' own degree.
+        comments: whether the header states the facts and the version.
     """
 
     sh_degree: int | None = None
     comments: bool = True
 
     def __post_init__(self) -> None:
+        """Check the axis, frame and degree."""
         up_matrix(self.up)
         if self.frame not in FRAMES:
             raise UsageError(f"frame {self.frame!r}: expected one of {', '.join(FRAMES)}")
@@ -46,28 +47,28 @@ class PlyOptions(FileFacts):
 
 
 def colors_to_f_dc(colors: np.ndarray) -> np.ndarray:
-    """Display RGB (K, 3) float32 to SH band 0, ``(rgb - 0.5) / SH_C0``, rounded once from float64.
+    """Convert display RGB (K, 3) float32 to SH band 0, ``(rgb - 0.5) / SH_C0``, rounded once from float64.
 
-    With `f_dc_to_colors` a generalised inverse pair: ``W(R(W(c))) == W(c)`` and ``R(W(R(f))) == R(f)`` bit by
-    bit. At every magnitude one of the two grids is the finer by at least 1.13, so the trip through it is
-    exact; ``R(W(c)) == c`` itself holds for c in (0.25, 1.5], where the grid of f_dc is the finer one.
+    With `f_dc_to_colors` this forms a generalised inverse pair: ``W(R(W(c))) == W(c)`` and ``R(W(R(f))) == R(f)`` bit
+    by bit. At every magnitude one of the two floating-point grids is finer by at least 1.13, so a round trip through it
+    is exact; ``R(W(c)) == c`` itself holds for c in (0.25, 1.5], where the grid of f_dc is the finer one.
     """
     with np.errstate(over="ignore"):
         return ((colors.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
 
 
 def f_dc_to_colors(f_dc: np.ndarray) -> np.ndarray:
-    """SH band 0 (K, 3) float32 to display RGB, ``0.5 + SH_C0 * f_dc``, rounded once from float64."""
+    """Convert SH band 0 (K, 3) float32 to display RGB, ``0.5 + SH_C0 * f_dc``, rounded once from float64."""
     return (0.5 + SH_C0 * f_dc.astype(np.float64)).astype(np.float32)
 
 
 def as_stored(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians that a unit-frame file will give back: colours rounded as the file rounds them."""
+    """Return Gaussians as a unit-frame file would restore them, with colours rounded in the same way."""
     return replace(gaussians, colors=f_dc_to_colors(colors_to_f_dc(gaussians.colors)))
 
 
 def property_names(sh_degree: int = 0, live: bool = False) -> list[str]:
-    """Property order of the file, of Gaussians that carry values or not; all float32."""
+    """Return the float32 properties of a file in order; ``live`` adds those of carried values."""
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *rest_names(sh_degree),
@@ -82,29 +83,28 @@ def write_ply(
     options: PlyOptions | None = None,
     normals: np.ndarray | None = None,
 ) -> int:
-    """Write ``gaussians`` (unit frame) to a path or a binary stream; returns the bytes written.
+    """Write Gaussians (unit frame) to a path or a binary stream, and return the number of bytes.
 
-    ``normals`` (K, 3), unit frame; None: zeros.
-
-    A path is written as it is given: callers that must not leave a partial file pass the temporary name of
-    `vvgt_cli.files.atomic_write`. The bytes depend on the arguments and the version only.
+    A path is written directly: callers that must not leave a partial file pass the temporary name of
+    `vvgt_cli.files.atomic_write`. The bytes depend only on the arguments and the version. ``normals`` (K, 3), unit
+    frame, are zeros by default.
 
     Raises:
-        DataError: no Gaussians, or a value that float32 cannot hold in the chosen frame.
+        DataError: there are no Gaussians, or a value does not fit in float32 in the chosen frame.
         UsageError: the frame is "world" and scale or centre are missing.
     """
     options = options or PlyOptions()
     if gaussians.live is None or options.live is None:
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     if not len(gaussians):
-        raise DataError("no Gaussians to write: a .ply needs at least one")
+        raise DataError("no Gaussians to write; expected at least one")
     rows = ply_rows(gaussians, options, normals)
     degree = gaussians.degree if options.sh_degree is None else options.sh_degree
     header = ply_header(len(gaussians), degree, options, gaussians.live is not None)
     if isinstance(target, str | Path):
         with open(target, "wb") as stream:
             stream.write(header)
-            stream.write(rows.data)  # not tofile, whose errors do not say why
+            stream.write(rows.data)  # not tofile, whose errors give no reason
     else:
         target.write(header)
         target.write(rows.tobytes())
@@ -112,16 +112,16 @@ def write_ply(
 
 
 def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None = None) -> np.ndarray:
-    """The rows (K, properties) float32 little-endian of a file, as `write_ply` writes them.
+    """Return the rows of a file, (K, properties) float32 little-endian, as written by `write_ply`.
 
     Raises:
-        DataError, UsageError: as `write_ply`.
+        DataError, UsageError: see `write_ply`.
     """
     _check_rotations(gaussians, "Gaussians to write")
     placed = turn(gaussians if options.sh_degree is None else gaussians.of_degree(options.sh_degree), options.up)
     if options.frame == "world":
         if options.scale is None or options.centre is None:
-            raise UsageError("frame 'world' needs the volume's unit frame: pass PlyOptions(scale=..., centre=...)")
+            raise UsageError("frame 'world': no unit frame of the volume; expected PlyOptions(scale=..., centre=...)")
         centre = up_matrix(options.up) @ np.array(options.centre)
         placed = rescale(placed, 1 / options.scale, np.zeros(3), centre)
     f_dc = colors_to_f_dc(placed.colors)
@@ -140,14 +140,14 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
-        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, CARRIED]
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, VALUES]
         if options.live is not None:
             return _with_numbers(rows, placed.live, options.live)
     return rows
 
 
 def _with_numbers(rows: np.ndarray, live: np.ndarray, facts: LiveFacts) -> np.ndarray:
-    """Rows (K,) of floats and of what `_numbers` names; the floats alone where it names nothing."""
+    """Append the integer columns of `_numbers` to rows of floats (K, n); without any, return the rows."""
     extra = _numbers(facts)
     if not extra:
         return rows
@@ -159,20 +159,20 @@ def _with_numbers(rows: np.ndarray, live: np.ndarray, facts: LiveFacts) -> np.nd
 
 
 def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
-    """Name and type of columns of whole numbers, in the file and in memory, and which of what Gaussians carry they are.
+    """Return the integer columns: name, type in the file and in memory, and column of `Gaussians.live`.
 
-    The row of a label takes a byte, or two of more than 256; the number of a layer one.
+    The row of a label takes one byte, or two for more than 256 labels; the number of a layer takes one.
     """
     labels, found = facts.most_labels, []
     if labels:
-        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), ROW))
+        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), LABEL_ROW))
     if facts.others:
-        found.append((LAYER, "uchar", "u1", NUMBER))
+        found.append((LAYER, "uchar", "u1", LAYER_ID))
     return found
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
-    """The header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live``: they carry values."""
+    """Return the header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live`` adds carried values."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
     if live and options.live is not None:
@@ -182,7 +182,7 @@ def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False)
 
 
 def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarray]:
-    """Header and structured rows; the size is checked before anything is allocated."""
+    """Read the header and structured rows; the size is checked before anything is allocated."""
     if isinstance(source, str | Path):
         with open(seekable(source), "rb") as stream:
             header = parse_header(stream.read(_HEADER_LIMIT), name)
@@ -199,26 +199,26 @@ def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarr
 
 
 def check_size(header: PlyHeader, size: int, name: str) -> None:
-    """Raise DataError unless a file of ``size`` bytes is as long as its header says."""
+    """Raise DataError unless a file of ``size`` bytes has the size that its header states."""
     expected = header.size + header.count * header.dtype.itemsize
     if size != expected:
         what = "truncated" if size < expected else "followed by data that is not Gaussians"
         raise DataError(
-            f"{name}: {size} bytes, but its header promises {header.count} vertices of {header.dtype.itemsize} "
-            f"bytes ({expected} bytes in all): the file is {what}"
+            f"{name}: {size} bytes; expected {expected} by its header, for {header.count} vertices of "
+            f"{header.dtype.itemsize} bytes: the file is {what}"
         )
 
 
 def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
-    """Read a 3DGS `.ply` from a path or a binary stream, in the frame that the file is in.
+    """Read a 3DGS `.ply` from a path or a binary stream, in the frame of the file.
 
-    Properties are found by name, so files of other programs in another order are read too. Harmonics that are all 0
-    are none, but padding: ``header.sh_degree`` tells how far it goes. In other programs' files rows that cannot be
-    drawn are skipped, with a warning (`_drawable`).
+    Properties are found by name, in any order. Harmonics that are all zero count as padding and are dropped;
+    ``header.sh_degree`` keeps their degree. In files of other programs, rows that cannot be rendered are skipped with a
+    warning.
 
     Raises:
-        DataError: not a binary little-endian 3DGS `.ply`, of another size than its header says, or a file of vvgt with
-            values that are not finite.
+        DataError: the file is not a binary little-endian 3DGS `.ply`, does not have the size that its header states, or
+            was written by vvgt and has values that are not finite.
     """
     name = str(source) if isinstance(source, str | Path) else getattr(source, "name", "stream")
     header, rows = _rows(source, str(name))
@@ -245,15 +245,15 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 
 def _drawable(rows: np.ndarray, header: PlyHeader, name: str) -> np.ndarray:
-    """Return rows of finite values and rotation other than 0, opacity +inf as `OPAQUE`; a warning counts the rest."""
+    """Return the rows with finite values and non-zero rotation, opacity +inf as `OPAQUE`, and warn about the rest."""
     opaque = rows["opacity"] == np.inf
     rotated = np.any([rows[f"rot_{k}"] for k in range(4)], axis=0)
     values = [rows[key] for key in (*REQUIRED, *rest_names(header.sh_degree)) if key != "opacity"]
     kept = np.logical_and.reduce([*map(np.isfinite, values), rotated, opaque | np.isfinite(rows["opacity"])])
     if kept.all() and not opaque.any():
         return rows
-    told = {"skipped (a value not finite, or rotation 0)": ~kept, "taken as opaque (opacity inf)": opaque & kept}
-    counts = [f"{count} {what}" for what, these in told.items() if (count := np.count_nonzero(these))]
+    found = {"skipped (a value not finite, or rotation 0)": ~kept, "read as opaque (opacity inf)": opaque & kept}
+    counts = [f"{count} {what}" for what, these in found.items() if (count := np.count_nonzero(these))]
     warnings.warn(f"{name}: of {len(kept)} Gaussians {', '.join(counts)}", stacklevel=3)
     rows = rows[kept]
     rows["opacity"][opaque[kept]] = OPAQUE
@@ -261,44 +261,44 @@ def _drawable(rows: np.ndarray, header: PlyHeader, name: str) -> np.ndarray:
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray | None:
-    """(K, M, 3) of a file's (K, 3 M), channel after channel; None where not a bit is set."""
+    """Reshape a file's harmonics from (K, 3 M), channel by channel, to (K, M, 3); None if all bits are zero."""
     terms = rest.shape[1] // 3
     return rest.reshape(-1, 3, terms).transpose(0, 2, 1) if rest.view(np.uint32).any() else None
 
 
 def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray | None:
-    """(K, 6) that Gaussians carry, None of a file without.
+    """Return `Gaussians.live` from the columns of a file, None if it has none.
 
     Raises:
-        DataError: a length or a spread that is none.
+        DataError: a length, spread, layer or label is out of range.
     """
     if header.live is None:
         return None
     facts, numbers = header.live, _numbers(header.live)
-    found = columns(*COLUMNS, *NORMAL, *(name for name, *_ in numbers))
+    found = columns(*COLUMNS, *NXYZ, *(name for name, *_ in numbers))
     if facts.others and not facts.most_labels:
-        found = np.insert(found, ROW, 0, axis=1)
-    layer = found[:, NUMBER].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
+        found = np.insert(found, LABEL_ROW, 0, axis=1)
+    layer = found[:, LAYER_ID].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
     if layer.max(initial=0) >= len(facts.layers):
-        raise DataError(f"a layer of number {layer.max()}; expected fewer than {len(facts.layers)}")
+        raise DataError(f"layer number {layer.max()}; expected less than {len(facts.layers)}")
     if facts.most_labels:
         most = np.array([len(one.labels) or 1 for one in facts.layers])[layer]
-        wrong = np.flatnonzero(found[:, ROW] >= most)
+        wrong = np.flatnonzero(found[:, LABEL_ROW] >= most)
         if len(wrong):
-            raise DataError(f"a label of row {found[wrong[0], ROW]:g}; expected fewer than {most[wrong[0]]}")
+            raise DataError(f"label row {found[wrong[0], LABEL_ROW]:g}; expected less than {most[wrong[0]]}")
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
-        raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
+        raise DataError("negative spreads, or lengths that are not positive; expected the columns that vvgt writes")
     return found
 
 
 def _check_rotations(gaussians: Gaussians, name: str) -> None:
     zero = int(np.count_nonzero(~gaussians.quaternions.any(axis=1)))
     if zero:
-        raise DataError(f"{name}: {zero} of {len(gaussians)} rotation quaternions are zero; expected any other norm")
+        raise DataError(f"{name}: {zero} of {len(gaussians)} rotation quaternions are zero; expected a non-zero norm")
 
 
 def in_unit_frame(gaussians: Gaussians, header: PlyHeader) -> Gaussians:
-    """Undo the frame and the up rotation that the file's comments name (without comments: as they are)."""
+    """Undo the frame and the up rotation that the file's comments state, if any."""
     if header.frame == "world":
         assert header.scale is not None  # parse_header has checked it
         shift = up_matrix(header.up) @ np.array(header.centre)
@@ -307,24 +307,24 @@ def in_unit_frame(gaussians: Gaussians, header: PlyHeader) -> Gaussians:
 
 
 def opacity(gaussians: Gaussians) -> np.ndarray:
-    """Peak alpha (K,) float64 of the logits."""
+    """Return the peak alpha (K,) float64 from the logits."""
     return 1 / (1 + np.exp(-np.clip(gaussians.opacity_logits.astype(np.float64), -700, 700)))
 
 
 def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
-    """What `describe` says of values that Gaussians carry."""
+    """Return the part of `describe` about carried values."""
     assert gaussians.live is not None
     if facts.others:
-        told_of: list[dict[str, object]] = []
+        rows_of_layers: list[dict[str, object]] = []
         for k, layer in enumerate(facts.layers):
-            own = gaussians.take(np.flatnonzero(gaussians.live[:, NUMBER] == k))
-            told = {"labels": len(layer.labels)} if layer.labels else {
+            own = gaussians.take(np.flatnonzero(gaussians.live[:, LAYER_ID] == k))
+            look = {"labels": len(layer.labels)} if layer.labels else {
                 "values": [layer.lo, layer.hi], "function": layer.baked().get("name", ""),
             }  # fmt: skip
-            told_of.append({"layer": k, "name": layer.name, "gaussians": len(own), **told})
-        return {"live_layers": told_of}
+            rows_of_layers.append({"layer": k, "name": layer.name, "gaussians": len(own), **look})
+        return {"live_layers": rows_of_layers}
     if facts.labels:
-        counts = np.bincount(gaussians.live[:, ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
+        counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
         rows = zip(facts.labels, counts, strict=True)
         return {"live_labels": [{"label": e.number, "name": e.name, "gaussians": n} for e, n in rows]}
     found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
@@ -334,7 +334,7 @@ def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
 
 
 def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
-    """What `vvgt info` says about a `.ply`: counts, frame, box and the spread of sizes and opacities."""
+    """Return the summary of a `.ply` for `vvgt info`: counts, frame, box, and percentiles of sizes and opacities."""
     summary: dict[str, object] = {
         "gaussians": len(gaussians),
         "bytes": header.size + header.count * header.dtype.itemsize,

@@ -1,4 +1,4 @@
-"""Images: EXR and PNG in and out, over backgrounds and side by side."""
+"""Images: reading and writing EXR and PNG, compositing and comparison."""
 
 from vvgt_cli.images.compose import contact_sheet, over, side_by_side
 from vvgt_cli.images.exr import read_exr, write_exr

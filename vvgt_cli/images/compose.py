@@ -1,4 +1,4 @@
-"""Images over a background, beside each other, and as a sheet."""
+"""Compositing of images: over a background, side by side, and as a contact sheet."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BL
         (..., 3) float32, not clipped.
 
     Raises:
-        DataError: not four channels.
+        DataError: the image does not have four channels.
     """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.shape[-1:] != (4,):
@@ -33,7 +33,7 @@ def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BL
 
 
 def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
-    """Return (h, w, 3) float32 in [0, 1] of an RGB or premultiplied RGBA image."""
+    """Return an RGB or premultiplied RGBA image as (h, w, 3) float32 in [0, 1]."""
     image = np.asarray(image, dtype=np.float32)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
@@ -45,12 +45,12 @@ def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> 
     """Join reference, ours and their absolute difference times ``gain``, (h, 3 w, 3) float32 in [0, 1].
 
     Args:
-        reference: (h, w, 3) RGB, or (h, w, 4) premultiplied RGBA, which is shown over black.
-        ours: of the same size.
+        reference: (h, w, 3) RGB, or (h, w, 4) premultiplied RGBA, which is composited over black.
+        ours: an image of the same size.
         gain: factor of the difference.
 
     Raises:
-        DataError: sizes that differ, or not images.
+        DataError: the sizes differ, or the arrays are not images.
     """
     left, right = _rgb(reference, BLACK), _rgb(ours, BLACK)
     if left.shape != right.shape:
@@ -65,16 +65,18 @@ def contact_sheet(
 
     Args:
         images: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA each; at least one.
-        columns: images a row; default: the square root of their number, rounded up.
+        columns: images per row, by default the square root of their number, rounded up.
         gap: pixels between images.
-        background: behind RGBA images, in the gaps and in empty places.
+        background: colour behind RGBA images, in gaps and in empty cells.
 
     Raises:
-        DataError: no images, sizes that differ, ``columns`` below 1.
+        DataError: there are no images, their sizes differ, or ``columns`` is below 1.
     """
     tiles = [_rgb(image, background) for image in images]
     if not tiles or len({tile.shape for tile in tiles}) != 1:
-        raise DataError(f"{len(tiles)} images of {len({t.shape for t in tiles})} sizes; expected some, of one size")
+        raise DataError(
+            f"{len(tiles)} images of {len({t.shape for t in tiles})} sizes; expected at least one, one size"
+        )
     columns = math.ceil(math.sqrt(len(tiles))) if columns is None else columns
     if columns < 1:
         raise DataError(f"{columns} columns; expected at least one")

@@ -1,4 +1,4 @@
-"""OpenEXR in and out: premultiplied float RGBA, the camera in the header."""
+"""Reading and writing OpenEXR: premultiplied float RGBA, with the camera in the header."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.images.png import check_pixels
 
-CAMERA_ATTRIBUTE = "vvgt.camera"  # a string, JSON: EXR's own matrix attributes hold float32 only
+CAMERA_ATTRIBUTE = "vvgt.camera"  # a JSON string, because EXR's matrix attributes are only float32
 CHANNELS = ("R", "G", "B", "A")
 
 
@@ -27,18 +27,18 @@ def write_exr(
     camera: Camera | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write channels R, G, B, A, ZIP-compressed; float32 values come back bit for bit.
+    """Write channels R, G, B, A, ZIP-compressed; float32 values are preserved exactly.
 
     Args:
-        path: the file; written beside and renamed.
+        path: the file, which is written atomically.
         rgba: (h, w, 4) premultiplied.
         half: write 16-bit floats.
-        camera: written as the header attribute ``vvgt.camera``: a JSON object with ``rotation`` (3 x 3,
+        camera: camera for the header attribute ``vvgt.camera``: a JSON object with ``rotation`` (3 x 3,
             world to camera, OpenCV axes), ``translation`` (3), ``fx fy cx cy`` (pixels), ``width height name``.
         overwrite: replace an existing file.
 
     Raises:
-        DataError: wrong shape, a camera of another size, or the file cannot be written.
+        DataError: the shape is wrong, the camera has another size, or the file cannot be written.
         UsageError: the file exists and ``overwrite`` is not set.
     """
     import OpenEXR
@@ -62,13 +62,14 @@ def write_exr(
 
 
 def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
-    """Read channels R, G, B, A (A may be missing: then opaque) and the camera, if the header has one.
+    """Read channels R, G, B, A (opaque if A is missing) and the camera, if the header has one.
 
     Returns:
         (rgba, camera): (h, w, 4) premultiplied float32, and the camera or None.
 
     Raises:
-        DataError: not an EXR image, more than 2^28 pixels, channels missing or subsampled, a faulty camera.
+        DataError: the file is not an EXR image or has more than 2^28 pixels, channels are missing or subsampled, or the
+            camera is not valid.
     """
     import OpenEXR
 
@@ -96,10 +97,10 @@ def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
 
 
 def _camera_of(text: Any, path: str | PathLike[str]) -> Camera | None:
-    """Return the camera that a header attribute holds, None without one."""
+    """Parse the camera of a header attribute, None if there is none."""
     if text is None:
         return None
     try:
         return Camera(**json.loads(text))
     except (TypeError, ValueError, KeyError, RecursionError) as error:
-        raise DataError(f"{path}: header attribute {CAMERA_ATTRIBUTE} is not a camera ({error})") from error
+        raise DataError(f"{path}: header attribute {CAMERA_ATTRIBUTE}; expected a camera ({error})") from error

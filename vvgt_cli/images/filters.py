@@ -1,14 +1,14 @@
-"""Separable filters for images, as products with short banded matrices (fast without scipy)."""
+"""Separable image filters, as products with short banded matrices (fast without SciPy)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-BLOCK = 64  # outputs a product; the band's share of the work is largest near the kernel's own size
+BLOCK = 64  # outputs per product; the share of useful work is largest near the kernel's size
 
 
 def correlate(image: np.ndarray, kernel: np.ndarray, axis: int) -> np.ndarray:
-    """Correlate (h, w) with ``kernel`` (k,) along ``axis`` 0 or 1, valid part only: that axis shrinks by k - 1."""
+    """Correlate an image (h, w) with ``kernel`` (k,) along an axis, which shrinks by k - 1 to the valid part."""
     if axis == 1:
         return correlate(image.T, kernel, 0).T
     count = image.shape[0] - kernel.size + 1
@@ -25,5 +25,5 @@ def correlate(image: np.ndarray, kernel: np.ndarray, axis: int) -> np.ndarray:
 
 
 def separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    """Correlate (h, w) with the outer product of two kernels, valid part only."""
+    """Correlate an image (h, w) with the outer product of two kernels, valid part only."""
     return correlate(correlate(image, along_x, 1), along_y, 0)

@@ -1,7 +1,7 @@
-"""LDR-FLIP: what differs when one flips between two images.
+"""LDR-FLIP, the perceived difference when alternating between two images.
 
 Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild: "FLIP: A Difference Evaluator for Alternating
-Images", HPG 2020. Section and equation names are the paper's.
+Images", HPG 2020. Sections and equations are numbered as in the paper.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def flip(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float = PIX
     """Return the mean LDR-FLIP error in [0, 1] of sRGB images in [0, 1], (h, w, 3) each (clipped).
 
     Raises:
-        DataError: shapes that differ or are not (h, w, 3).
+        DataError: the shapes differ or are not (h, w, 3).
     """
     return float(flip_map(reference, ours, pixels_per_degree).mean(dtype=np.float64))
 
 
 def flip_map(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """Return LDR-FLIP of each pixel, (h, w) float32 in [0, 1]; arguments and errors as `flip`."""
+    """Return the LDR-FLIP error of each pixel, (h, w) float32 in [0, 1]; arguments and errors as in `flip`."""
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 3 or 0 in reference.shape:
         raise DataError(f"FLIP of images {reference.shape} and {ours.shape}; expected the same (h, w, 3)")
@@ -56,7 +56,7 @@ def flip_map(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float =
 
 
 def _opponent(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB (h, w, 3) to planes (Y, Cx, Cz) (3, h, w) float32 of the linearised opponent space."""
+    """Convert sRGB (h, w, 3) to the planes Y, Cx, Cz, (3, h, w) float32, of the linearised opponent space."""
     planes = np.ascontiguousarray(np.moveaxis(srgb, -1, 0), dtype=np.float32)
     linear = np.where(
         planes > 0.04045,
@@ -76,7 +76,7 @@ def _mix(matrix: np.ndarray, planes: np.ndarray) -> np.ndarray:
 
 
 def _perceived(opponent: np.ndarray, ppd: float) -> np.ndarray:
-    """Return planes filtered by the contrast sensitivity, as Hunt-adjusted L*a*b* (3, h, w) (section 4.1)."""
+    """Filter planes by contrast sensitivity and convert them to Hunt-adjusted L*a*b* (3, h, w) (section 4.1)."""
     radius = math.ceil(3 * math.sqrt(CSF_WIDEST / (2 * math.pi**2)) * ppd)
     x = np.arange(-radius, radius + 1) / ppd
     filtered = np.empty_like(opponent)
@@ -103,14 +103,14 @@ def _hunt_lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the HyAB distance of L*a*b* planes (3, h, w) -> (h, w) (equation 5)."""
+    """Return the HyAB distance (h, w) of L*a*b* planes (3, h, w) (equation 5)."""
     difference = a - b
     result: np.ndarray = np.abs(difference[0]) + np.hypot(difference[1], difference[2])
     return result
 
 
 def _redistributed(distance: np.ndarray) -> np.ndarray:
-    """Turn a colour distance into an error in [0, 1], most of it for small distances (section 4.1.4)."""
+    """Map colour distances to errors in [0, 1], most of that range for small distances (section 4.1.4)."""
     green, blue = (_hunt_lab(np.eye(3, dtype=np.float32)[i].reshape(3, 1, 1)) for i in (1, 2))
     largest = float(_hyab(green, blue)[0, 0]) ** Q_C
     power = distance ** np.float32(Q_C)
@@ -138,6 +138,6 @@ def _features(y: np.ndarray, ppd: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _balanced(kernel: np.ndarray) -> np.ndarray:
-    """Scale positive weights to a sum of 1, negative ones to -1."""
+    """Scale positive weights to a sum of 1, negative ones to a sum of -1."""
     result: np.ndarray = np.where(kernel < 0, kernel / -kernel[kernel < 0].sum(), kernel / kernel[kernel > 0].sum())
     return result

@@ -1,4 +1,4 @@
-"""PSNR, SSIM, FLIP and texture as the conventions define them ("Units of a report")."""
+"""PSNR, SSIM, FLIP and texture, as defined in the conventions ("Units of a report")."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from vvgt_cli.images.compose import over
 from vvgt_cli.images.filters import separable
 from vvgt_cli.images.flip import flip
 
-CAP = 150.0  # dB: a root-mean-square error of 3e-8, half a float32 step at 1; identical images have this value
+CAP = 150.0  # dB: an RMS error of 3e-8, half a float32 step at 1; the value of identical images
 RADIUS, SIGMA = 5, 1.5  # of SSIM's window, 11 x 11
 C1, C2 = 0.01**2, 0.03**2  # of SSIM
-FOREGROUND = 0.01  # reference alpha above which a pixel is foreground
+FOREGROUND = 0.01  # alpha of the reference above which a pixel is foreground
 FINE, COARSE = 1.2, 5.0  # standard deviations in pixels of the blurs whose difference is texture
-REACH = 3.0  # standard deviations at which a blur ends
+REACH = 3.0  # standard deviations at which a blur is truncated
 BLOCK = 32  # pixels along an edge of the blocks in which texture is measured
-OPAQUE, SMOOTH = 0.97, 1.0  # alpha, and the reference's own texture in levels of 255, of blocks that are measured
+OPAQUE, SMOOTH = 0.97, 1.0  # least alpha, and largest texture of the reference (levels of 255), of measured blocks
 WORST = 0.1  # share of the blocks that count as the worst
 
 
@@ -31,11 +31,11 @@ def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None
 
     Args:
         reference: (h, w) or (h, w, c).
-        ours: of the same shape.
-        mask: (h, w) bool, the pixels to count; default all.
+        ours: an image of the same shape.
+        mask: (h, w) bool, the pixels to count, by default all.
 
     Raises:
-        DataError: shapes that differ, no pixel to count, values that are not finite.
+        DataError: the shapes differ, no pixel is counted, or a value is not finite.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape:
@@ -43,27 +43,27 @@ def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None
     if mask is not None:
         reference, ours = reference[mask], ours[mask]
     if reference.size == 0:
-        raise DataError("PSNR over no pixels; expected some")
+        raise DataError("PSNR of no pixels; expected at least one")
     difference = np.clip(reference, 0, 1) - np.clip(ours, 0, 1)
     error = float(np.mean(np.square(difference, dtype=np.float64)))
     if not math.isfinite(error):
-        raise DataError("PSNR of images that are not finite")
+        raise DataError("PSNR of images that are not finite; expected finite values")
     return min(CAP, -10 * math.log10(error)) if error > 0 else CAP
 
 
 def ssim(reference: np.ndarray, ours: np.ndarray) -> float:
     """Return the mean SSIM of RGB images in [0, 1]: 11 x 11 Gaussian window, sigma 1.5, data range 1.
 
-    The mean is over channels and over the pixels whose window lies inside the image: what scikit-image's
-    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`` gives.
+    The mean is over channels and over the pixels whose window lies inside the image, like scikit-image's
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)``.
     Structural similarity: Wang, Bovik, Sheikh, Simoncelli 2004.
 
     Args:
         reference: (h, w, c), h and w at least 11.
-        ours: of the same shape.
+        ours: an image of the same shape.
 
     Raises:
-        DataError: shapes that differ, or an image smaller than the window.
+        DataError: the shapes differ, or an image is smaller than the window.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape or reference.ndim != 3:
@@ -90,7 +90,7 @@ def _ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _gaussian(radius: int, sigma: float) -> np.ndarray:
-    """Return the kernel (2 radius + 1,) of a blur, float64; its sum is 1."""
+    """Return the kernel (2 radius + 1,) float64 of a blur, with a sum of 1."""
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     result: np.ndarray = kernel / kernel.sum()
     return result
@@ -98,15 +98,15 @@ def _gaussian(radius: int, sigma: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores of one view; None where a number has no meaning for it.
+    """Scores of one view; None where a score is undefined.
 
     Attributes:
         psnr: dB, RGB over black, whole frame; at most 150 (identical images).
         psnr_white, psnr_alpha: the same over white, and of alpha.
         psnr_foreground, psnr_white_foreground, psnr_alpha_foreground: over the pixels whose reference alpha
             is above 0.01; None without any.
-        ssim: over black, whole frame; None for images smaller than 11 x 11, or not asked for.
-        flip: LDR-FLIP over black at 67 pixels per degree, 0 is best; None if not asked for.
+        ssim: over black, whole frame; None for images smaller than 11 x 11, or if not requested.
+        flip: LDR-FLIP over black at 67 pixels per degree, 0 is best; None if not requested.
     """
 
     psnr: float
@@ -121,15 +121,14 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Scores(ViewScore):
-    """Means over views of the numbers of `ViewScore`; ``dataclasses.asdict`` gives what JSON can hold.
+    """Means of `ViewScore` over views; ``dataclasses.asdict`` returns JSON values.
 
-    Views without foreground are counted and skipped in every mean (in the whole-frame ones only while
-    some view has a foreground).
+    Views without foreground are excluded from the means, unless no view has any.
 
     Attributes:
-        views: views compared.
-        views_without_foreground: of them, those with no reference alpha above 0.01.
-        per_view: the numbers of each view, in order.
+        views: number of views.
+        views_without_foreground: number of views with no reference alpha above 0.01.
+        per_view: the scores of each view, in order.
     """
 
     views: int
@@ -142,11 +141,11 @@ def score_view(reference: np.ndarray, ours: np.ndarray, *, perceptual: bool = Tr
 
     Args:
         reference: (h, w, 4) premultiplied RGBA, display-referred.
-        ours: of the same shape.
-        perceptual: compute SSIM and FLIP too (about 0.2 s a view of 800 x 800).
+        ours: an image of the same shape.
+        perceptual: compute SSIM and FLIP too (about 0.2 s per view of 800 x 800).
 
     Raises:
-        DataError: shapes that differ or are not (h, w, 4), a value that is not finite.
+        DataError: the shapes differ or are not (h, w, 4), or a value is not finite.
     """
     reference = np.asarray(reference, dtype=np.float32)
     ours = np.asarray(ours, dtype=np.float32)
@@ -172,7 +171,7 @@ def score_view(reference: np.ndarray, ours: np.ndarray, *, perceptual: bool = Tr
 
 
 def score_views(reference: Iterable[np.ndarray], ours: Iterable[np.ndarray], *, perceptual: bool = True) -> Scores:
-    """Score our views against the reference's.
+    """Score our views against those of the reference.
 
     Args:
         reference: (n, h, w, 4) premultiplied RGBA, or an iterable of (h, w, 4) that is read one view at a time.
@@ -180,21 +179,21 @@ def score_views(reference: Iterable[np.ndarray], ours: Iterable[np.ndarray], *, 
         perceptual: compute SSIM and FLIP too.
 
     Raises:
-        DataError: no views, numbers of views or shapes that differ, a value that is not finite.
+        DataError: there are no views, their numbers or shapes differ, or a value is not finite.
     """
     views = []
     for a, b in zip_longest(reference, ours):
         if a is None or b is None:
-            raise DataError(f"{'more' if b is None else 'fewer'} views in the reference than of ours; expected as many")
+            raise DataError(f"{'more' if b is None else 'fewer'} reference views than ours; expected the same number")
         views.append(score_view(a, b, perceptual=perceptual))
     return mean_scores(views)
 
 
 def mean_scores(views: list[ViewScore]) -> Scores:
-    """Average scores over views, by the rule of `Scores`.
+    """Average scores over views as described in `Scores`.
 
     Raises:
-        DataError: no views.
+        DataError: there are no views.
     """
     if not views:
         raise DataError("no views to score; expected at least one")
@@ -208,15 +207,15 @@ def mean_scores(views: list[ViewScore]) -> Scores:
 
 @dataclass(frozen=True)
 class Texture:
-    """Texture on smooth areas: the root mean square of `band` over a block and its channels, in levels of 255.
+    """Texture of smooth areas: the root mean square of `band` over a block and its channels, in levels of 255.
 
-    The eye sees a lattice of Gaussians long before squared errors do: where the volume's picture is opaque and smooth,
-    a picture of its Gaussians should be smooth as well.
+    The eye notices a lattice of Gaussians long before it affects squared errors: where the volume's picture is opaque
+    and smooth, the picture of the Gaussians should be smooth as well.
 
     Attributes:
-        blocks: that are opaque and smooth in the reference; without any the numbers are None.
-        ours, reference: mean of the blocks.
-        ours_worst, reference_worst: mean of the tenth of the blocks that have most of it, each picture's own tenth.
+        blocks: number of blocks that are opaque and smooth in the reference; without any the other values are None.
+        ours, reference: mean over the blocks.
+        ours_worst, reference_worst: mean over the tenth of the blocks with the most texture in that picture.
     """
 
     blocks: int
@@ -227,13 +226,13 @@ class Texture:
 
 
 def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
-    """Measure the texture of pictures in the blocks in which their references are opaque and smooth.
+    """Measure the texture of pictures in blocks where their references are opaque and smooth.
 
     Args:
         pairs: (reference, ours) of each view, (h, w, 4) premultiplied, display-referred.
 
     Raises:
-        DataError: shapes that differ or are not (h, w, 4).
+        DataError: the shapes differ or are not (h, w, 4).
     """
     found = [np.empty((2, 0))]
     for reference, ours in pairs:
@@ -251,14 +250,14 @@ def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
 
 
 def band(image: np.ndarray) -> np.ndarray:
-    """Return RGB in levels of 255 blurred by `FINE` less blurred by `COARSE` pixels, (h, w, 3); edges are continued."""
-    levels = np.clip(np.asarray(image[..., :3], np.float32), 0, 1) * 255  # as a screen shows them
+    """Return the difference of RGB (h, w, 3), in levels of 255, blurred by `FINE` and by `COARSE` pixels."""
+    levels = np.clip(np.asarray(image[..., :3], np.float32), 0, 1) * 255  # as on a screen
     result: np.ndarray = _blurred(levels, FINE) - _blurred(levels, COARSE)
     return result
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Return (h, w, 3) float32 blurred."""
+    """Blur an image (h, w, 3) float32, continuing its edges."""
     reach = math.ceil(REACH * sigma)
     kernel = _gaussian(reach, sigma).astype(np.float32)
     padded = np.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
@@ -267,7 +266,7 @@ def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    """Return (h, w, ...) as (rows, BLOCK, columns, BLOCK, ...), without the remainder at the lower and right edge."""
+    """Reshape (h, w, ...) to (rows, BLOCK, columns, BLOCK, ...), without the remainder at the lower and right edge."""
     rows, columns = image.shape[0] // BLOCK, image.shape[1] // BLOCK
     whole = image[: rows * BLOCK, : columns * BLOCK]
     return whole.reshape(rows, BLOCK, columns, BLOCK, *image.shape[2:])

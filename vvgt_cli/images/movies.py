@@ -1,4 +1,4 @@
-"""Pictures that move: GIF through Pillow, MP4 (H.264) through imageio-ffmpeg's program."""
+"""Movies: GIF through Pillow, MP4 (H.264) through imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 
 SUFFIXES = (".gif", ".mp4")
-RATE = 25  # pictures a second: 4 hundredths a picture, which GIF can say
-_QUALITY = "18"  # of x264: hardly to be told from the pictures
-_MOST = 1 << 16  # colours that a palette is made of
-_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # of a GIF's palette, pictures that it is made of, rounds of its clustering
+RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
+_QUALITY = "18"  # of x264: visually almost lossless
+_MOST = 1 << 16  # colours that a palette is computed from
+_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
 
 
 def movie_ready(path: str | Path) -> None:
-    """See that a movie of this name can be written here.
+    """Check that a movie of this name can be written.
 
     Raises:
         DataError: a library that it needs is not installed.
@@ -29,11 +29,11 @@ def movie_ready(path: str | Path) -> None:
 
 
 def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False) -> int:
-    """Write pictures as a movie that goes on from its last picture to its first; returns the bytes.
+    """Write pictures as a looping movie, and return its size in bytes.
 
     Args:
-        path: ends in one of `SUFFIXES`.
-        pictures: (h, w, 3) float32 RGB in [0, 1] of one size (clipped); at least one.
+        path: a file that ends in one of `SUFFIXES`.
+        pictures: (h, w, 3) float32 RGB in [0, 1] (clipped), at least one, all of the same size.
         overwrite: replace an existing file.
 
     Raises:
@@ -47,12 +47,12 @@ def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: boo
 
 
 def _gif(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """One palette for all pictures, so that what stands still does not flicker; for ever."""
+    """Write a GIF that loops forever, with one palette for all pictures, so that static parts do not flicker."""
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
     some = [np.asarray(image).reshape(-1, 3) for image in images[:: max(len(images) // _SAMPLES, 1)]]
-    colors = np.unique(np.concatenate(some), axis=0)  # each once: the background is no more than any other
+    colors = np.unique(np.concatenate(some), axis=0)  # each once, so that the background does not dominate
     colors = colors[:: max(len(colors) // _MOST, 1)]
     palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -70,7 +70,7 @@ def _ffmpeg(source: str) -> Any:
 
 
 def _mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """H.264 as every player has it: 4:2:0, so sizes are even; a row or a column is repeated where they are not."""
+    """Write H.264 that all players support: 4:2:0, with the last row or column repeated to get even sizes."""
     library, writer = _ffmpeg(str(path)), None
     try:
         for frame in frames:

@@ -1,4 +1,4 @@
-"""PNG in and out, 8 bits a channel, through OpenImageIO."""
+"""Reading and writing 8-bit PNG through OpenImageIO."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 
-MAX_PIXELS = 2**28  # 16384 x 16384: a header may claim anything
-MAX_PIXELS_PER_BYTE = 2**14  # above what deflate reaches on one-bit pixels
+MAX_PIXELS = 2**28  # 16384 x 16384, because a damaged header may claim anything
+MAX_PIXELS_PER_BYTE = 2**14  # more than deflate can reach for one-bit pixels
 
 
 def check_pixels(path: str | PathLike[str], width: int, height: int) -> None:
-    """Raise DataError for a size that the file cannot hold, or that is too large to take in."""
+    """Raise DataError if an image is too large for its file, or larger than 2^28 pixels."""
     size = Path(path).stat().st_size
     if width < 1 or height < 1 or width * height > min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size):
         raise DataError(f"{path}: claims {width} x {height} pixels in {size} bytes; expected a whole image, up to 2^28")
@@ -26,13 +26,13 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
     """Write an image as 8-bit PNG; no gamma is applied.
 
     Args:
-        path: the file; written beside and renamed.
-        image: (h, w, 3) RGB or (h, w, 4) *premultiplied* RGBA, in [0, 1] (clipped; NaN becomes 0). PNG holds
-            straight alpha: colours are divided by alpha here.
+        path: the file, which is written atomically.
+        image: (h, w, 3) RGB or (h, w, 4) *premultiplied* RGBA, in [0, 1] (clipped; NaN becomes 0). PNG stores
+            straight alpha, so colours are divided by alpha.
         overwrite: replace an existing file.
 
     Raises:
-        DataError: wrong shape, or the file cannot be written.
+        DataError: the shape is wrong, or the file cannot be written.
         UsageError: the file exists and ``overwrite`` is not set.
     """
     import OpenImageIO as oiio
@@ -40,7 +40,7 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
     pixels = _bytes(image)
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # straight already: the writer must not divide again
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # alpha is straight already: the writer must not divide again
     spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("png:compressionLevel", 3)
     with atomic_write(path, overwrite) as temporary:
@@ -53,7 +53,7 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """An image as `write_png` writes it, in memory: what notebooks and browsers are handed."""
+    """Encode an image as PNG in memory, for notebooks and browsers; see `write_png`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.png"
         write_png(path, image)
@@ -63,10 +63,10 @@ def png_bytes(image: np.ndarray) -> bytes:
 def read_png(path: str | PathLike[str]) -> np.ndarray:
     """Read a PNG: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA, float32 in [0, 1].
 
-    Grey images come as RGB(A). The division and multiplication by alpha are exact to half an 8-bit step.
+    Grey images are returned as RGB(A). Division and multiplication by alpha are exact to half an 8-bit step.
 
     Raises:
-        DataError: not a PNG, or one larger than 2^28 pixels.
+        DataError: the file is not a PNG, or larger than 2^28 pixels.
     """
     import OpenImageIO as oiio
 
@@ -84,7 +84,7 @@ def read_png(path: str | PathLike[str]) -> np.ndarray:
         check_pixels(path, spec.width, spec.height)
         pixels = source.read_image(oiio.FLOAT)
         if pixels is None:
-            raise DataError(f"{path}: damaged PNG ({source.geterror().strip()})")
+            raise DataError(f"{path}: damaged PNG ({source.geterror().strip()}); expected a complete one")
     finally:
         source.close()
     pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
@@ -96,7 +96,7 @@ def read_png(path: str | PathLike[str]) -> np.ndarray:
 
 
 def _bytes(image: np.ndarray) -> np.ndarray:
-    """(h, w, 3 or 4) uint8, alpha straight."""
+    """Convert an image to (h, w, 3 or 4) uint8 with straight alpha."""
     image = np.asarray(image, dtype=np.float32)
     if image.ndim != 3 or image.shape[2] not in (3, 4) or 0 in image.shape:
         raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")

@@ -1,4 +1,4 @@
-"""View sets on disk, read back: images with their cameras (docs/commands/render-views.md)."""
+"""Reading view sets: images with their cameras (docs/commands/render-views.md)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.images.exr import read_exr
 from vvgt_cli.images.png import read_png
 
-SUFFIXES = (".exr", ".png")  # the first that is there
+SUFFIXES = (".exr", ".png")  # the first that exists is read
 
 
 def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[list[Camera], np.ndarray]:
-    """Cameras and images of ``transforms_SPLIT.json`` in a folder that `vvgt render-views` wrote.
+    """Read cameras and images of ``transforms_SPLIT.json`` in a folder written by `vvgt render-views`.
 
-    EXR is taken where it is there, else PNG, whose 8 bits round colours and alpha.
+    EXR is preferred to PNG, whose 8 bits round colours and alpha.
 
     Args:
         directory: the folder.
@@ -29,7 +29,7 @@ def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[li
         (cameras, images): n cameras in the unit frame, and (n, h, w, 4) float32 premultiplied RGBA.
 
     Raises:
-        DataError: no such split, an image that is missing, damaged or not of its camera's size, or sizes that differ.
+        DataError: there is no such split, an image is missing, damaged or not of its camera's size, or sizes differ.
     """
     folder = Path(directory)
     path = folder / f"transforms_{split}.json"
@@ -47,17 +47,18 @@ def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[li
         read = read_view(folder / frame.file_path)
         if read.shape != image.shape:
             raise DataError(
-                f"{folder / frame.file_path}: {read.shape[1]} x {read.shape[0]} px, its camera has {width} x {height}"
+                f"{folder / frame.file_path}: {read.shape[1]} x {read.shape[0]} px; expected {width} x {height}, as in "
+                f"{path.name}"
             )
         image[:] = read
     return cameras, images
 
 
 def read_view(path: str | PathLike[str]) -> np.ndarray:
-    """The image at ``path`` (with or without a suffix), EXR before PNG: (h, w, 4) float32 premultiplied.
+    """Read the image at ``path`` (with or without a suffix), EXR or else PNG: (h, w, 4) float32 premultiplied.
 
     Raises:
-        DataError: neither is there, or it is damaged.
+        DataError: the image is missing or damaged.
     """
     stem = Path(path)
     if stem.suffix in SUFFIXES:

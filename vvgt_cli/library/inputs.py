@@ -13,7 +13,7 @@ from vvgt_cli.conversion.index import function_name
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content, open_parts
+from vvgt_cli.field.layered import Content, open_content
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
 from vvgt_cli.look.label_files import table_of
@@ -214,7 +214,7 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
         DataError, UsageError: as `volume_of`.
     """
     if isinstance(volume, str | os.PathLike):
-        return open_parts(os.fspath(volume), _options(reading))
+        return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
     if not isinstance(content, Content):
         return Content((volume_of(volume, reading),))

@@ -1,4 +1,4 @@
-"""Volumes with known structure; importing this package makes them ``example:`` sources."""
+"""Synthetic volumes; importing this package registers them as ``example:`` sources."""
 
 from vvgt_cli.synth.sources import open_volume
 

@@ -1,4 +1,4 @@
-"""Volumes with a closed form. All are float32 with cubic voxels in a box centred on 0 whose longest edge is 2."""
+"""Volumes with a closed form: float32 with cubic voxels, in a box centred on 0 with a longest edge of 2."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _dims(size: Size) -> tuple[int, int, int]:
 
 
 def _axes(size: Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Voxel centres as x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1), float64."""
+    """Return voxel centres as x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1), float64."""
     nx, ny, nz = _dims(size)
     h = 2.0 / max(nx, ny, nz)
     x, y, z = ((np.arange(n) - (n - 1) / 2) * h for n in (nx, ny, nz))
@@ -31,7 +31,7 @@ def _axes(size: Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def volume_of(values: np.ndarray, name: str) -> Volume:
-    """Values (nz, ny, nx) as a float32 volume with cubic voxels, centred on 0, longest edge 2."""
+    """Return values (nz, ny, nx) as a float32 volume with cubic voxels, centred on 0, longest edge 2."""
     nz, ny, nx = values.shape
     h = 2.0 / max(nx, ny, nz)
     origin = tuple(-(n - 1) / 2 * h for n in (nx, ny, nz))
@@ -39,7 +39,7 @@ def volume_of(values: np.ndarray, name: str) -> Volume:
 
 
 def marschner_lobb(size: Size = 64, frequency: float = 6.0, alpha: float = 0.25) -> Volume:
-    """The Marschner-Lobb test signal, values in [0, 1].
+    """Return the Marschner-Lobb test signal, values in [0, 1].
 
     Marschner and Lobb, "An evaluation of reconstruction filters for volume rendering", 1994, equation 1:
     ``(1 - sin(pi z / 2) + alpha (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + alpha))`` with r in the x-y plane.
@@ -55,14 +55,14 @@ def marschner_lobb(size: Size = 64, frequency: float = 6.0, alpha: float = 0.25)
 
 
 def blob(size: Size = 64, sigma: float = 0.25) -> Volume:
-    """A Gaussian ``exp(-r^2 / (2 sigma^2))`` at the centre; sigma in world units (the box's longest edge is 2)."""
-    # A product of three factors: no array but the result has the volume's size.
+    """Return a Gaussian ``exp(-r^2 / (2 sigma^2))`` at the centre, sigma in world units (the longest edge is 2)."""
+    # as a product of three factors, so that only the result has the volume's size
     factors = [np.exp(-(axis**2) / (2 * sigma**2)) for axis in _axes(size)]
     return volume_of(factors[0] * factors[1] * factors[2], "blob")
 
 
 def slab(size: Size = 64, thickness: float = 1.0, value: float = 1.0) -> Volume:
-    """A homogeneous slab ``|z| <= thickness / 2`` across the whole box, 0 outside; cut voxels hold their inner part."""
+    """Return a homogeneous slab ``|z| <= thickness / 2`` across the box, 0 outside, with partial voxels antialiased."""
     nx, ny, nz = _dims(size)
     h = 2.0 / max(nx, ny, nz)
     z, half = _axes(size)[2], thickness / 2
@@ -71,13 +71,13 @@ def slab(size: Size = 64, thickness: float = 1.0, value: float = 1.0) -> Volume:
 
 
 def sphere(size: Size = 64, radius: float = 0.7, value: float = 1.0, *, hard: bool = False) -> Volume:
-    """A ball of ``value`` about the centre, 0 outside.
+    """Return a ball of ``value`` around the centre, 0 outside.
 
     Args:
         size: voxels.
-        radius: world units.
-        value: inside.
-        hard: binary values; otherwise a linear ramp of one voxel across the surface (close to the covered part).
+        radius: radius in world units.
+        value: value inside.
+        hard: binary values instead of a linear ramp of one voxel across the surface (close to the covered share).
     """
     x, y, z = _axes(size)
     h = 2.0 / max(_dims(size))
@@ -87,7 +87,7 @@ def sphere(size: Size = 64, radius: float = 0.7, value: float = 1.0, *, hard: bo
 
 
 def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
-    """0 and 1 in alternating cubes, ``cells`` along the longest axis; ``cells == size`` alternates every voxel."""
+    """Return alternating cubes of 0 and 1, ``cells`` along the longest axis; ``cells == size`` alternates voxels."""
     nx, ny, nz = _dims(size)
     edge = max(1, max(nx, ny, nz) // max(1, cells))
     x, y, z = (np.arange(n) // edge for n in (nx, ny, nz))
@@ -95,19 +95,19 @@ def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
 
 
 def constant(size: Size = 16, value: float = 1.0) -> Volume:
-    """The same value everywhere."""
+    """Return a volume with the same value everywhere."""
     nx, ny, nz = _dims(size)
     return volume_of(np.full((nz, ny, nx), value, np.float32), "constant")
 
 
 def random_field(size: Size = 64, cycles: float = 8.0, seed: int = 0) -> Volume:
-    """Band-limited periodic noise, values over [0, 1]; the same seed gives the same volume.
+    """Return band-limited periodic noise with values over [0, 1]; the same seed gives the same volume.
 
     Args:
         size: voxels.
-        cycles: highest spatial frequency, in cycles along the longest edge; below size / 2 the samples determine
+        cycles: highest spatial frequency in cycles along the longest edge; below size / 2 the samples determine
             the field.
-        seed: of the white noise that is filtered.
+        seed: seed of the white noise that is filtered.
     """
     nx, ny, nz = _dims(size)
     longest = max(nx, ny, nz)

@@ -1,6 +1,6 @@
-"""Shapes as CT, MR and simulations show them, see `SHAPES`. float32, values near [0, 1].
+"""Random shapes like those of CT, MR and simulations (`SHAPES`), float32 with values near [0, 1].
 
-A seed gives one volume on every machine but for the last bits of its Fourier transforms.
+A seed gives the same volume on every machine up to the last bits of Fourier transforms.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from vvgt_cli.synth.analytic import volume_of
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.types import Volume
 
-SMALLEST = 8  # voxels a side
-BYTES = 100  # a voxel, at the peak
+SMALLEST = 8  # voxels per side
+BYTES = 100  # peak memory per voxel
 
 
 def _grid(size: int) -> np.ndarray:
-    """(3, n, n, n) positions x, y, z of voxel centres in a box of [-1, 1]."""
+    """Return the positions x, y, z of voxel centres in a box of [-1, 1], (3, n, n, n)."""
     line = (np.arange(size) + 0.5) * 2 / size - 1
     z, y, x = np.meshgrid(line, line, line, indexing="ij")
     return np.stack([x, y, z])
 
 
 def _field(rng: np.random.Generator, size: int, slope: float, finest: float = np.inf) -> np.ndarray:
-    """(n, n, n) periodic noise of variance 1 whose amplitude falls as k^-slope, up to ``finest`` cycles a box."""
+    """Return periodic noise (n, n, n) of variance 1 with amplitude k^-slope, up to ``finest`` cycles per box."""
     spectrum = np.fft.rfftn(rng.standard_normal((size, size, size)))
     line, half = np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size)
     k = np.sqrt(half[None, None, :] ** 2 + line[None, :, None] ** 2 + line[:, None, None] ** 2)
@@ -37,18 +37,18 @@ def _field(rng: np.random.Generator, size: int, slope: float, finest: float = np
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
-    """(3, 3), uniform: QR of a Gaussian matrix, signs fixed."""
+    """Return a uniformly distributed rotation (3, 3), by QR of a Gaussian matrix with fixed signs."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     return q * np.sign(np.diag(r))
 
 
 def _inside(distance: np.ndarray, size: int) -> np.ndarray:
-    """Share of a voxel that lies inside, by a linear ramp of a voxel across the surface."""
+    """Return the share of a voxel that lies inside, by a linear ramp of one voxel across the surface."""
     return np.clip(distance * size / 2 + 0.5, 0, 1)
 
 
 def shells(size: int, seed: int) -> np.ndarray:
-    """Three to five bent ellipsoids, one within the other, with a value and some texture each (skin, skull, brain)."""
+    """Return three to five nested bent ellipsoids with a value and some texture each (skin, skull, brain)."""
     rng = np.random.default_rng(seed)
     centred = np.tensordot(_rotation(rng), _grid(size), 1) / rng.uniform(0.65, 0.95, 3)[:, None, None, None]
     radius = np.linalg.norm(centred, axis=0) + 0.04 * _field(rng, size, 2.5, 6)
@@ -65,7 +65,7 @@ def shells(size: int, seed: int) -> np.ndarray:
 
 
 def tubes(size: int, seed: int) -> np.ndarray:
-    """Vessels: bent lines with radii that shrink along them, brightest in their middle, in faint tissue."""
+    """Return vessels in faint tissue: bent tubes, brightest in the middle, whose radii shrink along them."""
     rng = np.random.default_rng(seed)
     out = 0.08 + 0.02 * _field(rng, size, 1.5, size / 4)
     for _ in range(rng.integers(8, 20)):
@@ -80,7 +80,7 @@ def tubes(size: int, seed: int) -> np.ndarray:
 
 
 def _stamp(out: np.ndarray, place: np.ndarray, radius: float, value: float) -> None:
-    """A ball whose value falls off towards its surface; the larger value stays."""
+    """Draw a ball whose value falls off towards its surface, keeping the larger value of each voxel."""
     size = len(out)
     middle = (place + 1) * size / 2 - 0.5  # in voxels, x y z
     reach = radius * size / 2 + 1
@@ -96,7 +96,7 @@ def _stamp(out: np.ndarray, place: np.ndarray, radius: float, value: float) -> N
 
 
 def plates(size: int, seed: int) -> np.ndarray:
-    """Boxes of metal: thin plates, bars and blocks at any angle, with holes; a value each, sharp edges."""
+    """Return metal parts: thin plates, bars and blocks at any angle, some drilled, each with a value."""
     rng = np.random.default_rng(seed)
     grid = _grid(size)
     out = np.zeros((size,) * 3)
@@ -112,7 +112,7 @@ def plates(size: int, seed: int) -> np.ndarray:
 
 
 def noise(size: int, seed: int) -> np.ndarray:
-    """Noise of all scales, clouds to granite by its seed, over [0, 1]."""
+    """Return noise of all scales over [0, 1], from clouds to granite depending on the seed."""
     rng = np.random.default_rng(seed)
     field = _field(rng, size, rng.uniform(1.6, 2.6), size / 3)
     result: np.ndarray = (field - field.min()) / (field.max() - field.min())
@@ -120,7 +120,7 @@ def noise(size: int, seed: int) -> np.ndarray:
 
 
 def wells(size: int, seed: int) -> np.ndarray:
-    """Sums of smooth bumps of both signs, as densities and potentials of molecules are, over [0, 1]."""
+    """Return sums of smooth bumps of both signs over [0, 1], like densities and potentials of molecules."""
     rng = np.random.default_rng(seed)
     line = (np.arange(size) + 0.5) * 2 / size - 1
     field = np.zeros((size,) * 3)
@@ -133,7 +133,7 @@ def wells(size: int, seed: int) -> np.ndarray:
 
 
 def bodies(size: int, seed: int) -> np.ndarray:
-    """Shells with vessels in and around most of them, metal parts in some, and the noise of a scanner."""
+    """Return shells, most with vessels and some with metal parts, and the noise of a scanner."""
     rng = np.random.default_rng([seed, 1])
     out = shells(size, seed)
     if rng.random() < 0.8:
@@ -156,12 +156,12 @@ SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
 
 
 def make_shape(kind: str, size: int = 128, seed: int = 0) -> Volume:
-    """A volume of one of `SHAPES`, ``size`` voxels a side.
+    """Return a volume of one of `SHAPES`, ``size`` voxels per side.
 
     Raises:
-        UsageError: a size below `SMALLEST`, or above what memory holds.
+        UsageError: the size is below `SMALLEST`, or does not fit in memory.
     """
     if size < SMALLEST:
-        raise UsageError(f"{kind} of {size} voxels a side: expected at least {SMALLEST}")
+        raise UsageError(f"{kind} of {size} voxels per side: expected at least {SMALLEST}")
     check_memory(size**3 * BYTES, f"{kind} of {size} x {size} x {size} voxels")
     return volume_of(SHAPES[kind](size, seed), f"{kind}-{seed}")

@@ -1,4 +1,4 @@
-"""The entry for every volume source: files, ``-`` and ``example:`` names, the analytic ones among them."""
+"""The entry point for all volume sources: files, ``-`` and ``example:`` names, with the analytic examples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _sized(name: str, make: Callable[[analytic.Size], Volume], default: int) -> 
         if match is None:
             raise UsageError(f"example:{name}:{rest}: expected a size, as example:{name}:64 or example:{name}:64x48x32")
         if options.array is not None or options.component not in (None, 0):
-            raise UsageError(f"example:{name}: one unnamed scalar array; leave out --array and --component")
+            raise UsageError(f"example:{name}: has a single unnamed scalar array; omit --array and --component")
         x, y, z = (int(match[1]), int(match[2] or match[1]), int(match[3] or match[1]))
         volume = make((x, y, z))
         return volume if options.spacing is None else replace(volume, spacing=options.spacing)
@@ -45,11 +45,11 @@ def open_volume(source: str, options: ReadOptions | None = None) -> Volume:
     """Open a volume: a file, ``-`` (raw bytes from standard input) or ``example:NAME[:SIZE]``.
 
     Args:
-        source: see above.
-        options: see `ReadOptions`.
+        source: the file or name.
+        options: how to read it.
 
     Raises:
         DataError: see `read_volume`.
-        UsageError: see `read_volume`; also an example that does not exist (the error lists those that do).
+        UsageError: see `read_volume`; also if there is no such example (the error lists all).
     """
     return read_volume(source, options or ReadOptions())

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.dvr.layout import Light
-    from vvgt_cli.field.forest import Forest
+    from vvgt_cli.field.tiled_tree import TiledTree
     from vvgt_cli.gaussians import Gaussians
 
 BATCH = 1 << 16  # Gaussians that are made at once
@@ -28,7 +28,7 @@ Node = tuple[list["Gaussians"], list[np.ndarray]]  # by level
 class Cut:
     """A pyramid, where bodies are opaque, and the plan that it is cut for."""
 
-    forest: Forest
+    tiled_tree: TiledTree
     opaque: Opaque
     plan: Plan
     light: Light | None = None
@@ -39,9 +39,9 @@ class Cut:
         With their normals (n, 3), None where nothing is lit.
         """
         from vvgt_cli.closed_form.lit import MEAN, directions
-        from vvgt_cli.field.forest import batches
+        from vvgt_cli.field.tiled_tree import batches
 
-        for leaves in batches(self.forest.leaves(threshold), BATCH):
+        for leaves in batches(self.tiled_tree.leaves(threshold), BATCH):
             lit = self._lit(leaves)
             yield self.made(leaves), None if lit is None else directions(lit[:, MEAN])
 
@@ -52,12 +52,12 @@ class Cut:
         some of an earlier call ended.
         """
         from vvgt_cli.closed_form.tree import spread_of
-        from vvgt_cli.field.forest import joined
+        from vvgt_cli.field.tiled_tree import joined
 
         waiting: list[list[Leaves]] = []
-        for row, leaves in enumerate(self.forest.cuts(thresholds, begin), begin):
+        for row, leaves in enumerate(self.tiled_tree.cuts(thresholds, begin), begin):
             waiting.append(leaves)
-            if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
+            if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.tiled_tree.tiles):
                 continue
             sizes = np.array([[len(part) for part in node] for node in waiting])
             whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
@@ -84,5 +84,5 @@ class Cut:
         return as_stored(made)
 
     def _lit(self, leaves: Leaves) -> np.ndarray | None:
-        """What `Forest` has put after their moments; None where nothing is lit."""
+        """What `TiledTree` has put after their moments; None where nothing is lit."""
         return None if self.light is None else leaves.moments[:, COLUMNS:]

@@ -12,7 +12,7 @@ from vvgt_cli.conversion.shards.apart import errors_apart
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
-    from vvgt_cli.field.parts import Parts
+    from vvgt_cli.field.block_store import BlockStore
 
 RUNGS = 10
 STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge
@@ -95,27 +95,27 @@ class Ladder:
         return {"errors": relative, "rms": [float(self.errors[row, rung]) for rung in rungs]}
 
 
-def measured(cut: Cut, parts: Parts, kind: str) -> Ladder:
-    """Make and draw `RUNGS` cuts of every node; what an interrupted run has left in ``parts`` is taken as it is.
+def measured(cut: Cut, store: BlockStore, kind: str) -> Ladder:
+    """Make and draw `RUNGS` cuts of every node; what an interrupted run has left in ``store`` is taken as it is.
 
     Raises:
         DataError: a part is damaged.
     """
-    forest = cut.forest
-    finest = forest.threshold(cut.plan.budget)
-    second = max(forest.threshold(max(forest.count(finest) // 2, 1)), np.finfo(float).tiny)
+    tiled_tree = cut.tiled_tree
+    finest = tiled_tree.threshold(cut.plan.budget)
+    second = max(tiled_tree.threshold(max(tiled_tree.count(finest) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(RUNGS - 1))])
     values = np.minimum(values, np.finfo(float).max)
     found: list[dict[str, Any]] = []
-    parts.prepare(kind)
-    while not parts.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
-        found.append(parts.load(kind, done))
-    for nodes in cut.nodes(np.tile(values, (len(forest.tiles), 1)), done):
+    store.prepare(kind)
+    while not store.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
+        found.append(store.load(kind, done))
+    for nodes in cut.nodes(np.tile(values, (len(tiled_tree.tiles), 1)), done):
         squares, energies, pixels = zip(*(errors_apart(made) for made, _ in nodes), strict=True)
         counts = [[len(gaussians) for gaussians in made] for made, _ in nodes]
         arrays = map(np.array, (counts, squares, energies, pixels))
         some: dict[str, Any] = dict(zip(FIELDS, arrays, strict=True))
-        parts.save(kind, done, **some)
+        store.save(kind, done, **some)
         found.append(some)
         done += len(nodes)
     return Ladder(values, **{name: np.concatenate([some[name] for some in found]) for name in FIELDS})

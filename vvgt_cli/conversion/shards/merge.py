@@ -20,14 +20,14 @@ from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.files import atomic_write, check_room, is_stream
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.gaussians.types import together
+from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import MERGE, SHADE, for_degree
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
@@ -35,43 +35,43 @@ from vvgt_cli.score.record import Run
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.dvr.layout import Light
-    from vvgt_cli.field.forest import Coarse, Forest
+    from vvgt_cli.field.tiled_tree import Coarse, TiledTree
     from vvgt_cli.gaussians import Gaussians
 
 SCRATCH = "scores"
 
 
-def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
+def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool) -> None:
     """Cut the pyramid over all parts for the plan's budget and write it; fills the report in.
 
     Raises:
         DataError: parts are missing or damaged, or nothing is visible.
         UsageError: an output that may not be written.
     """
-    plan = Plan.load(parts)
+    plan = Plan.load(store)
     report = run.report
     report.volume, report.transfer_function = plan.volume, plan.function
     report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
-    light = load_light(parts, plan)
+    light = load_light(store, plan)
     run.compile(for_degree((*MERGE, *(SHADE if light else ())), plan.degree))
     with run.stage("pyramid") as stage:
-        forest, opaque = pyramid(parts, plan, light)
-        stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
+        tiled_tree, opaque = pyramid(store, plan, light)
+        stage.note = f"{tiled_tree.base} cells in {len(tiled_tree.tiles)} tiles"
     if is_streamed(output):
-        write_streamed(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
+        write_streamed(run, store, Cut(tiled_tree, opaque, plan, light), output, overwrite)
         return
-    _write_ply(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
+    _write_ply(run, store, Cut(tiled_tree, opaque, plan, light), output, overwrite)
 
 
-def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
+def _write_ply(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:
     """One file; how many Gaussians and bytes it has, and its scores where it is drawn, into the report."""
     plan, size = cut.plan, cut.plan.size
-    with run.stage("write") as stage, _sink(parts, output, overwrite) as sink:
+    with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
         made, spared = _write(cut, sink, output)
         count, written = made.total, sink.tell()
         stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB"
         if not spared and count < NEARLY * plan.budget:
-            base = cut.forest.base
+            base = cut.tiled_tree.base
             stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
@@ -81,11 +81,11 @@ def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -
         run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
     else:
         with run.stage("test views") as stage:
-            found = score_gaussians(together(made.batches), parts, plan, plan.ply.rule or INRIA)
+            found = score_gaussians(concatenate(made.batches), store, plan, plan.ply.rule or INRIA)
             run.report.scores, stage.note = asdict(found), score_text(found, size)
 
 
-def pyramid(parts: Parts, plan: Plan, light: Light | None = None) -> tuple[Forest, Opaque]:
+def pyramid(store: BlockStore, plan: Plan, light: Light | None = None) -> tuple[TiledTree, Opaque]:
     """The pyramid over all parts, and where bodies are opaque.
 
     Raises:
@@ -95,17 +95,17 @@ def pyramid(parts: Parts, plan: Plan, light: Light | None = None) -> tuple[Fores
     from vvgt_cli.cameras import default_views
     from vvgt_cli.closed_form.closed_form import MARCH_SIZE
     from vvgt_cli.closed_form.visibility import march_views
-    from vvgt_cli.field.forest import Forest, gather
+    from vvgt_cli.field.tiled_tree import TiledTree, gather
 
-    grid, coarse = plan.grid, gather(parts, plan.grid)
+    grid, coarse = plan.grid, gather(store, plan.grid)
     wide = grid.cell * 2.0**grid.march
     box = Box(np.array(grid.half), np.array(grid.step))
     extinction = (coarse.mass / (wide * box.step).prod()).astype(np.float32)
     seen = march_views(extinction, wide, box, default_views("train", size=MARCH_SIZE))
-    forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH, light)
-    if forest.top is None:
+    tiled_tree = TiledTree(store, grid, seen, coarse, store.folder / SCRATCH, light)
+    if tiled_tree.top is None:
         raise NothingVisible(plan.volume["name"], plan.function["name"])
-    return forest, _opaque(coarse, plan)
+    return tiled_tree, _opaque(coarse, plan)
 
 
 def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
@@ -131,8 +131,8 @@ def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
     axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
     degree = plan.degree if plan.ply.sh_degree is None else plan.ply.sh_degree
     while True:
-        threshold = cut.forest.threshold(plan.budget)
-        count = cut.forest.count(threshold)
+        threshold = cut.tiled_tree.threshold(plan.budget)
+        count = cut.tiled_tree.count(threshold)
         first = first or count
         if output != STDOUT:
             check_room(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
@@ -153,13 +153,13 @@ def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
 
 
 @contextmanager
-def _sink(parts: Parts, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
+def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
     """A file to write to, which takes the output's place, or goes down its pipe, when it is whole."""
     if output != STDOUT and not is_stream(output):
         with atomic_write(output, overwrite) as temporary, open(temporary, "w+b") as sink:
             yield sink
         return
-    with tempfile.TemporaryFile(dir=parts.folder) as sink:
+    with tempfile.TemporaryFile(dir=store.folder) as sink:
         yield sink
         sink.seek(0)
         if output == STDOUT:

@@ -13,8 +13,8 @@ import numpy as np
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import ROW, BlockStore
 from vvgt_cli.field.grid import Boxes, CellGrid
-from vvgt_cli.field.parts import ROW, Parts
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.look.lighting import Lighting
@@ -52,22 +52,22 @@ class Plan:
     labels: bool = False
     degree: int = 0
 
-    def save(self, parts: Parts, light: Light | None) -> None:
+    def save(self, store: BlockStore, light: Light | None) -> None:
         """Write it beside the parts, and before it what falls on the volume."""
         if light is not None:
-            with atomic_write(parts.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
+            with atomic_write(store.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, allow_pickle=False, **light._asdict())
-        with atomic_write(parts.folder / PLAN, overwrite=True) as temporary:
+        with atomic_write(store.folder / PLAN, overwrite=True) as temporary:
             temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
 
     @classmethod
-    def load(cls, parts: Parts) -> Plan:
+    def load(cls, store: BlockStore) -> Plan:
         """The plan beside parts.
 
         Raises:
             DataError: there is none, or it is damaged.
         """
-        path = parts.folder / PLAN
+        path = store.folder / PLAN
         try:
             found = json.loads(path.read_text("utf-8"))
             grid, ply = found["grid"], found["ply"]
@@ -86,7 +86,7 @@ class Plan:
             raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
 
 
-def load_light(parts: Parts, plan: Plan) -> Light | None:
+def load_light(store: BlockStore, plan: Plan) -> Light | None:
     """What falls on the volume, None for nothing.
 
     Raises:
@@ -94,7 +94,7 @@ def load_light(parts: Parts, plan: Plan) -> Light | None:
     """
     if plan.ply.light is None:
         return None
-    path = parts.folder / LIGHT
+    path = store.folder / LIGHT
     try:
         with np.load(path) as found:
             return Light(**{key: found[key] if found[key].ndim else found[key].item() for key in Light._fields})

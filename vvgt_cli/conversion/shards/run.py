@@ -15,10 +15,10 @@ from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.conversion.shards.streamed import folder_of
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.blocked import Blocked, Later
+from vvgt_cli.field.block_store import CELLS, BlockStore
+from vvgt_cli.field.blocked import Blocked, MissingBlocks
 from vvgt_cli.field.cells import CellBlocks
-from vvgt_cli.field.open import Wanted, beside, blocked
-from vvgt_cli.field.parts import CELLS, Parts
+from vvgt_cli.field.open import FieldNeeds, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.files import check_room
@@ -64,19 +64,19 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
     run = Run(console or Console(), ConversionReport("init"))
     if options.shard is not None:
         assert request.output is not None
-        _shard(run, request, options, Parts(Path(request.output).absolute()))
+        _shard(run, request, options, BlockStore(Path(request.output).absolute()))
         return run.finish()
     with (
         _written(request.output, request) as outputs,
         claimed(outputs, request.inputs(), request.overwrite),
-        beside(request.output) as parts,
+        store_beside(request.output) as store,
     ):
-        make_parts(run, request, options, parts)
-        write_merged(run, parts, request.output or STDOUT, request.overwrite)
+        make_parts(run, request, options, store)
+        write_merged(run, store, request.output or STDOUT, request.overwrite)
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
-        parts.remove()
+        store.remove()
     return run.report
 
 
@@ -88,10 +88,10 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
         DataError: blocks are missing or damaged.
     """
     run = Run(console or Console(), ConversionReport("merge"))
-    parts = Parts(Path(folder))
-    parts.settings()
+    store = BlockStore(Path(folder))
+    store.settings()
     with _written(output) as outputs, claimed(outputs, [], overwrite):
-        write_merged(run, parts, output, overwrite)
+        write_merged(run, store, output, overwrite)
     return run.finish()
 
 
@@ -116,11 +116,11 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
         raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
 
 
-def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+def _shard(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
     """Do a shard's share of what can be done now, and say what is left."""
     try:
-        make_parts(run, request, options, parts)
-    except Later as later:
+        make_parts(run, request, options, store)
+    except MissingBlocks as later:
         run.console.say(
             f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
             "again when they are"
@@ -129,15 +129,15 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Part
         run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
     """Every block's part, those that are there taken as they are; and the plan of the file.
 
     Raises:
-        Later: other shards' blocks are missing.
+        MissingBlocks: other shards' blocks are missing.
     """
     budget, size = request.fit.max_gaussians, request.fit.size
-    wanted = Wanted(budget, size, request.ply.sh_degree, most_cells(budget))
-    with blocked(run, request.source, options, parts, wanted) as field:
+    wanted = FieldNeeds(budget, size, request.ply.sh_degree, most_cells(budget))
+    with blocked(run, request.source, options, store, wanted) as field:
         source, ply = field.source, ply_options(request, field.source)
         for line in remarks(source.volume, ply):
             run.console.say(line)
@@ -149,11 +149,11 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
         Plan(
             cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
             tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree,
-        ).save(parts, cells.light)  # fmt: skip
+        ).save(store, cells.light)  # fmt: skip
         _check_disk(run, field, cells, budget, degree)
         with run.stage("integrate") as stage:
-            done = field.do(cells, "integrate")
-            workers = field.do.runner.workers
+            done = field.run_pass(cells, "integrate")
+            workers = field.run_pass.runner.workers
             stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
 
 
@@ -165,8 +165,8 @@ def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree
     """
     assert cells.rays is not None
     rays = sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
-    parts = cells.parts
-    need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - parts.bytes(CELLS)
-    if need > 0 and parts.missing(CELLS, range(len(cells))):
-        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
-        check_room(parts.folder, need)
+    store = cells.store
+    need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - store.bytes(CELLS)
+    if need > 0 and store.missing(CELLS, range(len(cells))):
+        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
+        check_room(store.folder, need)

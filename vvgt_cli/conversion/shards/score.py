@@ -8,8 +8,8 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.field import Picture
-from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -33,7 +33,7 @@ def scored_views(size: int) -> list[Picture]:
     return [Picture(cameras[i], settings, spread_blocks(size, size, i, FEW)) for i in PREVIEW_VIEWS]
 
 
-def score_gaussians(gaussians: Gaussians, parts: Parts, plan: Plan, rule: str | Rule = INRIA) -> Scores:
+def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
     """Gaussians of the box frame, drawn by a rule, against the volume's views.
 
     Raises:
@@ -42,9 +42,9 @@ def score_gaussians(gaussians: Gaussians, parts: Parts, plan: Plan, rule: str | 
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render
 
-    rays = RayFile(str(parts.folder / f"{plan.rays}.npz"), plan.rays)
+    rays = RayFile(str(store.folder / f"{plan.rays}.npz"), plan.rays)
     x, y, z = plan.grid.blocks.dims
-    seen = composed(rays, parts, range(len(plan.grid.blocks)), (x, y, z))
+    seen = composed(rays, store, range(len(plan.grid.blocks)), (x, y, z))
     views = scored_views(plan.size)
 
     def picked(view: Picture) -> np.ndarray:

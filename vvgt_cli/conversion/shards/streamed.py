@@ -1,7 +1,7 @@
 """Streamed SOG: nodes by place, each in levels by measured error, in files of SOG's images; and `lod-meta.json`.
 
 As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
-(`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.forest`); what its levels are is
+(`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.tiled_tree`); what its levels are is
 measured (`ladder`).
 """
 
@@ -33,7 +33,7 @@ from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
-    from vvgt_cli.field.parts import Parts
+    from vvgt_cli.field.block_store import BlockStore
 
 # Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
@@ -56,25 +56,25 @@ def folder_of(output: str) -> Iterator[None]:
                 folder.rmdir()
 
 
-def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
+def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:
     """Write the files and, last of all, the manifest.
 
-    What is done of it is noted in ``parts``: errors by some nodes at a time, and files that are whole.
+    What is done of it is noted in ``store``: errors by some nodes at a time, and files that are whole.
 
     Raises:
         UsageError: a frame in which distances are not the engine's.
     """
     if cut.plan.ply.frame != "unit":
         raise UsageError(f"-o {output}: levels go by distances in the unit frame; leave out --frame")
-    forest = cut.forest
+    tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
-        key = digest((parts.folder / PLAN).read_text("utf-8"))[:16]
-        ladder = measured(cut, parts, f"errors-{key}")
+        key = digest((store.folder / PLAN).read_text("utf-8"))[:16]
+        ladder = measured(cut, store, f"errors-{key}")
         choices = ladder.levels()
         levels = [Level(number) for number in range(len(choices))]
-        stage.note = f"{len(levels)} levels of {len(forest.tiles)} nodes"
+        stage.note = f"{len(levels)} levels of {len(tiled_tree.tiles)} nodes"
     before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
-    files = Files(folder, parts, f"written-{digest(key, str(folder))[:16]}")
+    files = Files(folder, store, f"written-{digest(key, str(folder))[:16]}")
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
         for some in cut.nodes(ladder.thresholds[np.stack(choices, axis=1)]):
             for made, spreads in some:
@@ -90,7 +90,7 @@ def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: boo
         stage.note = f"{output}: {len(nodes)} nodes, {len(files.names)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
         if levels[0].gaussians < cut.plan.budget // 2:
-            stage.note += f", no more: {forest.base} cells that the screen, or {cut.plan.budget}, have use for"
+            stage.note += f", no more: {tiled_tree.base} cells that the screen, or {cut.plan.budget}, have use for"
     files.remove_others(before)
     run.report.gaussians, run.report.bytes = levels[0].gaussians, total
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order
@@ -45,13 +45,13 @@ class Level:
 class Files:
     """Those of all levels; ``names`` of their `meta.json`, as the manifest has them.
 
-    A part ``kind`` of ``parts`` says of each file that it is whole, its bytes and when it was written: it is not
+    A part ``kind`` of ``store`` says of each file that it is whole, its bytes and when it was written: it is not
     written again, unless another run has written there since.
     """
 
-    def __init__(self, folder: Path, parts: Parts, kind: str) -> None:
-        self._folder, self._parts, self._kind = folder, parts, kind
-        parts.prepare(kind)
+    def __init__(self, folder: Path, store: BlockStore, kind: str) -> None:
+        self._folder, self._store, self._kind = folder, store, kind
+        store.prepare(kind)
         self.names: list[str] = []
         self._begun: dict[int, int] = {}  # number of the name of each level's next file
 
@@ -79,14 +79,14 @@ class Files:
 
     def _kept(self, number: int, target: Path) -> int:
         """Bytes of a file that is as this run, interrupted, has written it; else 0."""
-        if not target.is_file() or self._parts.missing(self._kind, [number]):
+        if not target.is_file() or self._store.missing(self._kind, [number]):
             return 0
-        size, written = self._parts.load(self._kind, number)["size"].tolist()
+        size, written = self._store.load(self._kind, number)["size"].tolist()
         return int(size) if written == target.stat().st_mtime_ns else 0
 
     def _made(self, number: int, target: Path, splats: Splats) -> int:
         size = _written(target, splats)
-        self._parts.save(self._kind, number, size=np.array([size, target.stat().st_mtime_ns]))
+        self._store.save(self._kind, number, size=np.array([size, target.stat().st_mtime_ns]))
         return size
 
     def remove_others(self, before: Sequence[str]) -> None:

@@ -43,8 +43,8 @@ class TestViews(Stage):
     def cost(self, case: Workload) -> Cost:
         """By pixels."""
         views, whole, beside = SCORE_ALL if self.whole else SCORE
-        pixels = whole * case.size**2 + (views - whole) * case.judged
-        return Cost(case.judging(pixels) + case.pace * beside * pixels / 400**2)
+        pixels = whole * case.size**2 + (views - whole) * case.test_view_pixels
+        return Cost(case.reference_seconds(pixels) + case.pace * beside * pixels / 400**2)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """What is scored."""
@@ -84,7 +84,7 @@ class ViewingConditions(Stage):
         """By pixels and Gaussians."""
         near = (case.size // 2) ** 2
         beside = CONDITIONS[1] + CONDITIONS[2] * case.gaussians / 1e5 + TEXTURE * near / 400**2
-        return Cost(CONDITIONS[0] * case.check_view_seconds + case.judging(near) + case.pace * beside)
+        return Cost(CONDITIONS[0] * case.check_view_seconds + case.reference_seconds(near) + case.pace * beside)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """What is scored."""

@@ -1,4 +1,4 @@
-"""Gaussians for others: the formats of other programs, a page that shows them, and its server."""
+"""File formats of other programs for Gaussians, and the page that shows them."""
 
 from vvgt_cli.gaussians.formats.choose import (
     SUFFIXES,

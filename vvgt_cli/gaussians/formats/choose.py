@@ -1,4 +1,4 @@
-"""Which format a name stands for, how it is written, and how what was written is read again."""
+"""The format of a file by its name, with its writer and reader."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
-from vvgt_cli.gaussians.formats.levels import Levels, split_name
+from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
 from vvgt_cli.volume.blocks import check_memory
 
-_HEAD = 1024  # bytes that tell a .ply of another kind
+_HEAD = 1024  # bytes that identify a compressed .ply
 _LARGEST = 1 << 32  # bytes of a file that is read whole
 
 
 @dataclass(frozen=True)
 class Format:
-    """Another format than the standard `.ply`.
+    """A format other than the standard `.ply`.
 
     Attributes:
-        suffix: that names end in.
-        write: columns and a name for errors -> the file's bytes.
-        read: bytes and a name for errors -> columns.
-        needs: given a name for errors, raises DataError where a library or a program is not installed.
-        layout: how Gaussians are laid out for it, given how a `.ply` would be.
-        live: as ``write``, of Gaussians that carry values (unit frame), and how a `.ply` of them would be laid out;
-            None where the format holds no values.
+        suffix: file ending.
+        write: maps columns and a name for errors to the file's bytes.
+        read: maps bytes and a name for errors to columns.
+        needs: given a name for errors, raises DataError if a library is not installed.
+        layout: maps the options for a `.ply` to those for this format.
+        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`; None if the
+            format cannot store values.
     """
 
     suffix: str
@@ -63,16 +63,16 @@ READ_ONLY = (
 
 
 def format_of(path: str | os.PathLike[str]) -> Format | None:
-    """The format that a name stands for; None for the standard `.ply`, and for names that say nothing."""
+    """Return the format of a file name; None for the standard `.ply` and for unknown endings."""
     name = Path(path).name.lower()
     return next((known for known in (*FORMATS, *READ_ONLY) if name.endswith(known.suffix)), None)
 
 
 def ready(path: str | Path) -> None:
-    """See that the format of a name can be written here.
+    """Check that the format of a file name can be written.
 
     Raises:
-        DataError: a library or a program that it needs is not installed; the error names it.
+        DataError: a library that it needs is not installed; the error names it.
     """
     known = format_of(path)
     if known is not None:
@@ -80,24 +80,24 @@ def ready(path: str | Path) -> None:
 
 
 def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
-    """Gaussians (unit frame) as a file of another format, laid out as `PlyOptions` say.
+    """Encode Gaussians (unit frame) in another format, with the layout of `PlyOptions`.
 
     Raises:
-        DataError: values that it cannot hold, a library or a program that is not installed, or fails.
+        DataError: the format cannot hold the values, or a library is not installed or fails.
     """
     if known.suffix == ".html":
         options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name)
     if gaussians.live is not None:
-        why = f"{known.suffix} has no columns for values"
-        warnings.warn(f"{name}: {why}: it has the one look that is baked in", stacklevel=2)
+        why = f"{known.suffix} cannot store values for other functions"
+        warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     return known.write(splats_of(gaussians, known.layout(options)), name)
 
 
 def is_splats(path: str | Path) -> bool:
-    """Whether a path is a file of Gaussians by its name, or by the `ply` that it begins with."""
+    """Return whether a path is a file of Gaussians, by its name or by its first bytes, `ply`."""
     if format_of(path) or Path(path).name.lower().endswith(".ply") or split_name(path):
         return True
     try:
@@ -108,13 +108,13 @@ def is_splats(path: str | Path) -> bool:
 
 
 def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
-    """Read a file of Gaussians of any format, in the frame that it is in; the header's comments are the file's.
+    """Read a file of Gaussians of any format, in the frame of the file, with a header that has its comments.
 
-    Of streamed levels those that the name asks for (`vvgt_cli.gaussians.formats.levels`).
+    For streamed levels, the name selects a level (`vvgt_cli.gaussians.formats.levels`).
 
     Raises:
-        UsageError: no such level.
-        DataError: not a file of its format, or its library is not installed.
+        UsageError: there is no such level.
+        DataError: the file is not valid, or a library is not installed.
     """
     if split_name(path) is None and (format_of(path) or _compressed(path)) is None:
         return read_ply(path)
@@ -122,14 +122,14 @@ def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
 
 
 def read_columns(path: str | Path) -> Splats:
-    """The columns of a file of Gaussians of any format as they are, finite or not; rotations of length 0 are NaN.
+    """Read the columns of a file of any format unchecked; values may not be finite, and rotations of length 0 are NaN.
 
     Raises:
-        DataError: as `read_splats`, but for values.
+        DataError: see `read_splats`, except for invalid values.
     """
     streamed = split_name(path)
     if streamed is not None:
-        return Levels(streamed[0]).level(streamed[1])
+        return StreamedLevels(streamed[0]).level(streamed[1])
     known = format_of(path) or _compressed(path)
     place, name = seekable(path), str(path)
     if known is not None:
@@ -142,13 +142,13 @@ def read_columns(path: str | Path) -> Splats:
 
 
 def _content(place: Path, path: str | Path) -> bytes:
-    """Of the file at ``place``, whole."""
+    """Read the whole file at ``place``."""
     if place.stat().st_size > _LARGEST:
-        raise DataError(f"{path}: more than 4 GiB; expected less of this format, or a standard .ply")
+        raise DataError(f"{path}: more than 4 GiB; expected a smaller file in this format, or a standard .ply")
     return place.read_bytes()
 
 
 def _compressed(path: str | Path) -> Format | None:
-    """`.compressed.ply` under another name."""
+    """Return the format of a `.compressed.ply` that has another name, else None."""
     with open(seekable(path), "rb") as stream:
         return FORMATS[0] if b"\nelement chunk " in stream.read(_HEAD) else None

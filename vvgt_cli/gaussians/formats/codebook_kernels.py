@@ -1,4 +1,4 @@
-"""The kernels under `codebooks`: the best intervals of numbers, clusters of rows."""
+"""Kernels of `codebooks`: optimal intervals of numbers, clusters of rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vvgt_cli.jit.decorators import inlined, kernel
 
 @inlined()
 def _error(sums: np.ndarray, start: int, end: int) -> float:
-    """Squared error of the interval from ``start`` to before ``end`` around its mean."""
+    """Return the squared error of the interval from ``start`` to before ``end`` around its mean."""
     weight, first = sums[0, end] - sums[0, start], sums[1, end] - sums[1, start]
     error: float = sums[2, end] - sums[2, start] - first * first / weight
     return error
@@ -19,14 +19,14 @@ def _error(sums: np.ndarray, start: int, end: int) -> float:
 
 @kernel("f8:2 i4:2")
 def divide(sums: np.ndarray, cuts: np.ndarray) -> None:
-    """Where the last of k intervals of the first j numbers begins, ``cuts[k, j]``, for the smallest error.
+    """Compute ``cuts[k, j]``, the start of the last of k intervals of the first j numbers with the smallest error.
 
-    By dynamic programming; the cuts of k rise with j, so that each is sought between those of its neighbours on either
-    side (Wu 1991, "Optimal quantization by matrix searching"; Wang and Song 2011, "Ckmeans.1d.dp").
+    This is dynamic programming: the cuts for k increase with j, so each is searched between those of its neighbours on
+    either side (Wu 1991, "Optimal quantization by matrix searching"; Wang and Song 2011, "Ckmeans.1d.dp").
 
     Args:
-        sums: (3, n + 1) float64, sums of weights, of weighted numbers and of their squares before each place.
-        cuts: (count + 1, n + 1) int32, zeros.
+        sums: (3, n + 1) float64, prefix sums of weights, weighted numbers and their weighted squares.
+        cuts: (count + 1, n + 1) int32, zeros; filled in.
     """
     n, count = sums.shape[1] - 1, cuts.shape[0] - 1
     before, now = np.full(n + 1, np.inf), np.full(n + 1, np.inf)
@@ -58,7 +58,7 @@ def divide(sums: np.ndarray, cuts: np.ndarray) -> None:
 
 @inlined()
 def _spread(points: np.ndarray, members: np.ndarray, start: int, end: int, sums: np.ndarray) -> tuple[float, int]:
-    """Squared error of a cluster along the axis where it is largest, and the axis; ``sums`` (2, d) is overwritten."""
+    """Return a cluster's squared error along its worst axis, and the axis; ``sums`` (2, d) is overwritten."""
     sums[:] = 0.0
     for k in range(start, end):
         for d in range(points.shape[1]):
@@ -76,12 +76,12 @@ def _spread(points: np.ndarray, members: np.ndarray, start: int, end: int, sums:
 
 @kernel("f4:2 i8")
 def cut_clusters(points: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``most`` rows for ``points`` (n, d) float32, and which of them stands for each.
+    """Cluster ``points`` (n, d) float32 into at most ``most`` rows.
 
-    Always the cluster with the largest error along an axis is cut there, at its mean.
+    The cluster with the largest error along an axis is split there at its mean, repeatedly.
 
     Returns:
-        rows (m, d) float32, the clusters' means; (n,) int32, numbers of rows.
+        rows (m, d) float32, the clusters' means; (n,) int32, the row of each point.
     """
     n, dims = points.shape
     members, sums = np.arange(n), np.empty((2, dims))
@@ -107,7 +107,7 @@ def cut_clusters(points: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]
                 members[low], members[high] = members[high], members[low]
                 high -= 1
         if low in (start, end):
-            continue  # equal but for rounding
+            continue  # the points are equal up to rounding
         ends[cluster], starts[made], ends[made] = low, low, end
         for part in (cluster, made):
             error, axes[part] = _spread(points, members, starts[part], ends[part], sums)

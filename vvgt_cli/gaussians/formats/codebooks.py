@@ -1,19 +1,20 @@
-"""Few values for many: 256 numbers for those of a column, a palette of rows for those of a table."""
+"""Quantisation: a codebook of 256 numbers for a column, a palette of rows for a table."""
 
 from __future__ import annotations
 
 import numpy as np
 
-SIZE = 256  # values of a codebook, told by a byte
-BINS = 8192  # of the histogram that values are divided by
-LARGEST_PALETTE = 1 << 16  # rows, told by two bytes
+SIZE = 256  # values of a codebook, indexed by a byte
+BINS = 8192  # of the histogram that is divided into intervals
+LARGEST_PALETTE = 1 << 16  # rows, indexed by two bytes
 
 
 def codebook(values: np.ndarray) -> np.ndarray:
-    """`SIZE` values (float32, rising) for any number of finite ones.
+    """Return `SIZE` values (float32, ascending) that represent any number of finite ones.
 
-    The division of their histogram into intervals of the smallest squared error, where a bin weighs as the square root
-    of its count: equal weights would spend more bytes, whole counts would leave rare values (large Gaussians) coarse.
+    Their histogram is divided into intervals with the smallest squared error, where a bin is weighted by the square
+    root of its count. Equal weights would make larger files, and full counts would quantise rare values (large
+    Gaussians) coarsely.
     """
     flat = values.ravel().astype(np.float64)
     low, high = float(flat.min()), float(flat.max())
@@ -27,17 +28,17 @@ def codebook(values: np.ndarray) -> np.ndarray:
 
 
 def places_in(book: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Index uint8 of the nearest value of a codebook, of the shape of ``values``."""
+    """Return the index of the nearest value of a codebook, uint8 in the shape of ``values``."""
     book = book.astype(np.float64)
     places: np.ndarray = np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
     return places
 
 
 def best_intervals(means: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
-    """Means (count,) float64 of the intervals of rising numbers (n,), n > count, with the smallest squared error."""
+    """Return the means (count,) float64 of the intervals of ascending numbers (n > count,) with least squared error."""
     from vvgt_cli.gaussians.formats.codebook_kernels import divide
 
-    shifted = means - means.mean()  # sums of squares lose nothing then
+    shifted = means - means.mean()  # avoids cancellation in the sums of squares
     sums = np.zeros((3, len(means) + 1))
     sums[:, 1:] = np.cumsum([weights, weights * shifted, weights * shifted**2], axis=1)
     cuts = np.zeros((count + 1, len(means) + 1), np.int32)
@@ -52,10 +53,10 @@ def best_intervals(means: np.ndarray, weights: np.ndarray, count: int) -> np.nda
 
 
 def palette(points: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``most`` rows for ``points`` (n, d), and which of them stands for each.
+    """Cluster ``points`` (n, d) into at most ``most`` rows.
 
     Returns:
-        rows (m, d) float32; (n,) int32, numbers of rows.
+        rows (m, d) float32; (n,) int32, the row of each point.
     """
     from vvgt_cli.gaussians.formats.codebook_kernels import cut_clusters
 

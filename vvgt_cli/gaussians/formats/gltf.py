@@ -1,6 +1,6 @@
-"""Binary glTF with KHR_gaussian_splatting: float32 attributes of a mesh of points, nothing rounded.
+"""Binary glTF with KHR_gaussian_splatting: float32 attributes of a point mesh, without quantisation.
 
-The data are the `.ply`'s, in its axes; the node turns them by 180 degrees about z, to glTF's +y upwards, and places
+The data are those of the `.ply`, in its axes. The node rotates them by 180 degrees about z, to glTF's +y up, and places
 them in the world in metres, where that is known.
 """
 
@@ -30,7 +30,7 @@ _HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, (x, y, z, w)
 
 
 def glb(splats: Splats, name: str) -> bytes:
-    """A `.glb` of the columns."""
+    """Encode columns as a `.glb`."""
     columns = {
         "POSITION": splats.means,
         f"{EXTENSION}:ROTATION": splats.quaternions[:, [1, 2, 3, 0]],
@@ -40,22 +40,22 @@ def glb(splats: Splats, name: str) -> bytes:
     }
     for m in range(splats.f_rest.shape[1]):
         columns[_harmonic(m)] = splats.f_rest[:, m]
-    parts = [np.ascontiguousarray(column, "<f4") for column in columns.values()]
+    arrays = [np.ascontiguousarray(column, "<f4") for column in columns.values()]
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     start = 0
-    for part in parts:
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes, "target": _ARRAY})
-        accessors.append(_accessor(len(accessors), part))
-        start += part.nbytes
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _ARRAY})
+        accessors.append(_accessor(len(accessors), array))
+        start += array.nbytes
     accessors[0] |= {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
     attributes = {attribute: k for k, attribute in enumerate(columns)}
     place = placed(splats.comments, name)
     node: dict[str, Any] = {"mesh": 0, "rotation": _HALF_TURN}
     if place.world is not None:
         node |= {"translation": place.translation.tolist(), "scale": [place.scale] * 3}
-        told = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
-        node["extras"] = told  # row by row
+        extras = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
+        node["extras"] = extras  # the matrix is row-major
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
     document = {
         "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(splats.comments)}},
@@ -72,24 +72,24 @@ def glb(splats: Splats, name: str) -> bytes:
     head += b" " * (-len(head) % 4)
     length = 12 + 8 + len(head) + 8 + start
     front = struct.pack("<5I", _MAGIC, 2, length, len(head), _JSON) + head + struct.pack("<2I", start, _BINARY)
-    return front + b"".join(part.tobytes() for part in parts)
+    return front + b"".join(array.tobytes() for array in arrays)
 
 
-def _accessor(view: int, part: np.ndarray) -> dict[str, Any]:
-    return {"bufferView": view, "componentType": _FLOAT, "count": len(part), "type": _TYPES[part.shape[1]]}
+def _accessor(view: int, array: np.ndarray) -> dict[str, Any]:
+    return {"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": _TYPES[array.shape[1]]}
 
 
 def _harmonic(m: int) -> str:
-    """Attribute of harmonic ``m``, counted from 0 above degree 0."""
+    """Return the attribute of harmonic ``m``, counted from 0 above degree 0."""
     degree = 1 if m < 3 else 2 if m < 8 else 3
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{m - (degree**2 - 1)}"
 
 
 def read_glb(content: bytes, name: str) -> Splats:
-    """The columns of a `.glb` as `glb` writes it: one mesh, float32.
+    """Read the columns of a `.glb` as written by `glb`: one mesh, float32.
 
     Raises:
-        DataError: another file, or of another kind of data.
+        DataError: the file is not such a `.glb`.
     """
     try:
         return _read(content, name)
@@ -103,7 +103,7 @@ def read_glb(content: bytes, name: str) -> Splats:
 def _read(content: bytes, name: str) -> Splats:
     magic, _, _, size, kind = struct.unpack_from("<5I", content)
     if (magic, kind) != (_MAGIC, _JSON):
-        raise ValueError("no JSON chunk in front")
+        raise ValueError("no JSON chunk at the beginning")
     document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
 
@@ -111,7 +111,7 @@ def _read(content: bytes, name: str) -> Splats:
         accessor = document["accessors"][attributes[attribute]]
         view = document["bufferViews"][accessor["bufferView"]]
         if accessor["componentType"] != _FLOAT or accessor["type"] != _TYPES[width] or "byteStride" in view:
-            raise ValueError(f"{attribute} of type {accessor['componentType']} {accessor['type']}")
+            raise ValueError(f"{attribute} has type {accessor['componentType']} {accessor['type']}")
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         values = np.frombuffer(binary, "<f4", accessor["count"] * width, start)
         return values.reshape(-1, width) if width > 1 else values
@@ -136,7 +136,7 @@ def _read(content: bytes, name: str) -> Splats:
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4) of a node, for columns of coordinates."""
+    """Return a node's matrix (4, 4), which applies to column vectors."""
     if "matrix" in node:
         return np.reshape(node["matrix"], (4, 4)).T.astype(np.float64)
     x, y, z, w = node.get("rotation", [0.0, 0.0, 0.0, 1.0])

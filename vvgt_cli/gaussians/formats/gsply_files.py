@@ -21,39 +21,39 @@ EXTRA = "share"
 _RANGES = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _RANGES += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _FORMAT = "format binary_little_endian 1.0"
-_WHOLE = (0, 0, 0, 1, 1, 1)  # range of colours of SuperSplat 1, whose chunks have none
+_WHOLE = (0, 0, 0, 1, 1, 1)  # colour range of SuperSplat 1, whose chunks state none
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-_FRACTION = 20  # bits of a coordinate behind the point, where its 23 leave as many: 1e-6
+_FRACTION = 20  # fractional bits of a coordinate of 23 bits, unless it is too large: 1e-6
 _COMMENT = 16  # gzip's flag for a comment in its header (RFC 1952)
-_FLAGS = 14  # byte of the header; 1: opacity is to be compensated ("antialiased")
+_FLAGS = 14  # byte of the header; 1: opacity is compensated for dilation ("antialiased")
 _FRONT = struct.Struct("<2sBBIBB")  # magic, method, flags, time, extra flags, system
 
 
 def gsply(source: str) -> Any:
-    """The library.
+    """Return the library.
 
     Raises:
-        DataError: it is not installed.
+        DataError: the library is not installed.
     """
     return need("gsply", EXTRA, source, "this format")
 
 
 def compressed_ply(splats: Splats, name: str, order: np.ndarray | None = None) -> bytes:
-    """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other.
+    """Encode columns as a `.compressed.ply`: 16 bytes per Gaussian, and 72 per chunk of 256 neighbours.
 
-    ``order`` (K,) of the Gaussians; by default along Morton's curve.
+    ``order`` (K,) of the Gaussians is by default along the Morton curve.
     """
     library = gsply(name)
     s = splats.take(morton_order(splats.means) if order is None else order)
     rest = s.f_rest if s.f_rest.shape[1] else None
     content: bytes = library.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
-    said = "".join(f"comment {line}\n" for line in s.comments).encode()
+    comments = "".join(f"comment {line}\n" for line in s.comments).encode()
     head, end, body = content.partition(b"end_header\n")
-    return head + said + end + body
+    return head + comments + end + body
 
 
 def read_compressed_ply(content: bytes, name: str) -> Splats:
-    """The columns of a `.compressed.ply`.
+    """Read the columns of a `.compressed.ply`.
 
     Raises:
         DataError: gsply cannot read it, or is not installed.
@@ -66,7 +66,7 @@ def read_compressed_ply(content: bytes, name: str) -> Splats:
 
 
 def _in_order(content: bytes, lines: list[str], at: int) -> bytes:
-    """Put the file's columns in the order that gsply expects, and a range of colours in every chunk."""
+    """Reorder the file's columns as gsply expects, with a colour range in every chunk."""
     elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     for words in map(str.split, lines):
         if words[:1] == ["element"]:
@@ -92,17 +92,17 @@ def _in_order(content: bytes, lines: list[str], at: int) -> bytes:
 
 
 def spz(splats: Splats, name: str) -> bytes:
-    """An `.spz` of version 3, in the axes of the `.ply`; its gzip header's comment holds the `.ply`'s comments."""
+    """Encode columns as `.spz` version 3, in the axes of the `.ply`, with its comments in the gzip header."""
     return _packed(_version_3(splats, name), splats.comments)
 
 
 def spz_4(splats: Splats, name: str) -> bytes:
-    """An `.spz` of version 4, with records that hold the comments and say that the axes are the `.ply`'s."""
+    """Encode columns as `.spz` version 4, with records for the comments and for the axes, which are the `.ply`'s."""
     return spz4.from_version_3(_version_3(splats, name), splats.comments, name)
 
 
 def zstandard(source: str) -> None:
-    """What `spz_4` needs.
+    """Check the libraries of `spz_4`.
 
     Raises:
         DataError: gsply or numcodecs is not installed.
@@ -112,12 +112,12 @@ def zstandard(source: str) -> None:
 
 
 def _version_3(splats: Splats, name: str) -> bytes:
-    """The content of an `.spz` of version 3, not packed, with the flag of Gaussians that are to be compensated."""
+    """Return the content of an `.spz` of version 3 before compression, with the flag for compensated opacity."""
     library = gsply(name)
     largest = max(float(np.abs(splats.means).max()), 1e-6)
     bits = min(int(np.floor(np.log2((2**23 - 1) / largest))), _FRACTION)
     if bits < 1:
-        raise DataError(f"{name}: positions up to {largest:g}; expected less than 4e6 in an .spz; try --frame unit")
+        raise DataError(f"{name}: positions up to {largest:g}; expected less than 4e6 for .spz: try --frame unit")
     s = splats
     rest = s.f_rest if s.f_rest.shape[1] else None
     data = library.GSData.from_arrays(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest, format="ply")
@@ -130,15 +130,15 @@ def _version_3(splats: Splats, name: str) -> bytes:
 
 
 def _packed(content: bytes, comments: tuple[str, ...]) -> bytes:
-    """gzip with comments, and the same bytes every time."""
+    """Compress by gzip with comments in its header, reproducibly."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
-    said = "\n".join(comments).encode("ascii", "replace").replace(b"\0", b" ")
-    front = _FRONT.pack(b"\x1f\x8b", 8, _COMMENT if said else 0, 0, 2, 255) + (said + b"\0" if said else b"")
+    text = "\n".join(comments).encode("ascii", "replace").replace(b"\0", b" ")
+    front = _FRONT.pack(b"\x1f\x8b", 8, _COMMENT if text else 0, 0, 2, 255) + (text + b"\0" if text else b"")
     return front + packer.compress(content) + packer.flush() + struct.pack("<II", zlib.crc32(content), len(content))
 
 
 def read_spz(content: bytes, name: str) -> Splats:
-    """The columns of an `.spz` of version 1 to 4.
+    """Read the columns of an `.spz` of version 1 to 4.
 
     Raises:
         DataError: gsply cannot read it, or is not installed.
@@ -154,11 +154,11 @@ def read_spz(content: bytes, name: str) -> Splats:
 
 
 def _comments(content: bytes) -> list[str]:
-    """Those that `_packed` left."""
+    """Return the comments that `_packed` wrote."""
     if len(content) < _FRONT.size or _FRONT.unpack_from(content)[2] != _COMMENT:
         return []
-    said = content[_FRONT.size : max(content.find(b"\0", _FRONT.size), 0)]  # none where it has no end
-    return said.decode("ascii", "replace").splitlines()
+    text = content[_FRONT.size : max(content.find(b"\0", _FRONT.size), 0)]  # empty if it is not terminated
+    return text.decode("ascii", "replace").splitlines()
 
 
 def _columns(data: Any, comments: list[str]) -> Splats:

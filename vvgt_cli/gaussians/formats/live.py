@@ -1,17 +1,17 @@
-"""What a page needs to show Gaussians that carry values under any function: bytes of each, and facts as JSON has them.
+"""The data with which a page shows Gaussians that carry values under any function: bytes of each, and JSON facts.
 
-Eight bytes a Gaussian, two textures of RGBA8U, in the order of the file:
+There are eight bytes per Gaussian, two RGBA8U textures, in the order of the file:
 
 | byte | holds |
 | --- | --- |
 | 0 | value m: (m - lo) / (hi - lo) * 255 |
-| 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table over 255 times its columns less one |
+| 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table scaled to 0 to 255 |
 | 2 | log L: (log L - l0) / (l1 - l0) * 255 |
-| 4, 5, 6 | direction in which values rise, as long as the share r that it explains: 128 + 127 times x, y, z |
-| 3, 7 | the row of what it looks like, its low and its high byte |
+| 4, 5, 6 | gradient direction, with the share r that it explains as its length: 128 + 127 times x, y, z |
+| 3, 7 | row of its look, low and high byte |
 
-A row is a layer that carries values, or a label of one that carries labels; those of one layer lie after those of the
-layer before.
+Each layer of values has one row, each layer of labels one per label; the rows of a layer follow those of the previous
+one.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from vvgt_cli.gaussians.live import (
     VALUE,
     WIDEST,
 )
-from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
 
 
 def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float] | None = None) -> np.ndarray:
-    """(K, 8) uint8 of Gaussians that carry values; directions are in the frame that these are in.
+    """Return the bytes (K, 8) uint8 of Gaussians that carry values, with directions in the Gaussians' frame.
 
-    ``logs``: `log_lengths` of all that are in one page; None: their own.
+    ``logs`` are the `log_lengths` of all Gaussians in the page, by default of these.
     """
     assert gaussians.live is not None
     live = gaussians.live.astype(np.float64)
     first, last = logs or log_lengths([gaussians])
-    number = live[:, NUMBER] if facts.others else np.zeros(len(live))
+    number = live[:, LAYER_ID] if facts.others else np.zeros(len(live))
     lo, width = (np.array(ends)[number.astype(np.int64)] for ends in _ranges(facts.layers))
     out = np.zeros((len(live), BYTES), np.uint8)
     out[:, 0] = _byte((live[:, VALUE] - lo) / width)
@@ -58,32 +58,32 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float]
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
     out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
     row = np.array(_first_rows(facts.layers))[number.astype(np.int64)]
-    row += live[:, ROW].astype(np.int64) if facts.most_labels else 0
+    row += live[:, LABEL_ROW].astype(np.int64) if facts.most_labels else 0
     out[:, 3], out[:, 7] = row & 255, row >> 8
     return out
 
 
 def _ranges(layers: Sequence[LiveFacts]) -> tuple[list[float], list[float]]:
-    """Of each layer the least value, and how far its values go."""
+    """Return the smallest value and the range of values of each layer."""
     return [layer.lo for layer in layers], [(layer.hi - layer.lo) or 1.0 for layer in layers]
 
 
 def _first_rows(layers: Sequence[LiveFacts]) -> list[int]:
-    """Of each layer the first row of its looks."""
+    """Return the first row of each layer."""
     return [0, *accumulate(max(len(layer.labels), 1) for layer in layers)][:-1]
 
 
 def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Sequence[float]) -> dict[str, Any]:
-    """Facts beside the bytes, plain values.
+    """Return the facts that accompany the bytes, as plain values.
 
     Args:
-        clouds: that the bytes are of.
-        facts: of their values.
-        unit_distances: of each layer the unit-frame length that its opacity is per.
+        clouds: the Gaussians.
+        facts: facts about their values.
+        unit_distances: per layer, the unit-frame length that its opacity refers to.
     """
-    parts = zip(facts.layers, _first_rows(facts.layers), unit_distances, strict=True)
+    rows = zip(facts.layers, _first_rows(facts.layers), unit_distances, strict=True)
     return {
-        "layers": [_layer_json(*part) for part in parts],
+        "layers": [_layer_json(*row) for row in rows],
         "log_lengths": list(log_lengths(clouds)),
         "widest": WIDEST,
         "bend": BEND,
@@ -110,7 +110,7 @@ def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, A
 
 
 def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
-    """(K, 6 to 8) float32 of bytes and facts: what a page makes of them, and `Gaussians.live` holds."""
+    """Decode bytes and facts to `Gaussians.live`, (K, 6 to 8) float32, as a page does."""
     layers, (first, last) = facts["layers"], facts["log_lengths"]
     row = stream[:, 3] + 256 * stream[:, 7].astype(np.int64)
     rows = np.array([layer["row"] for layer in layers])
@@ -128,12 +128,12 @@ def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
 
 
 def log_lengths(clouds: Sequence[Gaussians]) -> tuple[float, float]:
-    """Logs of the shortest and the longest."""
+    """Return the logs of the shortest and the longest length."""
     logs = [np.log(cloud.live[:, LENGTH].astype(np.float64)) for cloud in clouds if cloud.live is not None]
     return min(float(some.min()) for some in logs), max(float(some.max()) for some in logs)
 
 
 def _byte(share: np.ndarray) -> np.ndarray:
-    """Of shares in [0, 1]."""
+    """Quantise shares in [0, 1] to uint8."""
     found: np.ndarray = np.rint(share.clip(0, 1) * 255).astype(np.uint8)
     return found

@@ -1,4 +1,4 @@
-"""Where a scene in metres has the Gaussians of a file: glTF and USD, whose up is +y, and whose unit is the metre."""
+"""Placement of Gaussians in scenes of glTF and USD, in metres with +y up."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.header import facts_in
 from vvgt_cli.volume.space import metres
 
-SMALLEST = 1e-9  # metres: molecules, in angstroms, would be too small for any viewer
-HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from up as 3DGS viewers have it, -y, to +y
+SMALLEST = 1e-9  # metres per unit: molecules, in angstroms, would be too small for any viewer
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from the up of 3DGS viewers, -y, to +y
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,11 @@ class Placed:
     """A half turn about z, a uniform scale and a translation: ``scene = scale * HALF_TURN @ data + translation``.
 
     Attributes:
-        scale, translation: metres; 1 and (3,) of 0 where the world's unit, or the file's place in it, is not known.
-        world: (4, 4) that takes the scene's metres to the volume's world (mm where there is an anatomical space); None
-            where that is not known.
-        space, unit: of the world: "RAS", "LPS" or "none"; "mm", "um", ...
+        scale: metres per unit of the data; 1 if the world's unit or the file's place in it is unknown.
+        translation: (3,) metres; 0 in that case.
+        world: (4, 4) matrix from the scene's metres to the volume's world (mm in an anatomical space); None if unknown.
+        space: anatomical space of the world, "RAS", "LPS" or "none".
+        unit: unit of the world, "mm", "um", ...
     """
 
     scale: float
@@ -33,17 +34,17 @@ class Placed:
     unit: str = ""
 
     def matrix(self) -> np.ndarray:
-        """(4, 4) float64, data to scene, for columns of coordinates."""
+        """Return the matrix (4, 4) float64 from data to scene, which applies to column vectors."""
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = self.scale * HALF_TURN, self.translation
         return result
 
 
 def placed(comments: tuple[str, ...], name: str) -> Placed:
-    """Where the comments of a file say that its Gaussians are.
+    """Return the placement that a file's comments state.
 
     Raises:
-        DataError: comments that are not ours.
+        DataError: the comments are not valid.
     """
     facts = facts_in(list(comments), name)
     space = facts.get("space") or "none"
@@ -61,18 +62,19 @@ def placed(comments: tuple[str, ...], name: str) -> Placed:
 
 
 def same_place(found: np.ndarray, comments: tuple[str, ...], name: str) -> None:
-    """See that a file of ours places its Gaussians as it was written, or by the half turn alone.
+    """Check that a file places its Gaussians as vvgt wrote it, or by the half turn alone.
 
     Args:
-        found: (4, 4), data to scene, as `Placed.matrix`.
-        comments, name: of the file.
+        found: (4, 4) matrix from data to scene.
+        comments: comments of the file.
+        name: name of the file for errors.
 
     Raises:
-        DataError: it was moved by another program, and the comments do not say where it is any more.
+        DataError: another program moved the Gaussians, so that the comments are no longer true.
     """
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
     if not any(np.allclose(found, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(
-            f"{name}: its Gaussians are placed otherwise than vvgt places them (turned by 180 degrees about z, in "
-            "metres where their unit is known); expected a file as vvgt writes it"
+            f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (rotated by "
+            "180 degrees about z, in metres where their unit is known)"
         )

@@ -1,6 +1,6 @@
-"""The page that shows Gaussians: its text, and the whole of it as one file that opens without a server.
+"""The HTML page that shows Gaussians, and its single-file form, which opens without a server.
 
-`page/` holds its text, and `viewer.js.gz`, which `make page` builds of `page.mjs`, SuperSplat's viewer and the
+`page/` holds the template and `viewer.js.gz`, which `make page` builds from `page.mjs`, SuperSplat's viewer and the
 PlayCanvas engine (CONTRIBUTING.md, "Dependencies").
 """
 
@@ -33,20 +33,20 @@ PROGRAM = "viewer.js.gz"
 _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
-_FAR = 99  # percentile of the distances from the middle that a camera stands back by
-_SEEN = -3.0  # logit of the opacity from which on a Gaussian is one that is seen
-_DISTANCE, _FIELD = 3.0, 40.0  # of the orbits' cameras, in half edges of the unit frame and in degrees
+_FAR = 99  # percentile of distances from the middle that counts as the radius of a cloud
+_SEEN = -3.0  # smallest opacity logit of a Gaussian that counts as visible
+_DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
 
 
 def asset(name: str) -> bytes:
-    """A file of `page/`."""
+    """Return a file of `page/`."""
     return files("vvgt_cli.gaussians.formats").joinpath("page", name).read_bytes()
 
 
 def upright(options: PlyOptions) -> PlyOptions:
-    """How Gaussians are laid out to be looked at: in the unit frame, with the way up of `vvgt render` upwards.
+    """Return the options for viewing: the unit frame, with the same axis up as in `vvgt render`.
 
-    Viewers turn every file as 3DGS' files want it: PLY -y is up. Files that do not say where they are stay as they are.
+    Viewers show PLY -y up. Files without comments about their frame stay as they are.
     """
     if not options.comments:
         return options
@@ -54,7 +54,7 @@ def upright(options: PlyOptions) -> PlyOptions:
 
 
 def dated(options: PlyOptions) -> PlyOptions:
-    """With the day on which a page is written, or that of SOURCE_DATE_EPOCH (seconds), for the same bytes every day."""
+    """Return options with the current date, or that of `SOURCE_DATE_EPOCH` for reproducible files."""
     if not options.comments:
         return options
     seconds = epoch()
@@ -63,10 +63,10 @@ def dated(options: PlyOptions) -> PlyOptions:
 
 
 def camera(splats: Splats) -> dict[str, Any]:
-    """Where the page's camera begins: where `vvgt render --orbit` does, or as far from the middle of other files.
+    """Return the initial camera of the page: that of `vvgt render --orbit`, or a similar one for other frames.
 
     Returns:
-        Position and target in the viewer's axes, which have PLY (x, y, z) at (-x, -y, z); the field of view in degrees.
+        position and target in the viewer's axes, where PLY (x, y, z) is (-x, -y, z); the field of view in degrees.
     """
     middle, half = np.zeros(3), 1.0
     if not any(_UNIT.match(line) for line in splats.comments):
@@ -78,9 +78,9 @@ def camera(splats: Splats) -> dict[str, Any]:
 
 
 def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
-    """Places in the viewer's axes that a window has to hold for what is seen of all ``clouds`` to be whole in it.
+    """Return points in the viewer's axes that must be in view for everything visible of ``clouds`` to fit.
 
-    Of 26 directions each one's farthest Gaussian; none where nothing is seen.
+    These are the farthest Gaussians in 26 directions; the list is empty if nothing is visible.
     """
     places = np.concatenate([splats.means[splats.logits > _SEEN] for splats in clouds]) * (-1.0, -1.0, 1.0)
     towards = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)]).T
@@ -90,10 +90,10 @@ def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     return found
 
 
-def drawing(splats: Splats) -> dict[str, Any]:
-    """What the page's viewer changes to draw by the rule that the file names, or by the usual one."""
-    said = (_RULE.match(line) for line in splats.comments)
-    rule = RULES.get(next((found[1] for found in said if found), ""), INRIA)
+def rule_parameters(splats: Splats) -> dict[str, Any]:
+    """Return the viewer's parameters for the rendering rule that the file names, or for the default one."""
+    matches = (_RULE.match(line) for line in splats.comments)
+    rule = RULES.get(next((found[1] for found in matches if found), ""), INRIA)
     return {
         "dilation": rule.dilation, "compensate": rule.compensate, "shifted": rule.shifted,
         "minAlpha": rule.min_alpha, "minVariance": rule.min_variance,
@@ -104,60 +104,60 @@ def page(
     title: str,
     splats: Splats,
     frames: Sequence[dict[str, Any]],
-    parts: str,
+    elements: str,
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
-    """The page's text.
+    """Return the text of the page.
 
     Args:
-        title: of the window.
-        splats: of the first frame.
-        frames: of each its ``name``, its ``file``, what it is ``held`` in, where that is in the page, and the number
-            of the ``whole`` frame that it is held as the difference from.
-        parts: elements that bring the viewer.
-        more: of the scene, for the program.
+        title: title of the window.
+        splats: columns of the first frame.
+        frames: per frame its ``name`` and ``file``; if it is embedded in the page, the id of the element that it is
+            ``held`` in, and for a difference the number of the ``whole`` frame that it refers to.
+        elements: HTML elements with the viewer.
+        more: further entries of the scene for the viewer.
     """
     seen = {"camera": camera(splats), "outermost": outermost([splats])}
-    return _text(title, {"rule": drawing(splats), **seen, "frames": list(frames), **more}, parts)
+    return _text(title, {"rule": rule_parameters(splats), **seen, "frames": list(frames), **more}, elements)
 
 
-def waiting_page(title: str, parts: str) -> str:
-    """The text of a page whose Gaussians are being made: it asks the server how far they are."""
+def waiting_page(title: str, elements: str) -> str:
+    """Return the text of a page that waits for its Gaussians, and asks the server for progress."""
     place = {"position": [0, 0, _DISTANCE], "target": [0, 0, 0], "fov": _FIELD}
-    return _text(title, {"waits": True, "camera": place, "frames": []}, parts)
+    return _text(title, {"waits": True, "camera": place, "frames": []}, elements)
 
 
-def _text(title: str, scene: Mapping[str, Any], parts: str) -> str:
-    said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
+def _text(title: str, scene: Mapping[str, Any], elements: str) -> str:
+    document = json.dumps(scene).replace("<", "\\u003c")  # so that no name can end the script
     text = asset("page.html").decode("utf-8")
-    for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
+    for place, value in (("TITLE", escape(title)), ("SCENE", document), ("PARTS", elements)):
         text = text.replace(f"<!--{place}-->", value, 1)
     return text
 
 
 def html(splats: Splats, name: str) -> bytes:
-    """The page of one cloud as one file."""
+    """Return the page of one cloud as a single file."""
     return html_of_several([(title_of(name), splats)], name)
 
 
 def html_of_several(
     clouds: Sequence[tuple[str, Splats]],
     name: str,
-    parts: Mapping[str, bytes] = MappingProxyType({}),
+    embedded: Mapping[str, bytes] = MappingProxyType({}),
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> bytes:
-    """The page as one file: the viewer packed by gzip, each cloud as a `.compressed.ply`, all in base64.
+    """Return the page as a single file: the viewer by gzip, and each cloud as a `.compressed.ply`, in base64.
 
-    Of frames that share Gaussians only the first is whole.
+    Frames that share Gaussians with an earlier one are stored as differences.
 
     Args:
-        clouds: each one's name, as the page's list has it, and columns; the first is shown at first.
-        name: of the file.
-        parts: by the elements' ids, other content that the page holds.
-        more: of the scene, for the program.
+        clouds: names in the page's list, and columns; the first cloud is shown initially.
+        name: name of the file.
+        embedded: further content of the page, by element id.
+        more: further entries of the scene for the viewer.
     """
     held = [("program", "text/plain", asset(PROGRAM))]
-    held += [(key, "application/octet-stream", content) for key, content in parts.items()]
+    held += [(key, "application/octet-stream", content) for key, content in embedded.items()]
     shown = held_frames(clouds)
     held += [(f"splats-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
@@ -174,8 +174,8 @@ def html_of_several(
     return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
-def framed(content: bytes, name: str) -> str:
-    """A page within another, as notebooks show it: its program reaches nothing of that one, and no network."""
+def iframe(content: bytes, name: str) -> str:
+    """Return an iframe for notebooks that shows a page without access to the enclosing page or the network."""
     text = escape(content.decode("utf-8"))
     style = "width: 100%; height: 540px; border: 0; background: #000"
     allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen"'
@@ -183,21 +183,19 @@ def framed(content: bytes, name: str) -> str:
 
 
 def title_of(name: str) -> str:
-    """Of a page's file: no folder, no ending."""
+    """Return the title for a file name: without folder and ending."""
     return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
 
 def read_html(content: bytes, name: str) -> Splats:
-    """The columns of a page that `html` wrote.
+    """Read the columns of a page written by `html`.
 
     Raises:
-        DataError: another page, or one of several clouds.
+        DataError: the page is not from vvgt, or holds several clouds.
     """
     found = _SPLATS.findall(content)
     if not found:
         raise DataError(f"{name}: a page without Gaussians; expected one that vvgt wrote")
     if len(found) > 1:
-        raise DataError(
-            f"{name}: a page of {len(found)} clouds of Gaussians; expected one: try the .ply of one of them"
-        )
+        raise DataError(f"{name}: a page of {len(found)} clouds of Gaussians; expected one: try the .ply of one cloud")
     return read_compressed_ply(base64.b64decode(found[0]), name)

@@ -1,4 +1,4 @@
-"""Frames of a series within a page: whole, or what differs from the last whole one (`page/patch.mjs`)."""
+"""Frames of a series within a page: whole, or as differences from the last whole one (`page/patch.mjs`)."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
 
-LEAST = 0.2  # of the Gaussians that a frame shares with another, row by row
-GAP = 16  # bytes that are the same within a run: a run of its own would cost 8
+LEAST = 0.2  # smallest share of rows in common with the whole frame
+GAP = 16  # equal bytes that are kept within a run, as a new run costs 8 bytes
 
 
 class Held(NamedTuple):
-    """What a page holds of a frame: a `.compressed.ply`, or what differs from that of frame ``whole``."""
+    """A frame stored in a page: a `.compressed.ply`, or the difference from that of frame ``whole``."""
 
     content: bytes
     whole: int | None
 
 
 def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
-    """Every frame (name, columns), those that share rows with the last whole one as what differs from it."""
+    """Return all frames (name, columns), those that share rows with the last whole frame as differences."""
     clouds, found = _of_one_length(clouds), list[Held]()
     while len(found) < len(clouds):
         first = len(found)
@@ -34,7 +34,7 @@ def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
         ever = np.any([rows for rows in changed[:count] if rows is not None], axis=0) if count else None
         order = None if ever is None else morton_order(key.means)
         if order is not None and ever is not None:
-            order = order[np.argsort(ever[order], kind="stable")]  # those that stay, then the others
+            order = order[np.argsort(ever[order], kind="stable")]  # unchanged Gaussians first
         name, splats = clouds[first]
         base = compressed_ply(splats, name, order)
         found.append(Held(base, None))
@@ -44,7 +44,7 @@ def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
 
 
 def _of_one_length(clouds: Sequence[tuple[str, Splats]]) -> list[tuple[str, Splats]]:
-    """The same with comments of one length: those of certificates, say, differ from frame to frame."""
+    """Pad comments to the same length, because some, such as certificates, differ from frame to frame."""
     sizes = [sum(len(f"comment {line}\n".encode()) for line in splats.comments) for _, splats in clouds]
     if len(set(sizes)) < 2:
         return list(clouds)
@@ -55,7 +55,7 @@ def _of_one_length(clouds: Sequence[tuple[str, Splats]]) -> list[tuple[str, Spla
 
 
 def _changed(key: Splats, splats: Splats) -> np.ndarray | None:
-    """(K,) bool: rows that differ; None where the frames have too little in common."""
+    """Return a mask (K,) of the rows that differ, None if the frames have too little in common."""
     if len(key) != len(splats) or key.f_rest.shape != splats.f_rest.shape:
         return None
     rows = np.zeros(len(key), bool)
@@ -67,7 +67,7 @@ def _changed(key: Splats, splats: Splats) -> np.ndarray | None:
 
 
 def patch(base: bytes, content: bytes) -> bytes:
-    """What makes ``content`` of ``base``, which is as long: runs of bytes, each with its place and length (uint32)."""
+    """Return the difference of ``content`` from ``base`` of the same length: runs, each (place, length, bytes)."""
     a, b = np.frombuffer(base, np.uint8), np.frombuffer(content, np.uint8)
     at = np.flatnonzero(a != b)
     if not len(at):
@@ -79,7 +79,7 @@ def patch(base: bytes, content: bytes) -> bytes:
 
 
 def patched(base: bytes, runs: bytes) -> bytes:
-    """The inverse of `patch`."""
+    """Apply a `patch` to ``base``."""
     out, at = bytearray(base), 0
     while at < len(runs):
         place, length = struct.unpack_from("<II", runs, at)

@@ -1,4 +1,4 @@
-"""The page of Gaussians that carry values: under a function that is changed in the page, and cut (docs/live.md)."""
+"""The page of Gaussians that carry values, where the function and cuts can be changed (docs/live.md)."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upri
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
-from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume.types import triple
 
-HELD = "values"  # of the elements that hold the bytes, with the number of the cloud
-PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels or several layers all
-SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
+HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
+PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; with labels or several layers all are used
+SAMPLED = 96  # nodes for colours that are not interpolated linearly in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer has PLY (x, y, z) at (-x, -y, z)
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
 
 def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
-    """The page as one file; ``gaussians`` in the unit frame.
+    """Return the page as a single file, for ``gaussians`` in the unit frame.
 
     Raises:
-        DataError, UsageError: as `splats_of`, or a library that is missing.
+        DataError, UsageError: see `splats_of`; also if a library is not installed.
     """
     return live_html_of_several([(title_of(name), gaussians, options)], name)
 
 
 def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
-    """The page of several that are shown under one function, each by its name; `in_common` says whether they can be.
+    """Return the page of several named clouds that are shown under one function, which `shared_facts` must allow.
 
     Raises:
-        DataError, UsageError: as `live_html`.
+        DataError, UsageError: see `live_html`.
     """
-    shown, planes, facts = live_parts([(gaussians, options) for _, gaussians, options in clouds])
+    shown, planes, facts = live_page_data([(gaussians, options) for _, gaussians, options in clouds])
     light = clouds[0][2].light
     if light is not None and light.headlight + len(light.directions) > 1:
-        warnings.warn(f"{name}: its page has one light at a time; it begins with the first", stacklevel=2)
+        warnings.warn(f"{name}: the page shows one light at a time, and begins with the first", stacklevel=2)
     held = dict(zip(facts["held"], planes, strict=True))
     return html_of_several(
         [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)], name, held, {"live": facts}
@@ -58,12 +58,12 @@ def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], na
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
-    """The page of several clouds, each by its name: live where they can be shown under one function, else baked.
+    """Return the page of several named clouds, live if they can be shown under one function, else with fixed looks.
 
     Raises:
-        DataError, UsageError: as `live_html`.
+        DataError, UsageError: see `live_html`.
     """
-    if in_common([None if gaussians.live is None else options.live for _, gaussians, options in clouds]):
+    if shared_facts([None if gaussians.live is None else options.live for _, gaussians, options in clouds]):
         return live_html_of_several(clouds, name)
     baked = [
         (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
@@ -72,23 +72,23 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
     return html_of_several(baked, name)
 
 
-def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
-    """What files say of the values that their Gaussians carry, as one page has it; None where none can show all.
+def shared_facts(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
+    """Return common facts about the values of several files for one page, None if one page cannot show them all.
 
-    They have as many layers each, whose values are of one range under one function. Label maps have the labels of all:
-    one number may have several names, each of which has the look that it has in the first file.
+    The files must have the same number of layers, and values of the same range under the same function. The labels of
+    label maps are merged: a number may have several names, each with the look of the first file that has it.
     """
     known = [one.layers for one in facts if one is not None]
     if len(known) < len(facts) or len({len(layers) for layers in known}) > 1:
         return None
-    first, *others = [_layer_in_common(same) for same in zip(*known, strict=True)]
+    first, *others = [_shared_layer(same) for same in zip(*known, strict=True)]
     if first is None or None in others:
         return None
     return replace(first, others=tuple(one for one in others if one is not None))
 
 
-def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
-    """The same of one layer."""
+def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
+    """Return common facts about one layer of each file, None if there are none."""
     first = facts[0]
     if all(one.labels for one in facts):
         labels = {(label.number, label.name): label for one in reversed(facts) for label in one.labels}
@@ -97,19 +97,19 @@ def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     return first if len(looks) == 1 else None
 
 
-def live_parts(
+def live_page_data(
     clouds: Sequence[tuple[Gaussians, PlyOptions]],
 ) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
-    """What a page of Gaussians (unit frame) that carry values is made of, of one cloud or several.
+    """Return the data of a page of Gaussians (unit frame) that carry values, for one or several clouds.
 
     Returns:
-        of each its columns, in an order that `.compressed.ply` keeps; the bytes of its values, in that order, packed by
-        gzip; the facts about them that are the scene's ``live``.
+        per cloud the columns, in an order that `.compressed.ply` keeps; per cloud the bytes of the values in that
+        order, compressed by gzip; the facts for the scene's ``live``.
 
     Raises:
-        DataError, UsageError: as `live_html`.
+        DataError, UsageError: see `live_html`.
     """
-    facts = in_common([options.live for _, options in clouds])
+    facts = shared_facts([options.live for _, options in clouds])
     assert facts is not None
     ordered, splats = [], []
     for gaussians, options in clouds:
@@ -126,31 +126,31 @@ def live_parts(
 
 
 def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
-    """Gaussians with the rows that ``facts`` have in the place of their ``own``, of labels."""
+    """Return Gaussians with their label rows changed from those of their ``own`` facts to those of ``facts``."""
     assert gaussians.live is not None
     live = gaussians.live.copy()
     for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
         if one.labels != all_.labels:
             rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
-            mine = live[:, NUMBER] == number if facts.others else np.full(len(live), True)
+            mine = live[:, LAYER_ID] == number if facts.others else np.full(len(live), True)
             to = np.array([rows[label.number, label.name] for label in one.labels])
-            live[mine, ROW] = to[live[mine, ROW].astype(np.int64)]
+            live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 
 
 def planes_of(facts: LiveFacts) -> tuple[int, ...]:
-    """Columns of `live_bytes` that a page holds, one after the other."""
+    """Return the columns of `live_bytes` that a page stores, one after the other."""
     return (*PLANES, 3, 7) if facts.labels or facts.others else PLANES
 
 
 def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -> dict[str, Any]:
-    """What the page's program needs beside the bytes; ``options`` of the first cloud."""
+    """Return the facts that the viewer needs in addition to the bytes; ``options`` are those of the first cloud."""
     distances = [layer.distance or options.unit_distance or 1.0 for layer in facts.layers]
-    said = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
-    for own, layer, distance in zip(said["layers"], facts.layers, distances, strict=True):
+    found = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
+    for own, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
         own |= {"nodes": [] if layer.labels else nodes_of(layer), "opacity_unit_distance": distance}
     axes = _axes(upright(options).up)
-    return said | {
+    return found | {
         "held": [f"{HELD}-{k}" for k in range(len(clouds))],
         "planes": len(planes_of(facts)),
         "light": _light(options.light, axes),
@@ -165,7 +165,7 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
-    """What the page begins with: the file's light (of several the one at the eye, else the first), or none."""
+    """Return the initial light of the page: the file's headlight, else its first light, or none."""
     one = lighting or Lighting()
     kind = "none" if lighting is None else "headlight" if one.headlight else "direction"
     toward = np.array(one.directions[0] if one.directions else (-0.5, -0.7, 0.5)) @ axes
@@ -175,11 +175,11 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def light_sent(sent: Any, options: PlyOptions) -> Lighting | None:
-    """The light that a page of a file laid out so sends: what `_light` says, changed.
+def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
+    """Parse the JSON of a light sent by the page of a file with these options, in the format of `_light`.
 
     Raises:
-        DataError, UsageError: it is none.
+        DataError, UsageError: the light is not valid.
     """
     numbers = ("ambient", "diffuse", "specular", "power")
     if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
@@ -200,13 +200,13 @@ def light_sent(sent: Any, options: PlyOptions) -> Lighting | None:
 
 
 def _axes(up: str) -> np.ndarray:
-    """Rows: the axes of the unit frame in the viewer's."""
+    """Return the axes of the unit frame in the viewer's frame, as rows."""
     found: np.ndarray = (_HALF_TURN @ up_matrix(up)).T
     return found
 
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
-    """Nodes of both opacity and colour, straight lines between them; two where the function steps."""
+    """Return nodes with opacity and colour, between which both are linear; there are two at a step."""
     tf = read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function")
     places = [tf.opacity_nodes.x, tf.color_map.x]
     if tf.color_map.space != "RGB":
@@ -219,7 +219,7 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
 
 
 def _limit(tf: TransferFunction, x: float, side: float) -> dict[str, Any]:
-    """The function beside x, the nearest number but nodes' own on that side."""
+    """Return the function's one-sided limit at x, evaluated at the adjacent floating-point number."""
     beside = np.array([np.nextafter(x, side)])
     y, rgb = float(tf.opacity(beside)[0]), tf.color(beside)[0]
     return {"x": x, "y": round(y, 6), "rgb": [round(c, 4) for c in rgb.tolist()]}

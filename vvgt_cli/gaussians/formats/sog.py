@@ -1,4 +1,4 @@
-"""`.sog`: SOG's images and facts (`sog_images`) in a zip that is not compressed again."""
+"""`.sog`: SOG's images and metadata (`sog_images`) in an uncompressed zip."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vvgt_cli.gaussians.formats.splats import Splats, morton_order
 from vvgt_cli.gaussians.header import MIP
 from vvgt_cli.volume.libraries import library_errors
 
-COMMENTS = "vvgt.json"  # a member of the archive that others pass over
+COMMENTS = "vvgt.json"  # a member of the archive that other programs ignore
 _LARGEST = 1 << 30  # bytes of a member
 _LARGEST_TEXT = 1 << 20
 
 
 def sog(splats: Splats, name: str) -> bytes:
-    """A `.sog` of the columns, along Morton's curve.
+    """Encode columns as a `.sog`, along the Morton curve.
 
     Raises:
-        DataError: more Gaussians than a file holds.
+        DataError: there are more Gaussians than a file can hold.
     """
     if len(splats) > MOST:
         raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
@@ -39,10 +39,10 @@ def sog(splats: Splats, name: str) -> bytes:
 
 
 def read_sog(content: bytes, name: str) -> Splats:
-    """The columns of a `.sog` of version 2.
+    """Read the columns of a `.sog` of version 2.
 
     Raises:
-        DataError: it is not one.
+        DataError: the file is not valid.
     """
     with library_errors(name, "a .sog"), zipfile.ZipFile(io.BytesIO(content)) as archive:
 
@@ -58,6 +58,6 @@ def read_sog(content: bytes, name: str) -> Splats:
         splats = splats_in(json.loads(read(META, _LARGEST_TEXT)), read, name)
         if COMMENTS not in archive.namelist():
             return splats
-        said = json.loads(read(COMMENTS, _LARGEST_TEXT))
-        lines = said if isinstance(said, list) else []
+        found = json.loads(read(COMMENTS, _LARGEST_TEXT))
+        lines = found if isinstance(found, list) else []
         return replace(splats, comments=tuple(str(line).replace("\n", " ") for line in lines))

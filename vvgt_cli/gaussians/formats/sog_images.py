@@ -1,15 +1,15 @@
-"""PlayCanvas' SOG, version 2: Gaussians as images, a pixel each, and the facts beside them, both ways.
+"""Encoding and decoding of PlayCanvas' SOG, version 2: Gaussians as images, one pixel each, with JSON metadata.
 
-As the engine 2.23.3 and splat-transform 3.7.0 read it:
+The format is that read by the engine 2.23.3 and splat-transform 3.7.0:
 
 | image | red, green, blue | alpha |
 | --- | --- | --- |
 | `means_l`, `means_u` | low and high byte of sign(x) log(1 + abs(x)), in 65,535 steps from `mins` to `maxs` | 255 |
 | `quats` | the three smaller components, from -1/sqrt(2) to 1/sqrt(2), in the order w, x, y, z; the largest is positive | 252 plus the number of the largest |
-| `scales` | places of the log-scales in a codebook of 256 | 255 |
-| `sh0` | places of the harmonics of degree 0 in another | opacity times 255 |
+| `scales` | indices of the log-scales in a codebook of 256 | 255 |
+| `sh0` | indices of the harmonics of degree 0 in another codebook | opacity times 255 |
 | `shN_labels` | row of the palette, low and high byte | 255 |
-| `shN_centroids` | 64 rows of the palette a line, 3, 8 or 15 pixels each: places in a codebook | 255 |
+| `shN_centroids` | 64 rows of the palette per line, 3, 8 or 15 pixels each: indices in a codebook | 255 |
 """  # noqa: E501
 
 from __future__ import annotations
@@ -27,23 +27,19 @@ from vvgt_cli.gaussians.formats.splats import DEGREES, HARMONICS, Splats, logits
 from vvgt_cli.gaussians.formats.turns import nearest_turn
 from vvgt_cli.version import VERSION
 
-MOST = 1 << 26  # Gaussians of one set of images
+MOST = 1 << 26  # Gaussians in one set of images
 META = "meta.json"
 IMAGES = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
 _STEPS, _BYTE = 65535, 255
 _FIRST = 252  # alpha of a quaternion whose w is the largest
-_ROW = 64  # rows of the palette in a line of `shN_centroids`
+_ROW = 64  # rows of the palette per line of `shN_centroids`
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-_SPARE = 4096  # pixels that an image may have beyond four for each Gaussian
-_LARGEST_LOG = 80.0  # of a coordinate: float32 ends at 88
+_SPARE = 4096  # pixels that an image may have beyond four per Gaussian
+_LARGEST_LOG = 80.0  # of a coordinate; float32 overflows at 88
 
 
 def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Images by name, (h, w, 4) uint8, and what `meta.json` says; Gaussians stay in their order.
-
-    Raises:
-        DataError: more than `MOST`.
-    """
+    """Encode columns as images by name, (h, w, 4) uint8, and the content of `meta.json`, keeping their order."""
     count = len(splats)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     height = 4 * math.ceil(count / width / 4)
@@ -96,7 +92,7 @@ def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _palette(f_rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (m, M, 3) for harmonics (K, M, 3), and the row of each: as many as splat-transform makes, 1024 at least."""
+    """Return palette rows (m, M, 3) for harmonics (K, M, 3), as many as splat-transform makes, and the row of each."""
     count, few = len(f_rest), LARGEST_PALETTE
     while few > max(count, 1024):
         few //= 2
@@ -105,25 +101,25 @@ def _palette(f_rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def webp(image: np.ndarray) -> bytes:
-    """An image (h, w, 4) uint8 as lossless WebP, every pixel as it is."""
+    """Encode an image (h, w, 4) uint8 as lossless WebP."""
     from PIL import Image
 
     stream = io.BytesIO()
-    # the other methods take up to 70 times as long for files that are no smaller
+    # other methods take up to 70 times as long for files that are no smaller
     Image.fromarray(image).save(stream, "WEBP", lossless=True, quality=30, method=1, exact=True)
     return stream.getvalue()
 
 
 def splats_in(meta: Any, read: Callable[[str], bytes], name: str) -> Splats:
-    """The columns of what `meta.json` describes, without comments.
+    """Decode the columns that `meta.json` describes, without comments.
 
     Args:
         meta: the parsed JSON.
-        read: the bytes of an image, given its name.
-        name: for errors.
+        read: returns the bytes of an image, given its name.
+        name: name of the file for errors.
 
     Raises:
-        DataError: facts or images that are not what they must be.
+        DataError: the metadata or an image is not valid.
     """
     if not isinstance(meta, dict) or meta.get("version") != 2:
         found = meta.get("version") if isinstance(meta, dict) else None
@@ -138,7 +134,8 @@ def splats_in(meta: Any, read: Callable[[str], bytes], name: str) -> Splats:
     low, high = (_numbers(meta, "means", key, 3, name) for key in ("mins", "maxs"))
     if max(np.abs(low).max(), np.abs(high).max()) > _LARGEST_LOG:
         raise DataError(
-            f"{name}: {META} has means up to exp({max(np.abs(low).max(), np.abs(high).max()):.4g}); expected float32"
+            f"{name}: {META} has means up to exp({max(np.abs(low).max(), np.abs(high).max()):.4g}); expected the range "
+            "of float32"
         )
     steps = pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]
     logs = low + (high - low) * (steps / _STEPS)
@@ -171,7 +168,7 @@ def _harmonics(meta: dict[str, Any], pixels: Callable[..., np.ndarray], name: st
     rows, bands = (meta["shN"].get(key) if isinstance(meta["shN"], dict) else None for key in ("count", "bands"))
     if type(rows) is not int or not 0 < rows <= LARGEST_PALETTE or bands not in (1, 2, 3):
         raise DataError(
-            f"{name}: shN has count {rows!r:.40}, bands {bands!r:.40}; expected to {LARGEST_PALETTE}, 1 to 3"
+            f"{name}: shN has count {rows!r:.40}, bands {bands!r:.40}; expected 1 to {LARGEST_PALETTE}, and 1 to 3"
         )
     each = HARMONICS[int(bands)]
     labels = pixels("shN", 1).astype(np.int64)
@@ -191,7 +188,7 @@ def _part(meta: dict[str, Any], part: str, key: str) -> Any:
 def _files(meta: dict[str, Any], part: str, name: str) -> list[str]:
     found, needed = _part(meta, part, "files"), 2 if part in ("means", "shN") else 1
     if not isinstance(found, list) or len(found) != needed or not all(isinstance(file, str) for file in found):
-        raise DataError(f"{name}: {META} names no images of {part}; expected {needed}")
+        raise DataError(f"{name}: {META} does not name the images of {part}; expected {needed}")
     return found
 
 
@@ -208,7 +205,7 @@ def _numbers(meta: dict[str, Any], part: str, key: str, count: int, name: str) -
 def _pixels(
     read: Callable[[str], bytes], files: list[str], number: int, width: int, needed: int, name: str
 ) -> np.ndarray:
-    """The first ``needed`` pixels (n, 4) uint8 of an image, ``width`` pixels wide if that is not 0."""
+    """Read the first ``needed`` pixels (n, 4) uint8 of an image, whose width must be ``width`` unless that is 0."""
     from PIL import Image
 
     what = f"{name}: {files[number][:80]!r}"

@@ -1,7 +1,7 @@
-"""`.splat` of antimatter15's viewer, read only: 32 bytes a Gaussian, in the axes of the `.ply` that it was made from.
+"""`.splat` of antimatter15's viewer, read-only: 32 bytes per Gaussian, in the axes of the `.ply` that it came from.
 
-Centre and scales are 3 float32 each, scales linear; then R, G, B and opacity, and the rotation (w, x, y, z) times 128
-plus 128, are bytes. Colours are display RGB, as ``0.5 + SH_C0 * f_dc`` is; there are no harmonics.
+Centre and linear scales are 3 float32 each; then R, G, B and opacity, and the rotation (w, x, y, z) times 128 plus 128,
+are bytes. Colours are display RGB, like ``0.5 + SH_C0 * f_dc``; there are no harmonics.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("r
 
 
 def read_splat(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.splat`; scales of 0 are -inf, rotations of 0 NaN.
+    """Read the columns of a `.splat`; scales of 0 become -inf, rotations of 0 NaN.
 
     Raises:
-        DataError: a size that is not a multiple of 32 bytes.
+        DataError: the size is not a multiple of 32 bytes.
     """
     if not content or len(content) % _ROW.itemsize:
         raise DataError(f"{name}: {len(content)} bytes; expected a .splat of 32 bytes a Gaussian")
@@ -35,5 +35,5 @@ def read_splat(content: bytes, name: str) -> Splats:
 
 
 def refuse(content: Any, name: str) -> NoReturn:
-    """Raise the error for formats that are not read, or not written."""
-    raise DataError(f"{name}: not a format that is supported; expected a .ply: try splat-transform {name} out.ply")
+    """Raise the error for formats that cannot be read or written."""
+    raise DataError(f"{name}: this format is not supported; expected a .ply: try splat-transform {name} out.ply")

@@ -1,4 +1,4 @@
-"""The columns of a standard `.ply`, which every other format holds in its own way: out of one, and back into one."""
+"""The columns of a standard `.ply`, which all other formats encode, and conversions from and to Gaussians."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply, write
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
 
-HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # a channel, above degree 0
-A_ROW = 400  # bytes that reading a Gaussian takes
+HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients per channel above degree 0
+ROW_BYTES = 400  # memory that reading a Gaussian takes
 COLUMNS = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
 DEGREES = {count: degree for degree, count in HARMONICS.items()}
 
 
 @dataclass(frozen=True)
 class Splats:
-    """K Gaussians as a standard `.ply` holds them (docs/conventions.md), in the frame and the turn of the file.
+    """K Gaussians as stored in a standard `.ply` (docs/conventions.md), in the frame and orientation of the file.
 
     Attributes:
         means: (K, 3) float32.
         log_scales: (K, 3) float32, natural logarithms.
         quaternions: (K, 4) float32, (w, x, y, z), of norm 1.
-        logits: (K,) float32, of opacity.
+        logits: (K,) float32, logits of opacity.
         f_dc: (K, 3) float32, harmonics of degree 0.
         f_rest: (K, M, 3) float32, harmonics above, M = 0, 3, 8 or 15.
-        comments: lines of the header, without the word.
+        comments: comment lines of the header, without the word "comment".
     """
 
     means: np.ndarray
@@ -43,18 +43,19 @@ class Splats:
     comments: tuple[str, ...] = ()
 
     def __len__(self) -> int:
+        """Return the number of Gaussians."""
         return len(self.means)
 
     def take(self, order: np.ndarray) -> Splats:
-        """A permutation or a part of them."""
+        """Return the permutation or subset that ``order`` selects."""
         return replace(self, **{name: getattr(self, name)[order] for name in COLUMNS})
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """All of several, one after the other, with the comments of the first.
+    """Concatenate columns, with the comments of the first.
 
     Raises:
-        DataError: of several degrees of harmonics.
+        DataError: the degrees of harmonics differ.
     """
     degrees = sorted({DEGREES[part.f_rest.shape[1]] for part in parts})
     if len(degrees) > 1:
@@ -64,10 +65,10 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
 
 def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
-    """What `write_ply` would write.
+    """Return the columns that `write_ply` would write.
 
     Raises:
-        DataError, UsageError: as `write_ply`.
+        DataError, UsageError: see `write_ply`.
     """
     stream = io.BytesIO()
     write_ply(stream, gaussians, options)
@@ -75,10 +76,10 @@ def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
 
 
 def columns_of(content: bytes, name: str) -> Splats:
-    """The columns of a standard `.ply`.
+    """Return the columns of a standard `.ply`.
 
     Raises:
-        DataError: another file.
+        DataError: the content is not a standard `.ply`.
     """
     header = parse_header(content[: 1 << 16], name)
     rows = np.frombuffer(content, header.dtype, header.count, header.size)
@@ -102,7 +103,7 @@ def columns_of(content: bytes, name: str) -> Splats:
 
 
 def ply_bytes(splats: Splats) -> bytes:
-    """A standard `.ply` of the columns."""
+    """Encode columns as a standard `.ply`."""
     count, degree = len(splats), DEGREES[splats.f_rest.shape[1]]
     names = property_names(degree)
     rows = np.zeros((count, len(names)), "<f4")
@@ -115,10 +116,10 @@ def ply_bytes(splats: Splats) -> bytes:
 
 
 def gaussians_of(splats: Splats, name: str) -> tuple[Gaussians, PlyHeader]:
-    """As `read_ply` reads a file of these columns.
+    """Return Gaussians and header as `read_ply` would read them from a file of these columns.
 
     Raises:
-        DataError: values that are not finite, comments that are not ours.
+        DataError: values are not finite, or comments are not valid.
     """
     stream = io.BytesIO(ply_bytes(splats))
     stream.name = name
@@ -126,20 +127,20 @@ def gaussians_of(splats: Splats, name: str) -> tuple[Gaussians, PlyHeader]:
 
 
 def opacities_of(logits: np.ndarray) -> np.ndarray:
-    """Opacity (K,) float32 of logits."""
+    """Return the opacity (K,) float32 of logits."""
     result: np.ndarray = (1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))).astype(np.float32)
     return result
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
-    """Logits (K,) float32 of opacity; 0 and 1, whose logits are infinite, are taken as 1e-7 from there."""
+    """Return the logits (K,) float32 of opacity, which is clipped to 1e-7 and 1 - 1e-7 so that they are finite."""
     some = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
     result: np.ndarray = (np.log(some) - np.log1p(-some)).astype(np.float32)
     return result
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
-    """An order (K,) along Morton's curve: neighbours in the list are neighbours in space."""
+    """Return the order (K,) along the Morton curve, which keeps neighbours in space close together."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = ((means - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint32)
     code = np.zeros(len(means), np.uint32)

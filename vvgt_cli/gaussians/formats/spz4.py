@@ -1,7 +1,7 @@
-"""`.spz` of version 4: the streams of version 3, each packed by Zstandard, behind a header and records in the clear.
+"""`.spz` of version 4: the streams of version 3, each compressed by Zstandard, after a plain header and records.
 
-As https://github.com/nianticlabs/spz and its extensions/README.md have it: 32 bytes of header, records (type, length,
-payload) and a table of (packed, whole) sizes. Our comments are one record, the axes another.
+The layout follows https://github.com/nianticlabs/spz and its extensions/README.md: 32 bytes of header, records (type,
+length, payload) and a table of (compressed, full) sizes. One record holds our comments, another the axes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import A_ROW, HARMONICS
+from vvgt_cli.gaussians.formats.splats import HARMONICS, ROW_BYTES
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 
@@ -27,26 +27,26 @@ _LEVEL = 12  # of Zstandard
 
 
 def library(source: str) -> Any:
-    """The module `numcodecs.zstd`.
+    """Return the module `numcodecs.zstd`.
 
     Raises:
-        DataError: it is not installed.
+        DataError: the module is not installed.
     """
     return need("numcodecs.zstd", "share", source, ".spz of version 4")
 
 
 def _lengths(count: int, degree: int) -> list[int]:
-    """Bytes of centres, opacities, colours, sizes, rotations and harmonics."""
+    """Return the sizes in bytes of centres, opacities, colours, scales, rotations and harmonics."""
     return [length * count for length in (9, 1, 3, 3, 4, 3 * HARMONICS[degree]) if length]
 
 
 def from_version_3(content: bytes, comments: tuple[str, ...], name: str) -> bytes:
-    """A file of version 4 that holds what one of version 3 does, unpacked, and says that its axes are a `.ply`'s."""
+    """Convert the uncompressed content of version 3 to a file of version 4, which states the axes of a `.ply`."""
     zstd = library(name)
     _, _, count, degree, fraction, flags = _OLD.unpack_from(content)
     records = _RECORD.pack(AXES, 4) + struct.pack("<I", RIGHT_DOWN_FRONT)
-    said = "\n".join(comments).encode("ascii", "replace")
-    records += _RECORD.pack(COMMENTS, len(said)) + said if said else b""
+    text = "\n".join(comments).encode("ascii", "replace")
+    records += _RECORD.pack(COMMENTS, len(text)) + text if text else b""
     packed, sizes, start = [], b"", _OLD.size
     for length in _lengths(count, degree):
         packed.append(bytes(zstd.compress(content[start : start + length], _LEVEL)))
@@ -57,10 +57,10 @@ def from_version_3(content: bytes, comments: tuple[str, ...], name: str) -> byte
 
 
 def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
-    """What a file of version 3 would hold, packed by gzip, and our comments.
+    """Convert a file of version 4 to version 3, compressed by gzip, and return it with our comments.
 
     Raises:
-        DataError: not such a file, other axes than a `.ply`'s, no Zstandard here, or more than memory holds.
+        DataError: the file is not valid, has other axes than a `.ply` or exceeds memory, or numcodecs is missing.
     """
     try:
         _, version, count, degree, fraction, flags, streams, table = _HEAD.unpack_from(content)
@@ -72,13 +72,13 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
             f"{name}: version {version}, degree {degree}, {streams} streams, table at {table} of {len(content)} bytes; "
             "expected an .spz of version 4 with harmonics of degree 0 to 3"
         )
-    check_memory(A_ROW * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
+    check_memory(ROW_BYTES * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
     zstd, start, body = library(name), table + streams * _SIZES.size, []
     for number, length in enumerate(lengths):
         size, whole = _SIZES.unpack_from(content, table + number * _SIZES.size)
         part = content[start : start + size]
         if whole != length or len(part) != size:
-            raise DataError(f"{name}: stream {number} of {whole} bytes in {len(part)}; expected {length} in {size}")
+            raise DataError(f"{name}: stream {number} is {whole} bytes in {len(part)}; expected {length} in {size}")
         with library_errors(name, "an .spz of version 4"):
             body.append(_unpacked(zstd, part, length, f"{name}: stream {number}"))
         start += size
@@ -93,16 +93,16 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
 
 
 def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
-    """What a stream holds.
+    """Decompress a stream.
 
     Raises:
-        DataError: fewer bytes than ``length``, of which the last would stay as they were.
+        DataError: it has fewer bytes than ``length``, detected by the end of the buffer, which stays unchanged.
     """
     for before in (b"\0", b"\xff"):
         found = bytes(zstd.decompress(part, bytearray(before * length)))
         if found[-1:] != before:
             return found
-    raise DataError(f"{name}: less than the {length} bytes that its table says; is the file whole?")
+    raise DataError(f"{name}: truncated; expected {length} bytes by the file's table")
 
 
 def _records(zone: bytes, name: str) -> Iterator[tuple[int, bytes]]:
@@ -111,6 +111,6 @@ def _records(zone: bytes, name: str) -> Iterator[tuple[int, bytes]]:
         left = len(zone) - start
         kind, length = _RECORD.unpack_from(zone, start) if left >= _RECORD.size else (0, left)
         if _RECORD.size + length > left:
-            raise DataError(f"{name}: a record of {length} bytes where {left} are left; is the file whole?")
+            raise DataError(f"{name}: a record of {length} bytes; expected at most {left}, which remain in the file")
         start += _RECORD.size + length
         yield kind, zone[start - length : start]

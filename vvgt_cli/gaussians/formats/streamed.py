@@ -1,4 +1,4 @@
-"""`lod-meta.json` of streamed SOG: what PlayCanvas' engine takes of it, and what vvgt says beside that."""
+"""`lod-meta.json` of streamed SOG: the entries that PlayCanvas' engine reads, and those that vvgt adds."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _MOST_LEVELS = 64
 
 
 def is_streamed(path: str | Path | None) -> bool:
-    """Whether a name is that of the manifest of a folder."""
+    """Return whether a file name is that of a manifest."""
     return path is not None and Path(path).name == MANIFEST
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:
-    """The JSON, of which what the engine needs is there: levels, files, and in the tree nodes with bounds.
+    """Read a manifest and check the entries that the engine needs: levels, files, and nodes in the tree.
 
     Raises:
-        DataError: it is another file, or damaged.
+        DataError: the file is not a manifest, or damaged.
     """
     path = Path(path)
     try:
@@ -37,7 +37,7 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); expected a manifest of streamed SOG") from None
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no JSON ({' '.join(str(error).split())[:200]}); expected streamed SOG") from None
+        raise DataError(f"{path}: not JSON ({' '.join(str(error).split())[:200]}); expected streamed SOG") from None
     levels = found.get("lodLevels") if isinstance(found, dict) else None
     files = found.get("filenames") if isinstance(found, dict) else None
     if type(levels) is not int or not 0 < levels <= _MOST_LEVELS or not isinstance(files, list):
@@ -45,7 +45,7 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
     for name in files:
         parts = name.split("/") if isinstance(name, str) else []
         if not parts or parts[-1] != META or any(part in ("", ".", "..") or "\\" in part for part in parts):
-            raise DataError(f"{path}: names {name!r:.80}; expected files FOLDER/{META} beside it")
+            raise DataError(f"{path}: names {name!r:.80}; expected files FOLDER/{META} next to it")
     for node in nodes_of(found, path):
         for level, place in node["lods"].items():
             numbers = [place.get(key) if isinstance(place, dict) else None for key in ("file", "offset", "count")]
@@ -60,10 +60,10 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
 
 
 def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]:
-    """The nodes that have levels, in the order of the tree.
+    """Return the nodes that have levels, in the order of the tree.
 
     Raises:
-        DataError: something else in the tree.
+        DataError: the tree is not valid.
     """
     found, waiting = [], [manifest.get("tree")]
     while waiting:
@@ -78,14 +78,14 @@ def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]
 
 
 def facts_of(path: str | Path) -> dict[str, Any]:
-    """What `vvgt info` says of it: of each level Gaussians and nodes, and bytes and errors where vvgt wrote it.
+    """Return the summary for `vvgt info`: Gaussians and nodes per level, and bytes and errors if vvgt wrote them.
 
     Raises:
-        DataError: as `read_manifest`.
+        DataError: see `read_manifest`.
     """
     manifest = read_manifest(path)
-    nodes, said = nodes_of(manifest, path), manifest.get("vvgt")
-    facts = said.get("levels") if isinstance(said, dict) else None
+    nodes, ours = nodes_of(manifest, path), manifest.get("vvgt")
+    facts = ours.get("levels") if isinstance(ours, dict) else None
     levels = []
     for level in range(manifest["lodLevels"]):
         places = [node["lods"][str(level)] for node in nodes if str(level) in node["lods"]]
@@ -103,10 +103,10 @@ def facts_of(path: str | Path) -> dict[str, Any]:
 
 
 def placed(manifest: dict[str, Any]) -> tuple[Splats, float]:
-    """A stand-in with the comments of the file, for where the page's camera begins, and by what its frame is larger."""
-    said = manifest.get("vvgt")
-    said = said if isinstance(said, dict) else {}
-    scale, lines = said.get("scale"), said.get("comments")
+    """Return placeholder Gaussians with the file's comments, for the page's initial camera, and the frame's scale."""
+    ours = manifest.get("vvgt")
+    ours = ours if isinstance(ours, dict) else {}
+    scale, lines = ours.get("scale"), ours.get("comments")
     comments = tuple(str(line) for line in lines) if isinstance(lines, list) else ()
     tree = manifest["tree"].get("bound")
     corners = np.array([[-1.0] * 3, [1.0] * 3])

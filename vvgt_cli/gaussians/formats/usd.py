@@ -1,7 +1,7 @@
-"""OpenUSD's `ParticleField3DGaussianSplat` (OpenUSD 26.3 or newer) through usd-core: float32, nothing rounded.
+"""OpenUSD's `ParticleField3DGaussianSplat` (OpenUSD 26.3 or newer) through usd-core: float32, without quantisation.
 
-The data are the `.ply`'s, in its axes; the prim is turned by 180 degrees about z, to the stage's +y upwards, and placed
-in the world in metres, where that is known.
+The data are those of the `.ply`, in its axes. The prim is rotated by 180 degrees about z, to the stage's +y up, and
+placed in the world in metres, where that is known.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from vvgt_cli.volume.libraries import library_errors, need
 
 KIND = "ParticleField3DGaussianSplat"
 _SINCE = (0, 26, 3)
-_SEEN = 3.0  # standard deviations that the extent has around the centres
-_COMMENTS = "vvgtComments"  # in the layer's custom data, a line each
+_SEEN = 3.0  # standard deviations around the centres that the extent includes
+_COMMENTS = "vvgtComments"  # in the layer's custom data, one per line
 
 
 def library(source: str) -> Any:
-    """The module `pxr.Usd`.
+    """Return the module `pxr.Usd`.
 
     Raises:
-        DataError: it is not installed, or does not know Gaussians yet.
+        DataError: the module is not installed, or too old for Gaussians.
     """
     usd = need("pxr.Usd", "share", source, ".usdc")
     if usd.GetVersion() < _SINCE:
         version = ".".join(map(str, usd.GetVersion()[1:]))
-        raise DataError(f"{source}: OpenUSD {version} knows no {KIND}; try: pip install 'usd-core>=26.3'")
+        raise DataError(f"{source}: OpenUSD {version} does not support {KIND}; try: pip install 'usd-core>=26.3'")
     return usd
 
 
 def usdc(splats: Splats, name: str) -> bytes:
-    """A `.usdc` of the columns: one prim, /Splats."""
+    """Encode columns as a `.usdc` with one prim, /Splats."""
     usd = library(name)
     from pxr import Gf, Sdf, UsdGeom, UsdVol, Vt
 
@@ -56,13 +56,13 @@ def usdc(splats: Splats, name: str) -> bytes:
         xform.AddRotateZOp().Set(180.0)
         if place.world is not None:
             xform.AddScaleOp().Set(Gf.Vec3f(place.scale))
-            world = Gf.Matrix4d(*place.world.T.ravel().tolist())  # USD multiplies rows of coordinates
+            world = Gf.Matrix4d(*place.world.T.ravel().tolist())  # USD uses row vectors
             prim.SetCustomData({"space": place.space, "unit": place.unit, "worldFromScene": world})
         scales = np.exp(splats.log_scales.astype(np.float64)).astype(np.float32)
         harmonics = np.concatenate([splats.f_dc[:, None], splats.f_rest], axis=1)
         reach = _SEEN * scales.max(axis=1, keepdims=True)
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
-        values = {  # quaternions lie in memory there with w last
+        values = {  # USD stores quaternions with w last
             "positions": Vt.Vec3fArray.FromNumpy(_plain(splats.means)),
             "orientations": Vt.QuatfArray.FromNumpy(_plain(splats.quaternions[:, [1, 2, 3, 0]])),
             "scales": Vt.Vec3fArray.FromNumpy(_plain(scales)),
@@ -73,7 +73,7 @@ def usdc(splats: Splats, name: str) -> bytes:
         }
         for attribute, value in values.items():
             if not prim.GetAttribute(attribute).Set(value):
-                raise DataError(f"{name}: OpenUSD does not take {attribute} of a {KIND}")
+                raise DataError(f"{name}: OpenUSD does not accept {attribute} of a {KIND}")
         stage.GetRootLayer().Save()
         return path.read_bytes()
 
@@ -83,10 +83,10 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def read_usdc(content: bytes, name: str) -> Splats:
-    """The columns of a `.usdc` as `usdc` writes it.
+    """Read the columns of a `.usdc` as written by `usdc`.
 
     Raises:
-        DataError: another stage, or OpenUSD is not installed.
+        DataError: the file is not such a stage, or OpenUSD is not installed.
     """
     usd = library(name)
     with library_errors(name, f"a {KIND}"), tempfile.TemporaryDirectory() as folder:

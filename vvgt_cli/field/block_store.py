@@ -1,4 +1,4 @@
-"""The folder that blocks are kept in: one file a block and pass, whole or not there."""
+"""The folder that holds the results of blocks: one file per block and pass, complete or absent."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from vvgt_cli.files import atomic_write
 
 RUN = "run.json"
 COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"
-ROW = MOMENTS * 8 + 3  # bytes a cell: moments float64, place in its tile uint8
+ROW = MOMENTS * 8 + 3  # bytes per cell: moments float64, position in its tile uint8
 
 
 @dataclass(frozen=True)
-class Parts:
-    """A folder of parts.
+class BlockStore:
+    """A folder of block results, each of a kind (the pass) and a block number.
 
     Attributes:
-        folder: it.
+        folder: path of the folder.
     """
 
     folder: Path
 
     def open(self, settings: dict[str, Any], ours: bool) -> bool:
-        """Make the folder, or take up what an earlier run of the same settings left; whether there was one.
+        """Create the folder, or reuse it after a run with the same settings; return whether it existed.
 
         Args:
-            settings: all that the parts depend on, plain values.
-            ours: the folder is this program's own: what another run left is removed.
+            settings: everything that the results depend on, plain values.
+            ours: the folder belongs to this program, which removes another run's results.
 
         Raises:
-            UsageError: the folder holds another run's parts, or something else.
-            DataError: it cannot be written.
+            UsageError: the folder holds another run's results, or something else.
+            DataError: the folder cannot be written.
         """
         text = json.dumps(settings, sort_keys=True, indent=1)
         place = self.folder / RUN
         if self.folder.exists() and not (place.is_file() and place.read_text("utf-8") == text):
             if not ours and any(self.folder.iterdir()) and not place.is_file():
-                raise UsageError(f"{self.folder}: a folder of something else; choose another name")
+                raise UsageError(f"{self.folder}: exists and holds no blocks of vvgt; choose another name")
             if not ours and place.is_file():
                 raise UsageError(
                     f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
-                    "name, or remove it"
+                    "name, or remove the folder"
                 )
             if ours:
                 shutil.rmtree(self.folder, ignore_errors=True)
@@ -57,14 +57,14 @@ class Parts:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DataError(f"{self.folder}: cannot be made ({error.strerror or error})") from error
+            raise DataError(f"{self.folder}: cannot be created ({error.strerror or error})") from error
         if not there:
             with atomic_write(place, overwrite=True) as temporary:
                 temporary.write_text(text, "utf-8")
         return there
 
     def kept_edge(self, settings: dict[str, Any]) -> int | None:
-        """Size of the blocks that an earlier run of the same settings has left, None where there was none."""
+        """Return the block edge of an earlier run with the same settings, None if there was none."""
         try:
             found = dict(self.settings())
         except UsageError:
@@ -73,10 +73,10 @@ class Parts:
         return edge if found == json.loads(json.dumps(settings)) else None
 
     def settings(self) -> dict[str, Any]:
-        """As `open` was given them.
+        """Return the settings given to `open`.
 
         Raises:
-            UsageError: not a folder of parts.
+            UsageError: this is not a folder of blocks.
         """
         try:
             found = json.loads((self.folder / RUN).read_text("utf-8"))
@@ -87,14 +87,14 @@ class Parts:
         return dict(found)
 
     def path(self, kind: str, number: int, suffix: str = ".npz") -> Path:
-        """Of a part."""
+        """Return the path of a block's result."""
         return self.folder / kind / f"{number:06d}{suffix}"
 
     def prepare(self, kind: str) -> None:
-        """Make the folder of a pass.
+        """Create the folder of a pass.
 
         Raises:
-            DataError: the system refuses.
+            DataError: the folder cannot be written.
         """
         try:
             (self.folder / kind).mkdir(parents=True, exist_ok=True)
@@ -102,14 +102,14 @@ class Parts:
             raise DataError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
 
     def missing(self, kind: str, numbers: Iterable[int]) -> list[int]:
-        """Those of ``numbers`` that are not there."""
+        """Return those of ``numbers`` that have no result yet."""
         return [number for number in numbers if not self.path(kind, number).is_file()]
 
     def save(self, kind: str, number: int, suffix: str = ".npz", **arrays: np.ndarray) -> None:
-        """Write a part, whole or not at all; that without a suffix of its own last: the block is done with it.
+        """Write a result atomically; the one with the default suffix comes last and marks the block as done.
 
         Raises:
-            DataError: the system refuses (a full disk).
+            DataError: the file cannot be written (a full disk).
         """
         with (
             atomic_write(self.path(kind, number, suffix), overwrite=True) as temporary,
@@ -120,10 +120,10 @@ class Parts:
     def load(
         self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
     ) -> dict[str, np.ndarray]:
-        """The arrays of a part, or those of ``names``.
+        """Return the arrays of a result, by default all.
 
         Raises:
-            DataError: it is not there, or damaged.
+            DataError: the file is missing or damaged.
         """
         path = self.path(kind, number, suffix)
         try:
@@ -133,10 +133,10 @@ class Parts:
             raise _unreadable(path, number, error) from error
 
     def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
-        """Of the arrays of a part.
+        """Return the names of a result's arrays.
 
         Raises:
-            DataError: it is not there, or damaged.
+            DataError: the file is missing or damaged.
         """
         path = self.path(kind, number, suffix)
         try:
@@ -146,27 +146,25 @@ class Parts:
             raise _unreadable(path, number, error) from error
 
     def bytes(self, kind: str) -> int:
-        """Of all that lies there of a pass and is whole."""
+        """Return the size of all complete files of a pass."""
         folder = self.folder / kind
         whole = (path for path in (folder.iterdir() if folder.is_dir() else ()) if not path.name.startswith("."))
         return sum(path.stat().st_size for path in whole)
 
     def remove(self) -> None:
-        """The whole folder."""
+        """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _unreadable(path: Path, number: int, error: Exception) -> DataError:
-    """What is wrong with a part: zipfile, zlib and numpy raise what they like."""
+    """Return the error for a result that cannot be read (zipfile, zlib and numpy raise many types)."""
     if isinstance(error, FileNotFoundError):
-        return DataError(
-            f"{path}: block {number} is missing; run the shard that makes it (remove first what else there is of it)"
-        )
+        return DataError(f"{path}: block {number} is missing; remove its other files and run its shard again")
     return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
 
 def differences(place: Path, settings: dict[str, Any]) -> str:
-    """Names of the settings in which the run of a file differs."""
+    """Return the names of the settings in which another run differs."""
     try:
         other = json.loads(place.read_text("utf-8"))
     except ValueError:

@@ -1,7 +1,7 @@
-"""The pyramid over all tiles, of which only the tops are in memory; the choice of its cells for a budget.
+"""The pyramid over all tiles, with only the top level in memory, and the selection of its cells for a budget.
 
-Every tile's cells form a tree up to the tile's own cell; the trees' tops form one more. Scores are kept in a file, two
-numbers a cell, so that a threshold is found without the moments.
+The cells of each tile form a tree that ends in the tile's own cell; these roots are the leaves of a top tree. Scores
+are kept in a file, two numbers per cell, so that a threshold is found without the moments.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from vvgt_cli.closed_form.tree import (
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, read_rows
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.parts import CELLS, Parts
 
-FRACTION_BITS = 9  # of a score that a bin of the histogram tells apart, below its exponent
+FRACTION_BITS = 9  # mantissa bits of a score that select its bin in the histogram
 BINS = 1 << 16
-LOWEST = (1023 - 110) << FRACTION_BITS  # exponent 2^-110: less is as good as nothing
+LOWEST = (1023 - 110) << FRACTION_BITS  # exponent 2^-110: smaller scores share the lowest bin
 FIELDS = ("moments", "index", "edge", "node")
 
 
 class Tile(NamedTuple):
-    """Where a tile's cells lie: place (x, y, z), block, cells of the block before them, how many they are."""
+    """Location of a tile's cells: place (x, y, z), block, offset within the block's cells, and count."""
 
     place: tuple[int, int, int]
     block: int
@@ -48,7 +48,7 @@ class Tile(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Of some cells: the score that splits the cell above, the own one, and whether it has cells below."""
+    """Scores of cells: that which splits the parent, the cell's own, and whether it has children."""
 
     above: np.ndarray
     capped: np.ndarray
@@ -57,13 +57,13 @@ class Scores(NamedTuple):
 
 @dataclass(frozen=True)
 class Coarse:
-    """What of all blocks is held in memory.
+    """The summaries of all blocks, held in memory.
 
     Attributes:
-        mass: (nz, ny, nx) float64 in cells of the march.
+        mass: (nz, ny, nx) float64 optical mass, in cells of the visibility march.
         field: (nz, ny, nx) float32 opacity.
         deepest: largest opacity of a base cell.
-        tiles: in Morton order.
+        tiles: all tiles, in Morton order.
     """
 
     mass: np.ndarray
@@ -72,8 +72,8 @@ class Coarse:
     tiles: list[Tile]
 
 
-def gather(parts: Parts, grid: CellGrid) -> Coarse:
-    """Put the summaries of all blocks together.
+def gather(store: BlockStore, grid: CellGrid) -> Coarse:
+    """Merge the summaries of all blocks.
 
     Raises:
         DataError: a block is missing or damaged.
@@ -82,7 +82,7 @@ def gather(parts: Parts, grid: CellGrid) -> Coarse:
     mass, field, deepest = np.zeros(march[::-1]), np.zeros(fine[::-1], np.float32), 0.0
     tiles = []
     for number in range(len(grid.blocks)):
-        part = parts.load(CELLS, number)
+        part = store.load(CELLS, number)
         deepest = max(deepest, float(part["deepest"]))
         offset = 0
         for place, count, one, other in zip(
@@ -97,30 +97,32 @@ def gather(parts: Parts, grid: CellGrid) -> Coarse:
 
 
 def _lay(grid: np.ndarray, part: np.ndarray, place: list[int]) -> None:
-    """Put the cells of a tile into a grid; what lies beyond the volume is left out."""
+    """Copy the cells of a tile into a grid, cropped to the volume."""
     x, y, z = (n * part.shape[0] for n in place)
     target = grid[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]]
     target[:] = part[: target.shape[0], : target.shape[1], : target.shape[2]]
 
 
-class Forest:
-    """Trees of tiles; see the module. Where there is light, leaves have the means of `lit.shaded` after their moments.
+class TiledTree:
+    """A pyramid kept tile by tile. Under light, leaves carry the means of `lit.shaded` after their moments.
 
     Attributes:
-        top: the tree over the tiles' own cells, None where nothing is seen.
-        tiles: those with something seen, in Morton order, as the base of ``top``.
-        cells: in all trees, the base cells among them.
+        top: the tree over the tiles' own cells, None if nothing is visible.
+        tiles: tiles with visible cells, in Morton order, which are the base of ``top``.
+        cells: number of cells in all trees, base cells included.
     """
 
     def __init__(
-        self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path, light: Light | None = None
-    ) -> None:
-        self._parts, self._grid, self._seen, self._scratch, self._light = parts, grid, seen, scratch, light
+        self, store: BlockStore, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path,
+        light: Light | None = None,
+    ) -> None:  # fmt: skip
+        """Build each tile's tree in turn and write its scores to ``scratch``."""
+        self._store, self._grid, self._seen, self._scratch, self._light = store, grid, seen, scratch, light
         self._levels = None if len(coarse.tiles) == 1 else grid.bits
         self.tiles: list[Tile] = []
         self._sizes: list[tuple[int, int]] = []  # cells and base cells of each tree
         moments, largest = [], []
-        self._shades: list[np.ndarray] = []  # of each tile's own cell, where there is light
+        self._shades: list[np.ndarray] = []  # of each tile's own cell, if lit
         with open(scratch, "wb") as stream:
             for tile in coarse.tiles:
                 tree = self._tree(tile)
@@ -140,7 +142,7 @@ class Forest:
             self._over(np.array(moments), np.array(largest))
 
     def _over(self, moments: np.ndarray, largest: np.ndarray) -> None:
-        """The tree over the tiles' own cells."""
+        """Build the tree over the tiles' own cells."""
 
         def fill(rows: np.ndarray, top: np.ndarray) -> None:
             rows[:], top[:] = moments, largest
@@ -151,32 +153,32 @@ class Forest:
         self.top = pyramid(places, edge, fill)
         self._capped = cap_by_ancestors(self.top, split_score(self.top))
         self._above = self._capped[self.top.parent]
-        self._above[-1] = np.inf  # the root is there at any threshold
+        self._above[-1] = np.inf  # the root appears at any threshold
 
     def _tree(self, tile: Tile) -> Tree:
         return build_tree(self._cells(tile), self._seen, np.array(self._grid.step), self._levels)
 
     def _cells(self, tile: Tile) -> Cells:
-        moments, local = read_rows(self._parts, tile.block, tile.offset, tile.cells)
+        moments, local = read_rows(self._store, tile.block, tile.offset, tile.cells)
         index = local + np.array(tile.place, np.int32) * self._grid.tile_cells
         return Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
 
     def _normals(self, tile: Tile) -> np.ndarray:
-        """(n, 3) of the base cells of a tile's tree.
+        """Return the normals (n, 3) of the base cells of a tile's tree.
 
         Raises:
-            DataError: the file is not whole.
+            DataError: the file is truncated.
         """
-        path = self._parts.path(CELLS, tile.block, NORMALS)
+        path = self._store.path(CELLS, tile.block, NORMALS)
         try:
             whole = np.load(path, mmap_mode="r")[tile.offset : tile.offset + tile.cells]
         except (OSError, ValueError) as error:
-            raise DataError(f"{path}: damaged ({error}); remove it and its .npz, and run the same again") from error
+            raise DataError(f"{path}: damaged ({error}); remove it and its .npz and run the command again") from error
         found: np.ndarray = whole[shown(self._cells(tile), self._seen, np.array(self._grid.step))]
         return found
 
     def _shaded(self, tile: Tile, tree: Tree, nodes: np.ndarray) -> np.ndarray:
-        """`lit.shaded` (k, 16 + lights) of rows of a tile's tree."""
+        """Return `lit.shaded` (k, 16 + lights) of rows of a tile's tree."""
         from vvgt_cli.closed_form.lit import base_rows, shaded
 
         assert self._light is not None
@@ -184,7 +186,7 @@ class Forest:
         return shaded(self._light, half, step, tree.moments, self._normals(tile), *base_rows(tree, nodes))
 
     def _leaves(self, row: int, tree: Tree, nodes: np.ndarray) -> Leaves:
-        """Rows of the tree of tile ``row``, or of the tree above all tiles."""
+        """Return rows of the tree of tile ``row``, or of the top tree."""
         found = leaves_of(tree, nodes)
         if self._light is None:
             return found
@@ -192,7 +194,7 @@ class Forest:
         return replace(found, moments=np.concatenate([found.moments, more], axis=1))
 
     def _shaded_above(self, nodes: np.ndarray) -> np.ndarray:
-        """`_shaded` of rows of the tree above the tiles: means by what is seen of each tile."""
+        """Return `_shaded` of rows of the top tree: means over tiles, weighted by visibility."""
         from vvgt_cli.closed_form.lit import SEEN_LITTLE, base_rows
 
         assert self.top is not None, "rows come of a top"
@@ -203,11 +205,11 @@ class Forest:
 
     @property
     def base(self) -> int:
-        """Base cells that some view sees."""
+        """Number of base cells that some view sees."""
         return sum(base for _, base in self._sizes)
 
     def scores(self) -> Iterator[Scores]:
-        """Of each tile in turn, and of the cells above them."""
+        """Yield the scores of each tile in turn, then those of the inner cells of the top tree."""
         if self.top is None:
             return
         with open(self._scratch, "rb") as stream:
@@ -221,14 +223,14 @@ class Forest:
         yield Scores(self._above[over], self._capped[over], np.ones(len(self.top) - len(self.tiles), bool))
 
     def threshold(self, budget: int) -> float:
-        """The score above which cells are split, for at most ``budget``, as `vvgt_cli.closed_form.tree.select`."""
+        """Return the score above which `vvgt_cli.closed_form.tree.select` would split cells for ``budget`` leaves."""
         if self.base <= budget:
             return -np.inf
-        counts = np.zeros(BINS, np.int64)  # cells that are there, less those that are split
+        counts = np.zeros(BINS, np.int64)  # cells that appear, less those that are split
         for scores in self.scores():
             counts += np.bincount(_bins(scores.above), minlength=BINS)
             counts -= np.bincount(_bins(scores.capped[scores.inner]), minlength=BINS)
-        left = np.cumsum(counts[::-1])[::-1]  # with all from a bin on split
+        left = np.cumsum(counts[::-1])[::-1]  # leaves if all cells from a bin on are split
         first = int(np.argmax(left <= budget)) if (left <= budget).any() else BINS - 1
         entries, exits = [], []
         for scores in self.scores():
@@ -245,7 +247,7 @@ class Forest:
         return float(exit_[-1]) if len(exit_) else np.inf
 
     def leaves(self, threshold: float) -> Iterator[Leaves]:
-        """The cells that a threshold leaves, tile by tile, those above them last."""
+        """Yield the leaves for a threshold, tile by tile, those of the top tree last."""
         for row, scores in enumerate(self.scores()):
             which = np.flatnonzero((scores.above > threshold) & ((scores.capped <= threshold) | ~scores.inner))
             if not len(which):
@@ -257,9 +259,9 @@ class Forest:
                 yield self._leaves(row, self.top, which + len(self.tiles))
 
     def cuts(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Leaves]]:
-        """Of each tile from ``begin`` on the cells that each of its ``thresholds`` (tiles, n) leaves.
+        """Yield, per tile from ``begin`` on, the leaves for each of its ``thresholds`` (tiles, n).
 
-        At least the tile's own cell.
+        There is always at least the tile's own cell.
         """
         for row, scores in enumerate(self.scores()):
             if row == len(self.tiles):
@@ -272,12 +274,12 @@ class Forest:
             yield [self._leaves(row, tree, np.flatnonzero(which)) for which in kept]
 
     def count(self, threshold: float) -> int:
-        """How many cells a threshold leaves."""
+        """Return the number of leaves for a threshold."""
         return sum(int(((s.above > threshold) & ((s.capped <= threshold) | ~s.inner)).sum()) for s in self.scores())
 
 
 def batches(leaves: Iterator[Leaves], size: int) -> Iterator[Leaves]:
-    """The same cells, so many at a time or a few more."""
+    """Regroup leaves into batches of at least ``size``."""
     waiting: list[Leaves] = []
     for part in leaves:
         waiting.append(part)
@@ -288,13 +290,13 @@ def batches(leaves: Iterator[Leaves], size: int) -> Iterator[Leaves]:
         yield joined(waiting)
 
 
-def joined(parts: Sequence[Leaves]) -> Leaves:
-    """The cells of all parts."""
-    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in FIELDS))
+def joined(batch: Sequence[Leaves]) -> Leaves:
+    """Concatenate leaves."""
+    return Leaves(*(np.concatenate([getattr(part, field) for part in batch]) for field in FIELDS))
 
 
 def _bins(scores: np.ndarray) -> np.ndarray:
-    """Bin of each score, ascending with it."""
+    """Return the histogram bin of each score; bins ascend with scores."""
     bits = np.ascontiguousarray(scores).view(np.int64) >> (52 - FRACTION_BITS)
     result: np.ndarray = np.clip(bits - LOWEST, 0, BINS - 1)
     return result
