@@ -314,17 +314,17 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple
     assert kept.options.light == side
     assert kept.options.function == "mine"
     np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
-    preset = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
-    again = saved(light=preset).options.light
+    base = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
+    again = saved(light=base).options.light
     assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)
     assert replace(again, directions=side.directions) == side
-    assert saved(light=preset | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
-    none = saved(light=preset | {"kind": "none"})
+    assert saved(light=base | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
+    none = saved(light=base | {"kind": "none"})
     assert none.options.light is None
     np.testing.assert_allclose(none.gaussians.colors, dark.colors, atol=1e-5)
-    for wrong in ([], {}, {"kind": "sun"}, preset | {"from": [0, 0, 0]}, preset | {"from": 1}, preset | {"ambient": "x"},
-                  preset | {"power": None}, preset | {"diffuse": -1}, preset | {"from": [1e999, 0, 0]}):  # fmt: skip
+    for wrong in ([], {}, {"kind": "sun"}, base | {"from": [0, 0, 0]}, base | {"from": 1}, base | {"ambient": "x"},
+                  base | {"power": None}, base | {"diffuse": -1}, base | {"from": [1e999, 0, 0]}):  # fmt: skip
         assert send(url, "save", {"file": "ply", "function": FUNCTION, "light": wrong})[0] == 400
 
 
