@@ -116,10 +116,10 @@ def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
 
 def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
     for options, message in (
-        (("--light", "0,0,0"), "--light 0,0,0: of length 0"),
-        (("--specular", "0.5"), "--specular: nothing is lit"),
+        (("--light", "0,0,0"), "--light 0,0,0: its length is 0"),
+        (("--specular", "0.5"), "--specular: there is no light"),
         (("--light", "headlight", "--ambient", "nan"), "--ambient nan"),
-        (("--light", "headlight", "--shadows"), "--shadows: a headlight throws none"),
+        (("--light", "headlight", "--shadows"), "--shadows: a headlight casts no visible shadows"),
     ):
         failed = vvgt("convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
         assert failed.code == 2

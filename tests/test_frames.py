@@ -289,7 +289,7 @@ def test_evaluate_reads_every_frame_space_and_turn_back(vvgt) -> None:
         assert scores["psnr"] == pytest.approx(bare["psnr"], abs=2e-3), options
         assert "another volume" not in scores["said"]
     other = anatomy.nifti(Path("other"), data, anatomy.place(anatomy.CORONAL))
-    assert "its header's affine is not that of other" in evaluated(vvgt, "0.ply", str(other))["said"]
+    assert "its header's affine differs from that of other" in evaluated(vvgt, "0.ply", str(other))["said"]
 
 
 def test_no_comments_says_what_will_not_be_known(vvgt) -> None:

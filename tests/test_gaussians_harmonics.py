@@ -312,7 +312,7 @@ def test_what_makes_gaussians_of_gaussians_keeps_their_harmonics(tmp_path):
 
 
 def test_networks_refuse_them_in_one_line():
-    with pytest.raises(DataError, match=r"degree 3: a network knows only colours .* degree 0") as caught:
+    with pytest.raises(DataError, match=r"degree 3: a network supports only colours .* degree 0") as caught:
         pack(cloud())
     assert "\n" not in str(caught.value)
 

@@ -339,7 +339,7 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     series = vvgt("convert", tmp_path / "*.seg.nrrd", *SMALL, "-o", tmp_path / "s_{}.ply")
     assert "convert such frames one by one" in series.error
     path.write_bytes(path.read_bytes().replace(b"Segment0_Layer:=0", b"Segment0_Layer:=7"))
-    assert "layer 0: no label in it" in vvgt("init", path, "-o", tmp_path / "n.ply").error
+    assert "layer 0: no labels" in vvgt("init", path, "-o", tmp_path / "n.ply").error
 
 
 def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> None:
@@ -389,7 +389,7 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     ):
         done = vvgt(*asked[:-1], *options)
         assert done.code == 0, done.err
-        assert ("made under other labels, functions or layers" in done.err) is others, options
+        assert ("made with other labels, functions or layers" in done.err) is others, options
     assert vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "s.ply").code == 0
     assert read_ply(str(tmp_path / "s.ply"))[1].optics is None  # of scalars the header is what it was
     header = read_ply(str(ply))[1]

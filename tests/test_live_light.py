@@ -123,7 +123,7 @@ def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> Non
     with pytest.raises(vvgt_library.UsageError, match="need the volume"):
         vvgt_library.recolor(lit_file, light=LightOptions(("x",), shadows=True))
     done = vvgt("recolor", lit_file, "--ambient", "0.5", "--light", "none", "-o", tmp_path / "a.ply")
-    assert (done.code, "nothing is lit" in done.error) == (2, True)
+    assert (done.code, "there is no light" in done.error) == (2, True)
     assert not list(tmp_path.iterdir())
 
 

@@ -147,4 +147,4 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert (done.code, "a page of 2 clouds of Gaussians; expected one" in done.error) == (1, True)
     assert vvgt("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply").code == 0
     done = vvgt("view", "a.ply", "a.ply", "-o", "b.spz")
-    assert (done.code, "expected a page (.html), which takes them all" in done.error) == (2, True)
+    assert (done.code, "expected a page (.html), which holds several" in done.error) == (2, True)

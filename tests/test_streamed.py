@@ -16,7 +16,7 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.commands.view import named_files
 from vvgt_cli.conversion.shards.level_errors import level_errors
 from vvgt_cli.conversion.shards.level_selection import CutErrors
@@ -275,7 +275,7 @@ def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
 
 def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None:
     assert [file for _, file in named_files([str(folder)])] == [str(folder / "lod-meta.json")]
-    with served(Site(streamed_parts(str(folder / "lod-meta.json")), print)) as url:
+    with served(Site(streamed_resources(str(folder / "lod-meta.json")), print)) as url:
         path = url[url.index("/", 8) :]
         status, text, _ = ask(url)
         assert (status, b'"streamed": true' in text) == (200, True)

@@ -1,4 +1,4 @@
-"""`--help` in sections: the options most people need first, the others by what they are about."""
+"""Sections of `--help`: the options most people need first, the others by subject."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ class SectionedCommand(click.Command):
     """A command whose ``--help`` lists its options under the headings of `SECTIONS`."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options under their headings."""
         options = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
         rows = {option.name: row for option in options if (row := option.get_help_record(ctx))}
         sections = {

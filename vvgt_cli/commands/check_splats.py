@@ -1,4 +1,4 @@
-"""`check` of a file of Gaussians by any program, alone or against the volume and the look that it shows."""
+"""`check` of a file of Gaussians from any program, alone or against the volume and look that it shows."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def open_splats(
     columns = read_columns(file)
     good = finite_rows(columns)
     if not good.any():
-        raise DataError(f"{file}: {len(columns)} Gaussians, none of finite numbers; expected at least one")
+        raise DataError(f"{file}: {len(columns)} Gaussians, none with finite values; expected at least one")
     if good.all():
         gaussians, header = open_gaussians(file)
     else:  # check the others, whose values and certificate no longer fit

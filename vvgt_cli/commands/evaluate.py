@@ -1,4 +1,4 @@
-"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every condition."""
+"""`evaluate`: scores of a `.ply` against its volume, on test views and under all viewing conditions."""
 
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ MIDDLE = 200  # pixels along the edge of what the reference's own error is measu
 
 @dataclass(frozen=True)
 class EvaluateRequest:
-    """What to score.
+    """File of Gaussians to score, and how.
 
     Attributes:
         ply: Gaussians, "-" for standard input, or a stream of them.
-        source: the volume and the function that they were made from.
-        size: pixels along an image's edge; None: what the file is made for.
-        rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
-        step: of the reference, in voxels.
-        conditions: score every rule at several sizes and close up as well, and texture on smooth areas.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
-        preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
+        source: volume and function that they were made from.
+        size: pixels along an image's edge; None: the size recorded in the file.
+        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
+        step: sampling distance of the reference, in voxels.
+        conditions: also score every rule at several sizes and close up, and texture on smooth areas.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
+        preview: PNG to write (reference, splats, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
     """
 
@@ -74,13 +74,13 @@ class EvaluateRequest:
     overwrite: bool = False
 
     def inputs(self) -> list[str]:
-        """Files that are read."""
+        """Return the files that are read."""
         return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
 
 
 @dataclass
 class Evaluation:
-    """Scores, the measurements they rest on, and whether the certificate of the file holds (docs/report.md)."""
+    """Scores, what they were measured on, and whether the file's certificate holds (docs/report.md)."""
 
     gaussians: int
     size: int
@@ -98,11 +98,11 @@ class Evaluation:
     seconds: float = 0.0
 
     def to_json(self) -> str:
-        """JSON with machine and versions."""
+        """Return JSON with machine and versions."""
         return document("vvgt-evaluation", asdict(self))
 
     def table(self) -> str:
-        """The scores, a row a number, then the conditions by PSNR, worst first."""
+        """Return a table: one score per row, then the viewing conditions by PSNR, worst first."""
         lines = [f"made for {self.size} px, drawn as {self.rule}"]
         for key, value in self.scores.items():
             if key != "per_view":
@@ -113,10 +113,8 @@ class Evaluation:
         if self.certificate is not None:
             lines.append(f"certificate {self.certificate['text']}")
         if self.conditions:
-            lines.append(f"\n{'condition':<32}{'psnr':>10}")
-        lines += [
-            f"{ViewingCondition(**condition).name():<32}{condition['psnr']:>10.2f}" for condition in self.conditions
-        ]
+            lines.append(f"\n{'viewing condition':<32}{'psnr':>10}")
+        lines += [f"{ViewingCondition(**one).name():<32}{one['psnr']:>10.2f}" for one in self.conditions]
         return "\n".join(lines) + "\n"
 
 
@@ -128,7 +126,7 @@ def _cell(value: Any) -> str:
 
 @contextmanager
 def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
-    """The volume, with the file's own anatomical space, light and unit distance where none is asked for."""
+    """Open the volume, by default in the file's own anatomical space, light and unit distance."""
     size, asked = request.size or header.made_for or SIZE, request.source.light
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
@@ -167,7 +165,7 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
 
 @contextmanager
 def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
-    """Pictures that are asked for within: those of a volume in blocks are made together, and let go of."""
+    """Draw the pictures requested within the block together if the volume is in blocks; forget them afterwards."""
     field.views.expect(pictures)
     yield
     for picture in pictures:
@@ -175,10 +173,10 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
 
 
 def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
-    """What carries values, under the function that is given; else the look of the file.
+    """Return live Gaussians under the requested function; without one, and for other files, the file's own look.
 
     Raises:
-        UsageError: values that are looked at as labels, or the other way round.
+        UsageError: labels are requested for values, or the reverse.
     """
     if header.live is None or (request.labels is None and request.tf is None and not request.layers):
         return gaussians
@@ -187,7 +185,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     if carried != shown:
         raise UsageError(
             f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
-            "--tf, --labels or --layer as they were converted with, or none of these, to score the look of the file"
+            "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
@@ -199,10 +197,11 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     """Score a `.ply` against its volume.
 
     Raises:
-        UsageError, DataError: inputs that are not what they must be.
+        UsageError: both inputs are standard input, or the preview may not be written.
+        DataError: a file that is not valid.
     """
     if request.ply == STDIN == request.source.volume:
-        raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
+        raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
     if request.preview:
         check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
@@ -217,18 +216,18 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
 
 
 def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iterator[str]:
-    """What speaks against the file being of this volume, looked at so."""
+    """Yield reasons to doubt that the file was made from this volume and look."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
-        yield f"its header's affine is not that of {source.volume.name}: of another volume?"
+        yield f"its header's affine differs from that of {source.volume.name}; was it made from another volume?"
     if header.live is None and header.optics is not None and header.optics != source.optics():
         yield (
-            f"made under other labels, functions or layers than {source.name}, as its header says "
+            f"made with other labels, functions or layers than {source.name}, according to its header "
             f"({header.optics}, not {source.optics() or 'scalars'})"
         )
 
 
 def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussians, header: PlyHeader) -> Evaluation:
-    """The scores, and a preview."""
+    """Measure the scores, and write a preview if requested."""
     from vvgt_cli.dvr import REFERENCE
     from vvgt_cli.images import write_png
 
@@ -266,7 +265,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
 
 
 def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule) -> None:
-    """Seats, and texture from near."""
+    """Score the viewing conditions, and texture seen from near."""
     from vvgt_cli.dvr import RenderSettings
 
     size, settings = evaluation.size, RenderSettings()
@@ -285,7 +284,7 @@ def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gau
 
 
 def _reference_psnr(volume: Field, size: int, step: float) -> float:
-    """PSNR of the reference against half its step and twice its rays along a pixel's edge.
+    """Return the PSNR of the reference against half its step and twice its rays along a pixel's edge.
 
     Measured on the middle of the first test view: the whole of it would cost as much as eight views.
     """

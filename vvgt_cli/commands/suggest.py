@@ -14,11 +14,11 @@ from vvgt_cli.volume import ReadOptions
 def suggest_transfer_functions(
     volume: str, count: int, output: str, read: ReadOptions, overwrite: bool, console: Console | None = None
 ) -> list[Path]:
-    """Write ``count`` minimal-JSON functions into the folder ``output``, made if it is not there; returns their paths.
+    """Write ``count`` minimal-JSON functions into the folder ``output``, made if missing; return their paths.
 
     Raises:
-        UsageError: a file that exists, or a folder that cannot be.
-        DataError: input that is not what it must be, or data of a single value.
+        UsageError: a file that exists, or a folder that cannot be made.
+        DataError: invalid input, or data of a single value.
     """
     from vvgt_cli.look.suggest import suggest
     from vvgt_cli.synth.sources import open_volume
