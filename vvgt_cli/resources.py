@@ -48,7 +48,7 @@ def free_memory() -> int | None:
     """
     found = [
         *_machine(),
-        *(room for room in map(_left_by_group, _groups("memory")) if room is not None),
+        *(room for room in map(_free_in_group, _groups("memory")) if room is not None),
         *_own_limits(),
     ]
     if _asked is not None:
@@ -128,7 +128,7 @@ class Group:
         return next((int(value) for key, value in zip(words[::2], words[1::2], strict=False) if key == name), 0)
 
 
-def _left_by_group(group: Group) -> int | None:
+def _free_in_group(group: Group) -> int | None:
     """Return the bytes that a cgroup leaves, None without a limit; cached files count as free."""
     limits = [group.number(name) for name in ("memory.max", "memory.high", "memory.limit_in_bytes")]
     known = [limit for limit in limits if limit is not None and limit < UNLIMITED]

@@ -65,7 +65,7 @@ def ended_by(status: int) -> str | None:
 
 
 @contextmanager
-def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+def interruption(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     """Make the first interrupt (Ctrl-C) in the block only set the yielded function's result; a second one raises."""
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -75,7 +75,7 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: object) -> None:
         stopped.set()
         signal.signal(signal.SIGINT, before)
-        say("interrupted: saving the result so far; press Ctrl-C again to quit without saving")
+        message("interrupted: saving the result so far; press Ctrl-C again to quit without saving")
 
     before = signal.signal(signal.SIGINT, note)
     try:
