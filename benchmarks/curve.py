@@ -98,7 +98,7 @@ def score(paths: tuple[str, ...], folder: str, output: str) -> None:
     from vvgt_cli.gaussians import read_ply
     from vvgt_cli.gaussians.rules import INRIA
     from vvgt_cli.images.metrics import mean_scores
-    from vvgt_cli.score.views import score_seen, scored
+    from vvgt_cli.score.views import score_drawn_view, scored_views
     from vvgt_cli.splat import render
 
     fine = RenderSettings(step=1 / 8)
@@ -106,13 +106,14 @@ def score(paths: tuple[str, ...], folder: str, output: str) -> None:
     for name, source in read_scenes(paths[0], paths[1], paths[2]):
         scene = source.scene()
         seen = [
-            (camera, part, render_view(scene, camera, fine, part)) for _, camera, part in scored(SIZE, perceptual=False)
+            (camera, part, render_view(scene, camera, fine, part))
+            for _, camera, part in scored_views(SIZE, perceptual=False)
         ]
         files = sorted(Path(folder).glob(f"{name}.*.ply"), key=lambda file: int(file.suffixes[-2][1:]))
         for file in sorted(files, key=lambda file: file.suffixes[-3]):
             made, _ = read_ply(file)
             views = [
-                score_seen(there, render(made, camera, INRIA, blocks=part), part, whole=False, perceptual=False)
+                score_drawn_view(there, render(made, camera, INRIA, blocks=part), part, whole=False, perceptual=False)
                 for camera, part, there in seen
             ]
             label, steps = (suffix[1:] for suffix in file.suffixes[-3:-1])

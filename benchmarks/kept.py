@@ -24,7 +24,7 @@ import click
 import numpy as np
 from dvr_scenes import write_rows
 
-from vvgt_cli.conversion.place import placed
+from vvgt_cli.conversion.place import with_place
 from vvgt_cli.errors import VvgtError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, write_ply
 from vvgt_cli.gaussians.certificate import Certificate
@@ -56,7 +56,7 @@ def example() -> tuple[Gaussians, PlyOptions]:
     volume = Volume(np.zeros((20, 20, 20), np.uint8), (0.5, 0.5, 0.5), (-40.0, 20.0, 90.0), space="RAS")
     certificate = Certificate("head", "ab" * 32, "0123456789ab", 1080, "compensated", 40.0, 3, texture=(0.5, 0.4))
     options = PlyOptions(unit_distance=0.5, made_for=1080, rule="compensated", certificate=certificate)
-    return gaussians, placed(options, volume)
+    return gaussians, with_place(options, volume)
 
 
 def marked(path: Path) -> str:

@@ -21,7 +21,7 @@ from dvr_scenes import write_rows
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.gaussian_files import open_gaussians
-from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -125,10 +125,10 @@ def textures(
     source = load(SourceRequest(volume, tf=tf, unit_distance=distance))
     scene = source.scene()
     for level in range(read_manifest(folder / MANIFEST)["lodLevels"]):
-        gaussians = into_box(open_gaussians(f"{folder}#{level}")[0], source.volume)
+        gaussians = to_box_frame(open_gaussians(f"{folder}#{level}")[0], source.volume)
         files = [str(file) for file in whole[level : level + 1]]
         for name in (f"level {level}", *files):
-            drawn = into_box(open_gaussians(name)[0], source.volume) if name in files else gaussians
+            drawn = to_box_frame(open_gaussians(name)[0], source.volume) if name in files else gaussians
             found = [np.array(some) for some in edges(folder, level, gaussians, drawn, scene, size)]
             told = [f"{np.sqrt(some.mean()):.2f} ({len(some)} px)" if len(some) else "none" for some in found]
             yield f"{name}: texture {told[0]} at edges, {told[1]} at middles, {told[2]} elsewhere, levels of 255"

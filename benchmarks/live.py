@@ -19,9 +19,9 @@ import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.conversion.convert import degree_of, fitted
-from vvgt_cli.conversion.live import carrying, in_box, placed_by, table_of, wide_enough
-from vvgt_cli.conversion.recolored import lit_by
+from vvgt_cli.conversion.convert import degree_of, fit_gaussians
+from vvgt_cli.conversion.live import box_lighting, fog_start, function_table, widen_narrow, with_values
+from vvgt_cli.conversion.recolored import visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import ClosedFormStage
@@ -74,7 +74,7 @@ def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
     source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
     request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
-    return fitted(Run(Console(quiet=True), ConversionReport("convert")), request)
+    return fit_gaussians(Run(Console(quiet=True), ConversionReport("convert")), request)
 
 
 def placed(field: Resident, gaussians: int) -> Gaussians:
@@ -84,7 +84,7 @@ def placed(field: Resident, gaussians: int) -> Gaussians:
     request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
     assert isinstance(source.tf, TransferFunction)
     foggy = field.with_look(source.with_function(fog(source.statistics, source.tf)))
-    return wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
+    return widen_narrow(with_values(run, foggy, fog_start(run, foggy, request)), SIZE)
 
 
 def score(field: Resident, gaussians: Gaussians) -> float:
@@ -94,7 +94,7 @@ def score(field: Resident, gaussians: Gaussians) -> float:
 
 def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, Any]]:
     """A row a light."""
-    live, table, rows = placed(field, gaussians), table_of(field.source), []
+    live, table, rows = placed(field, gaussians), function_table(field.source), []
     for title, lights in {"none": (), "headlight": ("headlight",), "0.3,-0.8,0.5": ("0.3,-0.8,0.5",)}.items():
         source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
         lit = Resident.of(source)
@@ -102,7 +102,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
         fit = FitOptions(max_gaussians=gaussians, size=SIZE)
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
         ClosedFormStage().run(work)
-        shown = lit_by(live, table, in_box(source), pixel_width(SIZE))
+        shown = visible_cloud(live, table, box_lighting(source), pixel_width(SIZE))
         scores = {"live": score(lit, shown), "closed form": score(lit, work.made())}
         rows.append({"scene": name, "gaussians": gaussians, "light": title, **scores})
         print(rows[-1], flush=True)
@@ -121,7 +121,7 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
         shown = field.with_look(source.with_function(replace(tf, opacity_unit_distance=spacing)))
-        table = table_of(shown.source)
+        table = function_table(shown.source)
         looks = {
             "live": apply_look(live, table, pixel), "bytes": apply_look(packed, table, pixel),
             "other viewers": baked(live, table, pixel),

@@ -22,8 +22,8 @@ from closed_form import read_options, scene_rows
 from dvr_scenes import print_table, write_rows
 
 from vvgt_cli.commands.converter_process import Telling, Volume
-from vvgt_cli.conversion.convert import convert, initialise_only, opened, ply_options
-from vvgt_cli.conversion.live import live_conversion
+from vvgt_cli.conversion.convert import convert, initialise_only, open_field, ply_options
+from vvgt_cli.conversion.live import convert_live
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians.formats import encoded, format_of
@@ -39,8 +39,8 @@ UNHEARD = Telling(lambda message: None)
 def megabytes(source: SourceRequest, gaussians: int) -> float:
     """Of the page of a source."""
     run, request = Run(QUIET, ConversionReport("init")), ConvertRequest(source, fit=FitOptions(gaussians), live=True)
-    with opened(run, request) as field:
-        made = live_conversion(run, request, field, ply_options(request, field.source), scored=False)
+    with open_field(run, request) as field:
+        made = convert_live(run, request, field, ply_options(request, field.source), scored=False)
     known = format_of("page.html")
     assert known is not None
     return len(encoded(known, made.gaussians, made.ply, "page.html")) / 1e6

@@ -47,7 +47,9 @@ def conversion(call: list[str], part: str) -> dict[str, Any]:
             raise SystemExit(1)
         whole = time.process_time() - began
         found = json.loads(Path(report).read_text("utf-8"))
-    share = 1 - sum(s["seconds"] for s in found["stages"] if s["name"] in ("test views", "seats")) / found["seconds"]
+    share = (
+        1 - sum(s["seconds"] for s in found["stages"] if s["name"] in ("test views", "conditions")) / found["seconds"]
+    )
     before = (found["refinement"] or {}).get("psnr_before") or 0.0
     return {"start": before, "psnr": found["scores"]["psnr"], "seconds": whole * share}
 

@@ -26,7 +26,7 @@ from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
-from vvgt_cli.conversion.stages.views import LARGE, MOST_VIEWS, fine_enough, views_of, wide
+from vvgt_cli.conversion.stages.views import LARGE, MOST_VIEWS, ray_settings, suits_small_views, view_count
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.field.workload import view_edge
@@ -82,10 +82,10 @@ def equal_row(judged: Judged) -> dict[str, Any]:
 
 def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, Rule]:
     """As `convert` makes them: cameras, images, rule."""
-    edge = view_edge(SIZE, wide(start, SIZE))
+    edge = view_edge(SIZE, suits_small_views(start, SIZE))
     cameras, share = default_views("train", count, size=edge), edge / SIZE
     rule = INRIA.at(share)
-    settings = fine_enough(judged.scene, start, edge, rule, 1.0 if share >= LARGE else share)
+    settings = ray_settings(judged.scene, start, edge, rule, 1.0 if share >= LARGE else share)
     return cameras, render_views(judged.scene, cameras, settings), rule
 
 
@@ -104,7 +104,7 @@ def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     start = begin(judged, method, steps)
     if steps:
         if method == "ours":
-            cameras, images, rule = training_views(judged, start, views_of(steps, wide(start, SIZE)))
+            cameras, images, rule = training_views(judged, start, view_count(steps, suits_small_views(start, SIZE)))
             options = OptimizeOptions(steps=steps, rule=rule)
         else:
             cameras = default_views("train", 24 if method == "adam" else BASE_VIEWS)

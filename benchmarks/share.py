@@ -18,7 +18,7 @@ from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import into_box, preview, upright
+from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
 from vvgt_cli.dvr import RenderSettings, Scene
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import Source
@@ -34,7 +34,7 @@ PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a pic
 
 def score(source: Source, scene: Scene, gaussians: Gaussians, size: int, rule: Rule) -> float:
     """PSNR on three test views, dB."""
-    inside = into_box(gaussians, source.volume)
+    inside = to_box_frame(gaussians, source.volume)
     settings = RenderSettings()
     return score_test_views(scene, inside, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS).psnr
 
@@ -62,10 +62,10 @@ def picture(source: Source, scene: Scene, path: Path, target: Path) -> None:
     from PIL import Image
 
     gaussians, header = open_gaussians(str(path))
-    axes = upright(source.volume, header.up)
+    axes = upright_axes(source.volume, header.up)
     camera = default_views("test", size=EDGE)[PICTURED]
     size = header.made_for or EDGE
-    sheet = preview(scene, into_box(gaussians, source.volume), [camera], axes, file_rule(header).at(EDGE / size))
+    sheet = preview(scene, to_box_frame(gaussians, source.volume), [camera], axes, file_rule(header).at(EDGE / size))
     Image.fromarray(np.rint(255 * sheet).astype(np.uint8)).save(target, quality=QUALITY)
 
 

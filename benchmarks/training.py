@@ -82,7 +82,7 @@ def turbulence(folder: Path, kind: str, grid: int, seed: int, turnovers: list[fl
     state = solver.start(seed)
     for number, turnover in enumerate(turnovers):
         state = run(solver, state, TURNOVER * turnover)
-        Console().say(f"{kind} {seed}, snapshot {number}: E {solver.energy(state):.3f}, "
+        Console().message(f"{kind} {seed}, snapshot {number}: E {solver.energy(state):.3f}, "
                     f"dissipation {solver.dissipation(state):.3f}")  # fmt: skip
         for field, values in fields(solver, state).items():
             write_nrrd(name(field, number), volume_of(values, field), overwrite=True)

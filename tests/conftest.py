@@ -65,8 +65,8 @@ def small_conversions() -> Iterator[None]:
     which meet every cell of 30 voxels. `vvgt` in a process of its own does as users have it.
     """
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("conversion.stages.scores", "commands.ladder"):
-            patch.setattr(f"vvgt_cli.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])
+        for module in ("conversion.stages.scores", "commands.report_runs"):
+            patch.setattr(f"vvgt_cli.{module}.screens", lambda size: [(size, 40.0), (2 * size, 40.0)])
         patch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
         yield
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
-from vvgt_cli.conversion.certify import Verdict, first_views, position_error
+from vvgt_cli.conversion.certify import Verdict, position_error, preview_psnr
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
@@ -27,8 +27,8 @@ from vvgt_cli.volume.stored import Stored
 DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
     volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
-    seats=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5, seconds=12.5,
-    command="vvgt convert head.nrrd --tf 'a b.json'",
+    conditions=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5,
+    seconds=12.5, command="vvgt convert head.nrrd --tf 'a b.json'",
 )  # fmt: skip
 SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
 RAW = ("--dims", *map(str, DIMS), "--dtype", "uint8")
@@ -62,7 +62,7 @@ def made(vvgt, folder, tmp_path):
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
     result = vvgt(
-        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-seats", "--json", *more
+        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-conditions", "--json", *more
     )
     assert result.code == 0, result.err
     return json.loads(result.out)["certificate"]
@@ -72,7 +72,7 @@ def test_a_line_gives_the_certificate_back() -> None:
     assert FULL.line().startswith("vvgt certificate {")
     assert "\n" not in FULL.line()
     assert Certificate.of(FULL.line().split(None, 2)[2]) == FULL
-    least = replace(FULL, sha256=None, seats=(), texture=None, seconds=None, command=None)
+    least = replace(FULL, sha256=None, conditions=(), texture=None, seconds=None, command=None)
     assert Certificate.of(least.line().split(None, 2)[2]) == least
 
 
@@ -85,7 +85,7 @@ def test_a_line_gives_the_certificate_back() -> None:
         FULL.line().split(None, 2)[2].replace('"size": 400', '"size": true'),
         FULL.line().split(None, 2)[2].replace('"volume"', '"volumes"'),
         FULL.line().split(None, 2)[2].replace('"inria 400 px": 39.5', '"inria 400 px": Infinity'),
-        json.dumps(FULL.facts() | {"seats": [1]}),
+        json.dumps(FULL.facts() | {"conditions": [1]}),
         json.dumps(FULL.facts() | {"texture": [1]}),
         json.dumps(FULL.facts() | {"texture": 1}),
         json.dumps(FULL.facts() | {"texture": [1, "2"]}),
@@ -107,8 +107,8 @@ def test_a_conversion_certifies_its_file(made) -> None:
     assert found is not None
     assert (found.volume, found.size, found.rule, found.views) == ("ball", 64, "inria", 3)
     assert found.psnr > 20
-    assert len(found.seats) == 10
-    assert found.seats[0][1] == min(dB for _, dB in found.seats)
+    assert len(found.conditions) == 10
+    assert found.conditions[0][1] == min(dB for _, dB in found.conditions)
     assert found.command is not None
     assert found.command.startswith("vvgt convert ball.raw --")
     assert "/" not in found.command
@@ -130,7 +130,7 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     assert "--shard 2/2" in found.command
 
 
-def test_seconds_are_stated_unless_files_must_be_reproducible(vvgt, folder, tmp_path, monkeypatch) -> None:
+def test_seconds_are_written_unless_files_are_to_be_reproducible(vvgt, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *args, "-o", tmp_path / "timed.ply").code == 0
@@ -207,7 +207,7 @@ def test_it_does_not_hold_for_another_volume_function_or_damaged_gaussians(vvgt,
     moved = evaluated(vvgt, folder, made, "moved.raw")
     assert not moved["holds"]
     assert moved["same_volume"] is False
-    assert "values are not those" in moved["text"]
+    assert "values differ from those" in moved["text"]
     other = evaluated(vvgt, folder, made, "ball.raw", "other.json")
     assert not other["holds"]
     assert other["same_volume"]
@@ -250,7 +250,7 @@ def test_from_python(tmp_path) -> None:
     found = read_ply(tmp_path / "a.ply")[1].certificate
     assert found is not None
     assert found.command is None
-    assert found.psnr == round(first_views(result.scores), 2)
+    assert found.psnr == round(preview_psnr(result.scores), 2)
 
 
 def test_the_digest_is_of_values_type_and_dims_not_of_how_they_lie() -> None:
@@ -299,9 +299,9 @@ def test_the_digest_reads_each_chunk_once_whatever_its_shape(chunks, monkeypatch
 
 def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path) -> None:
     from vvgt_cli.conversion.gaussian_files import open_gaussians
-    from vvgt_cli.conversion.place import into_box
+    from vvgt_cli.conversion.place import to_box_frame
     from vvgt_cli.field.source import SourceRequest, load
-    from vvgt_cli.score.viewing import glance_cameras, score_texture
+    from vvgt_cli.score.viewing import score_texture, texture_cameras
     from vvgt_cli.volume import ReadOptions
 
     points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 60, "opacity": 1, "rgb": [1, 0.9, 0.8]}]
@@ -313,7 +313,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
-    boxed, cameras = into_box(gaussians, source.volume), glance_cameras(256)
+    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(256)
     assert [(c.width, c.height) for c in cameras] == [(128, 128)]
     found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4
@@ -340,7 +340,7 @@ def test_a_run_that_ends_among_its_scores_leaves_the_whole_file(vvgt, folder, tm
         "convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name
     )  # fmt: skip
     assert result.code == 130
-    assert "whole, scores follow" in result.err
+    assert "complete; scoring next" in result.err
     assert os.listdir(tmp_path) == [name]
     gaussians, header = read_splats(tmp_path / name)
     assert len(gaussians) > 100

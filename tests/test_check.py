@@ -83,7 +83,7 @@ def test_a_scene_is_measured_and_checked(vvgt):
     assert found["needed_step"] in (1.0, 2.0, 4.0)
     assert 0 < found["change_per_voxel"] < 1
     assert len(document["outcomes"]) == 4
-    assert "step that an error of 0.002 needs" in vvgt(*scene).out.decode()
+    assert "largest step with an error of at most 0.002" in vvgt(*scene).out.decode()
 
 
 def test_options_of_a_volume_need_one(vvgt):

@@ -144,16 +144,16 @@ def test_another_orientation_is_named(name):
 
 def test_a_mirrored_file_is_found_by_the_command(vvgt, made, scene, tmp_path):
     names, _ = failed(vvgt, damaged(made, tmp_path, mirror_image), *scene)
-    assert "with axes -x y z, a mirror image" in names["place: the other way round"]["what"]
+    assert "with axes -x y z, a mirror image" in names["place: axes swapped or mirrored"]["what"]
 
 
-def test_a_file_in_the_world_without_a_header_is_told_so(vvgt, made, scene, tmp_path):
+def test_the_check_recognises_world_coordinates_without_a_header(vvgt, made, scene, tmp_path):
     def moved(columns):
         return replace(columns, means=columns.means * EDGE / 2 + EDGE / 2 - 0.5,
                        log_scales=columns.log_scales + np.log(EDGE / 2), comments=())  # fmt: skip
 
     names, _ = failed(vvgt, damaged(made, tmp_path, moved), *scene)
-    assert re.search("taken as world coordinates", names["place: centres outside the volume's box"]["what"])
+    assert re.search("read as world coordinates", names["place: centres outside the volume's box"]["what"])
 
 
 def values(gaussians, edge=2.0):
@@ -206,4 +206,4 @@ def test_wrong_use_and_unreadable_files_are_one_line(vvgt, made, tmp_path):
     assert result.code == 1
     assert "truncated" in result.error
     nothing = damaged(made, tmp_path, lambda columns: replace(columns, means=columns.means * np.nan))
-    assert "none of finite numbers" in vvgt("check", nothing).error
+    assert "none with finite values" in vvgt("check", nothing).error

@@ -176,7 +176,7 @@ def test_pipes(folder, vvgt):
     assert Path("d/orbit_000.png").exists()
 
 
-def test_evaluate_scores_every_seat(converted, vvgt):
+def test_evaluate_scores_every_condition(converted, vvgt):
     ply = converted[0] / "a.ply"
     options = ("evaluate", ply, "--volume", SOURCE, "--step", 0.5)
     document = json.loads(vvgt(*options, "--json").out)
@@ -185,13 +185,13 @@ def test_evaluate_scores_every_seat(converted, vvgt):
     report = json.loads((converted[0] / "a.json").read_text())
     assert document["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=0.5)
     assert document["transfer_function"]["unit_distance"] == report["transfer_function"]["unit_distance"]
-    seats = document["seats"]
-    assert len(seats) == 5 * 5  # rules; 48, 400, 800, 2160 px and close up
-    assert [seat["psnr"] for seat in seats] == sorted(seat["psnr"] for seat in seats)
-    assert {seat["field_of_view"] for seat in seats} == {10, 40}
+    conditions = document["conditions"]
+    assert len(conditions) == 5 * 5  # rules; 48, 400, 800, 2160 px and close up
+    assert [condition["psnr"] for condition in conditions] == sorted(condition["psnr"] for condition in conditions)
+    assert {condition["field_of_view"] for condition in conditions} == {10, 40}
     page = (ROOT / "docs" / "report.md").read_text()
-    assert all(f"`{name}`" in page for name in (*document, *document["scores"], *seats[0]))
-    table = vvgt(*options, "--no-seats", "--quiet", "--rule", "playcanvas")
+    assert all(f"`{name}`" in page for name in (*document, *document["scores"], *conditions[0]))
+    table = vvgt(*options, "--no-conditions", "--quiet", "--rule", "playcanvas")
     assert table.err == ""
     assert "drawn as playcanvas" in table.out.decode()
     assert "close up" not in table.out.decode()
@@ -200,7 +200,7 @@ def test_evaluate_scores_every_seat(converted, vvgt):
 
 def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, tmp_path):
     picture = tmp_path / "seen.png"
-    options = ("evaluate", converted[0] / "a.ply", "--volume", SOURCE, "--no-seats", "--step", 0.5)
+    options = ("evaluate", converted[0] / "a.ply", "--volume", SOURCE, "--no-conditions", "--step", 0.5)
     options += ("--preview", picture)
     document = json.loads(vvgt(*options, "--json").out)
     sheet = read_png(picture)[..., :3]

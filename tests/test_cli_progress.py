@@ -37,7 +37,7 @@ def test_bars_are_drawn_on_a_terminal_and_cleared(monkeypatch):
     assert "\n" not in stream.getvalue()
 
 
-def test_without_a_terminal_a_line_is_said_every_half_minute(monkeypatch):
+def test_without_a_terminal_a_line_is_printed_every_half_minute(monkeypatch):
     clock = iter([0.0, 29.0, 31.0, 45.0, 62.0, 70.0, 100.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     stream = io.StringIO()
@@ -47,14 +47,14 @@ def test_without_a_terminal_a_line_is_said_every_half_minute(monkeypatch):
     assert stream.getvalue() == "closed form        31.00 s  33 %\nclosed form        62.00 s  67 %\n"
 
 
-def test_no_bars_where_nothing_is_to_be_said():
+def test_quiet_runs_draw_no_bars():
     assert Console(quiet=True, stream=Terminal()).bar("views") is None
 
 
 def test_quiet_says_nothing():
     stream = Terminal()
     console = Console(quiet=True, stream=stream)
-    console.say("a")
+    console.message("a")
     console.stage("b", 1.0)
     assert stream.getvalue() == ""
 

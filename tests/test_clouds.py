@@ -100,14 +100,14 @@ def test_looks_of_what_is_in_memory_have_their_names(at):  # noqa: F811
     assert list(vvgt.convert("ball*.npy", "bone.json", GOAL)) == ["ball.npy", "ball_2.npy"]
 
 
-def test_what_several_cannot_is_said_before_anything_is_written(at):  # noqa: F811
+def test_what_several_clouds_cannot_do_is_refused_before_anything_is_written(at):  # noqa: F811
     result = vvgt.convert("ball.npy", ["bone.json", "skin.json"], GOAL)
     Path("x_skin.ply").write_text("mine")
     for path, how, words in (
         ("x.ply", {"overwrite": False}, "x_skin.ply"),
         ("{}{}.ply", {}, "expected one place"),
         ("x_{:03d}.ply", {}, "expected one place for the function's name"),
-        ("x.html", {"frame": "world"}, "leave out frame"),
+        ("x.html", {"frame": "world"}, "remove frame"),
         ("x.obj", {}, "expected a name ending in"),
         ("none/x.ply", {}, "does not exist"),
     ):

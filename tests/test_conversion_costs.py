@@ -27,12 +27,12 @@ def scene():
 
 @pytest.mark.parametrize(("size", "judged"), [(300, 300**2), (1080, drawn(1080, FEW))])
 def test_check_views_cost_what_their_blocks_do(scene, size, judged):
-    case = measure(scene, size, 1000)
+    workload = measure(scene, size, 1000)
     edge = min(size, 300)
-    seconds, memory = CheckViews().cost(case)
-    assert seconds == pytest.approx(4 * 1.2 * case.view * judged / edge**2)
+    seconds, memory = CheckViews().cost(workload)
+    assert seconds == pytest.approx(4 * 1.2 * workload.view * judged / edge**2)
     assert memory == 32 * (4 * judged + size**2)
-    assert TrainingViews(48, edge).cost(case).memory == 32 * 48 * edge**2
+    assert TrainingViews(48, edge).cost(workload).memory == 32 * 48 * edge**2
 
 
 def test_a_machine_is_as_slow_as_it_draws(scene, monkeypatch):
@@ -48,5 +48,7 @@ def test_a_machine_is_as_slow_as_it_draws(scene, monkeypatch):
     [(True, 3 * 1080**2 + 7 * drawn(1080, ENOUGH), 0.1), (False, 3 * drawn(1080, ENOUGH), 0.03)],
 )
 def test_three_large_test_views_are_whole_where_all_ten_are_scored(whole, pixels, beside):
-    case = Workload(100_000, 1e6, 10.2e6, 1080, 0.05, pace=2.0)
-    assert TestViews(whole).cost(case).seconds == pytest.approx(pixels * (1.2 * 0.05 / 300**2 + 2 * beside / 400**2))
+    workload = Workload(100_000, 1e6, 10.2e6, 1080, 0.05, pace=2.0)
+    assert TestViews(whole).cost(workload).seconds == pytest.approx(
+        pixels * (1.2 * 0.05 / 300**2 + 2 * beside / 400**2)
+    )

@@ -11,13 +11,13 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.convert import convert, initialise_only, planned
+from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
 from vvgt_cli.conversion.plan import MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
-from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
@@ -29,17 +29,19 @@ from vvgt_cli.progress import Console
 from vvgt_cli.refine.options import TEXTURE
 from vvgt_cli.score.record import ConversionReport, Run
 
-CASE = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, base_bytes=2e8)
+WORKLOAD = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, base_bytes=2e8)
 FORM = 0.4 + 0.62 + 0.03 * 10.2 + 0.28  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
 POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
 
 
-def plan(steps=None, spent=1.0, begun=False, case=CASE, size=48, wide=True, **limits):
+def plan(steps=None, spent=1.0, begun=False, workload=WORKLOAD, size=48, wide=True, **limits):
     """The plan of a method without cells that could be cut again."""
-    case = replace(case, size=size)
-    return Planner(Limits(**limits), FitOptions(1000, size, "wavelet", steps=steps), wide=wide).plan(case, spent, begun)
+    workload = replace(workload, size=size)
+    return Planner(Limits(**limits), FitOptions(1000, size, "wavelet", steps=steps), wide=wide).plan(
+        workload, spent, begun
+    )
 
 
 def of(found, kind):
@@ -52,11 +54,11 @@ def steps_of(found):
     return 0 if stage is None else stage.steps
 
 
-def ending(edge=48.0, judge=0.06, glance=0.06, size=48):
-    """Seconds of three test views, the seats, texture and the file."""
+def ending(edge=48.0, judge=0.06, check=0.06, size=48):
+    """Seconds of three test views, the conditions, texture and the file."""
     near = (size // 2) ** 2  # pixels
     texture = judge * near / edge**2 + 0.05 * near / 400**2
-    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * glance + 0.15 + 0.155 + texture + 0.1
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * check + 0.15 + 0.155 + texture + 0.1
 
 
 def drawn(size, enough):
@@ -82,10 +84,10 @@ def names(report):
 def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not():
     found = plan()
     assert [stage.name for stage in found.stages] == [
-        "closed form", "check views", "views", "refinement", "test views", "seats"
+        "closed form", "check views", "views", "refinement", "test views", "conditions"
     ]  # fmt: skip
     assert steps_of(found) == STEPS
-    assert [name for name, _ in found.left_out] == ["network", "back-projection"]
+    assert [name for name, _ in found.skipped] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
     step = 0.027 * (48 / 400) ** 2 + 0.0275
     assert found.seconds == pytest.approx(1 + FORM + STEPS * step + 120 * 0.05 + 4 * 0.06 + ending())
@@ -98,19 +100,14 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
     found = plan(size=size)
     descent, views = of(found, Refinement), of(found, TrainingViews)
     assert (descent.small, descent.steps, views.edge) == (True, STEPS, edge)
-    judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
-    judge, glance = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
+    judged, check_pixels, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
+    judge, check = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, check_pixels))
     step = 0.027 * (edge / 400) ** 2 + 0.0275
     seconds = (
-        1
-        + FORM
-        + STEPS * step
-        + 96 * (edge / whole) ** 2 * 0.05
-        + 4 * glance
-        + ending(judged**0.5, judge, glance, size)
+        1 + FORM + STEPS * step + 96 * (edge / whole) ** 2 * 0.05 + 4 * check + ending(judged**0.5, judge, check, size)
     )
     assert found.seconds == pytest.approx(seconds)
-    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * glanced + size**2)
+    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * check_pixels + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
     assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
@@ -138,16 +135,16 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
     header = read_ply(tmp_path / "a.ply")[1]
     assert (header.made_for, header.rule) == (800, "inria")
     other = done(tmp_path, FitOptions(600, 800, steps=48, rule="playcanvas"), overwrite=True)
-    by = {(seat["rule"], seat["size"]): seat["psnr"] for seat in report.seats}
-    assert {(seat["rule"], seat["size"]): seat["psnr"] for seat in other.seats}["playcanvas", 800] > by[
+    by = {(condition["rule"], condition["size"]): condition["psnr"] for condition in report.conditions}
+    assert {(condition["rule"], condition["size"]): condition["psnr"] for condition in other.conditions}[
         "playcanvas", 800
-    ]
-    assert report.seats == sorted(report.seats, key=lambda seat: seat["psnr"])
+    ] > by["playcanvas", 800]
+    assert report.conditions == sorted(report.conditions, key=lambda condition: condition["psnr"])
     assert len(by) == 10
 
 
 def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.convert.wide", lambda *_: False)
+    monkeypatch.setattr("vvgt_cli.conversion.convert.suits_small_views", lambda *_: False)
     report = done(tmp_path, FitOptions(600, 128, steps=30))
     assert chosen(report)["small"]  # what was foreseen
     assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
@@ -167,8 +164,8 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
     monkeypatch.setattr("vvgt_cli.closed_form.closed_form.expected_cells", lambda *sizes: 2.0 * sizes[3])
-    case = replace(CASE, gaussians=1_000_000, cells=2e6)
-    found = Planner(Limits(), FitOptions(1_000_000, 48, steps=0)).plan(case, 1.0)
+    workload = replace(WORKLOAD, gaussians=1_000_000, cells=2e6)
+    found = Planner(Limits(), FitOptions(1_000_000, 48, steps=0)).plan(workload, 1.0)
     each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
     check_memory(found)
@@ -176,15 +173,15 @@ def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkey
     with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
         check_memory(found)
     with pytest.raises(UsageError, match="--max-gaussians 125000 would fit"):  # a series keeps more
-        check_memory(found, beside=lambda case: 0.5 * each * case.gaussians)
+        check_memory(found, beside=lambda workload: 0.5 * each * workload.gaussians)
 
 
 def test_no_steps_leave_back_projection():
     found = plan(steps=0)
     assert steps_of(found) == 0
     assert of(found, BackProjection) is not None
-    assert found.stages[0].anew  # its cells are cut once more
-    assert [name for name, _ in found.left_out] == ["refinement"]
+    assert found.stages[0].recut
+    assert [name for name, _ in found.skipped] == ["refinement"]
 
 
 def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
@@ -228,23 +225,23 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
         assert found.seconds <= seconds
         assert of(found, Refinement).most == MOST_STEPS
     assert of(taken[0], BackProjection) is None
-    assert {name for name, _ in taken[0].left_out} == {"refinement", "back-projection"}
+    assert {name for name, _ in taken[0].skipped} == {"refinement", "back-projection"}
     assert steps_of(plan(time_budget=30, steps=40)) == 40
 
 
 def test_a_network_runs_where_there_is_time_for_it():
     planner = Planner(Limits(), FitOptions(1000, 400, model="some"))
-    case = replace(CASE, size=400)
-    assert of(planner.plan(case, 1.0), Network).model == "some"
-    assert not of(planner.plan(case, 1.0), Refinement).small  # it was trained on whole views
-    short = Planner(Limits(time_budget=7.0), FitOptions(1000, 400, model="some")).plan(case, 1.0)
+    workload = replace(WORKLOAD, size=400)
+    assert of(planner.plan(workload, 1.0), Network).model == "some"
+    assert not of(planner.plan(workload, 1.0), Refinement).small  # it was trained on whole views
+    short = Planner(Limits(time_budget=7.0), FitOptions(1000, 400, model="some")).plan(workload, 1.0)
     assert of(short, Network) is None
-    assert "network" in {name for name, _ in short.left_out}
+    assert "network" in {name for name, _ in short.skipped}
 
 
 def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
     limits = Limits(time_budget=16.0)
-    alone, after = (Planner(limits, FitOptions(1000, 48, model=model)).plan(CASE, 1.0) for model in (None, "some"))
+    alone, after = (Planner(limits, FitOptions(1000, 48, model=model)).plan(WORKLOAD, 1.0) for model in (None, "some"))
     assert of(after, Network).model == "some"
     assert 0 < steps_of(after) < steps_of(alone)
     assert after.seconds <= 16
@@ -270,16 +267,20 @@ def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, m
 
 
 def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
-    quick, slow = (plan(time_budget=12, spent=6, begun=True, case=CASE.at(pace)) for pace in (1, 3))
+    quick, slow = (plan(time_budget=12, spent=6, begun=True, workload=WORKLOAD.at(pace)) for pace in (1, 3))
     assert steps_of(quick) > steps_of(slow) > 0
-    assert CASE.at(3).view == CASE.view  # measured, not fitted
+    assert WORKLOAD.at(3).view == WORKLOAD.view  # measured, not fitted
 
 
 def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.stages.closed_form.FAINT_LOGIT", np.inf)  # all is a fog
     monkeypatch.setattr("vvgt_cli.conversion.stages.closed_form.FEWEST", 200)
     plan_of, seen, made = Planner.plan, [], []
-    note = lambda self, case, *rest, **begun: seen.append(case.gaussians) or plan_of(self, case, *rest, **begun)  # noqa: E731
+
+    def note(self, workload, *rest, **begun):
+        seen.append(workload.gaussians)
+        return plan_of(self, workload, *rest, **begun)
+
     monkeypatch.setattr(Planner, "plan", note)
     monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.made())))
     done(tmp_path, FitOptions(1000, 48))
@@ -288,8 +289,8 @@ def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatc
 
 
 def test_views_come_in_sets():
-    assert [views_of(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
-    assert [views_of(steps, False) for steps in (0, 24, 60, 112, 10_000)] == [24, 24, 48, 96, 120]
+    assert [view_count(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
+    assert [view_count(steps, False) for steps in (0, 24, 60, 112, 10_000)] == [24, 24, 48, 96, 120]
 
 
 @pytest.mark.parametrize(
@@ -326,12 +327,12 @@ def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
         "check views",
         "write",
         "test views",
-        "seats",
+        "conditions",
         "certificate",
     ]
     assert report.gaussians <= 400 // 8
-    assert [name for name, _ in report.left_out[:2]] == ["cells by error", "refinement"]
-    assert "Gaussians" in report.left_out[2][0]
+    assert [name for name, _ in report.skipped[:2]] == ["cells by error", "refinement"]
+    assert "Gaussians" in report.skipped[2][0]
 
 
 def test_a_target_between_ends_refinement_when_it_is_reached(tmp_path):
@@ -358,7 +359,7 @@ def test_no_time_leaves_the_closed_form(tmp_path):
 
 def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
-    found = planned(request, Console(quiet=True))
+    found = plan_conversion(request, Console(quiet=True))
     assert not list(tmp_path.iterdir())
     assert found.seconds > 0
     assert found.memory > 1e8
@@ -367,7 +368,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert "120 views of 48 px" in found.text()
     done(tmp_path)
     with pytest.raises(UsageError, match="exists"):
-        planned(request, Console(quiet=True))
+        plan_conversion(request, Console(quiet=True))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
@@ -375,11 +376,11 @@ def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
         Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).made()
 
 
-def test_the_default_refines_and_says_what_it_left_out(tmp_path):
+def test_the_default_refines_and_reports_what_it_skipped(tmp_path):
     report = done(tmp_path)
     assert report.refinement["steps"] == STEPS
     assert "back-projection" not in names(report)
-    assert [name for name, _ in report.left_out] == ["network", "back-projection"]
+    assert [name for name, _ in report.skipped] == ["network", "back-projection"]
     assert np.isfinite(report.scores["psnr"])
     assert Path(tmp_path / "a.ply").exists()
 

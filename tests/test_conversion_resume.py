@@ -19,7 +19,7 @@ LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "
 def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
     """The working folder, with what a run that is not ended writes."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(views, "fine_enough", by_start)
+    monkeypatch.setattr(views, "ray_settings", by_start)
     assert vvgt(*LINE, "-o", "whole.ply").code == 0
     return tmp_path
 
@@ -54,7 +54,7 @@ def by_start(scene, start, *_):
         ("convert.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
     ],
 )
-def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
+def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
     line = (*LINE, "-o", "a.ply", "--checkpoint", "kept")
     with monkeypatch.context() as patch:
         patch.setattr(loop, "KEEP", 0.0)
@@ -75,7 +75,7 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
 
 
 @pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
-def test_stages_that_cut_the_pyramid_anew_have_it(more, folder, vvgt, monkeypatch):
+def test_stages_that_cut_the_pyramid_again_have_it(more, folder, vvgt, monkeypatch):
     line = (*LINE, *more, "--overwrite", "-o")
     assert vvgt(*line, "whole.ply").code == 0
     with monkeypatch.context() as patch:
@@ -92,27 +92,24 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
         ended(patch, "scores.score_test_views", 0)
         assert vvgt(*line).code == 130
     other = vvgt(*line, "--max-gaussians", "100")
-    assert (other.code, "fitted.npz: of a conversion of another volume, or with other options" in other.error) == (
-        2,
-        True,
-    )
+    assert (other.code, "fitted.npz: belongs to another volume or other options" in other.error) == (2, True)
     kept = folder / "kept" / "fitted.npz"
     whole = kept.read_bytes()
     for content in (b"", whole[: len(whole) // 2], whole.replace(b"means", b"moons")):
         kept.write_bytes(content)
         damaged = vvgt(*line)
-        assert (damaged.code, "not what a stage of 'vvgt convert' keeps" in damaged.error) == (1, True)
+        assert (damaged.code, "not a checkpoint of 'vvgt convert'" in damaged.error) == (1, True)
 
 
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (("--time-budget", "9"), "give one of both"),
+        (("--time-budget", "9"), "give one of them"),
         (("--checkpoint", "no/where"), "cannot be made (No such file or directory)"),
         (("-o", "a_{}.ply"), "a series resumes from its manifest"),
     ],
 )
-def test_what_cannot_go_on_is_said(more, told, tmp_path, vvgt, monkeypatch):
+def test_a_conversion_that_cannot_resume_is_reported(more, told, tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = vvgt(*LINE, "-o", "a.ply", "--checkpoint", "kept", *more)
     assert (result.code, told in result.error) == (2, True)

@@ -9,21 +9,21 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
-from vvgt_cli.conversion.stages.refinement import drawn_by_all, refine
-from vvgt_cli.conversion.stages.views import fine_enough, wide
+from vvgt_cli.conversion.stages.refinement import refine, without_undrawn
+from vvgt_cli.conversion.stages.views import ray_settings, suits_small_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.look.readers import minimal
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views, judging_views
+from vvgt_cli.score.checks import Views, render_check_views
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 
 
-def test_wide_is_told_by_the_middle_axis():
+def test_gaussians_are_wide_by_their_middle_axis():
     camera = default_views("check", 1, size=400)[0]
     pixel = np.linalg.norm(camera.position) / camera.fx
     scales = np.log(np.float32([[0.1, 1.0, 5.0]]) * pixel)
@@ -31,20 +31,20 @@ def test_wide_is_told_by_the_middle_axis():
         np.zeros((1, 3), np.float32), scales + np.float32(np.log(size)), np.float32([[1, 0, 0, 0]]),
         np.full(1, logit, np.float32), np.zeros((1, 3), np.float32),
     )  # fmt: skip
-    assert wide(one(1.0), 400)
-    assert not wide(one(1.0, 3.0), 400)  # opaque
-    assert not wide(one(0.8), 400)
-    assert wide(one(1.0), 1080)  # its views are no larger
-    assert not wide(one(1.0), 200)
+    assert suits_small_views(one(1.0), 400)
+    assert not suits_small_views(one(1.0, 3.0), 400)  # opaque
+    assert not suits_small_views(one(0.8), 400)
+    assert suits_small_views(one(1.0), 1080)  # its views are no larger
+    assert not suits_small_views(one(1.0), 200)
 
 
-def test_blocks_tell_what_the_whole_picture_does(tmp_path):
+def test_blocks_score_like_the_whole_picture(tmp_path):
     line = np.linspace(-1, 1, 24, dtype=np.float32)
     ball = Volume(1 - np.sqrt(sum(np.square(np.meshgrid(line, line, line)))))
     points = [{"x": x, "rgb": [1, abs(x), 0.2], "opacity": o} for x, o in ((-1, 0), (0.2, 0), (0.5, 0.5), (1, 0.9))]
     scene = Scene.build(ball, minimal.read({"points": points}, "ball"), 1.0, (-0.8, 1.0))
     cameras = default_views("check", 2, size=640)
-    judged = judging_views(scene, cameras, RenderSettings())
+    judged = render_check_views(scene, cameras, RenderSettings())
     assert judged.images.shape[0] == len(judged.blocks) == 2
     assert judged.images[0].size < 0.55 * 640 * 640 * 4
     for camera, blocks, picked in zip(cameras, judged.blocks, judged.images, strict=True):
@@ -52,13 +52,13 @@ def test_blocks_tell_what_the_whole_picture_does(tmp_path):
         assert np.abs(blocks.pick(render_view(scene, camera)) - picked).mean() < 1e-4
 
 
-def test_what_viewers_leave_out_is_not_written():
+def test_gaussians_that_viewers_discard_are_not_written():
     camera = default_views("check", 1, size=1000)[0]
     pixel = np.linalg.norm(camera.position) / camera.fx
     sizes = np.log(np.float32([0.1, 0.5, 2.0, 2.0])[:, None] * pixel * np.float32([1, 0.5, 0.1]))
     logits = np.float32([2.0, 0.0, 0.0, -6.0])
     turn, grey = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.full((4, 3), 0.5, np.float32)
-    kept = drawn_by_all(Gaussians(np.zeros((4, 3), np.float32), sizes, turn, logits, grey), 1000)
+    kept = without_undrawn(Gaussians(np.zeros((4, 3), np.float32), sizes, turn, logits, grey), 1000)
     assert len(kept) == 3  # the faint one is gone
     np.testing.assert_allclose(np.exp(kept.log_scales.max(axis=1)) / pixel, [0.5, 0.5, 2.0], rtol=1e-5)
     mass = lambda logit, scales: 1 / (1 + np.exp(-logit)) * np.exp(scales[0] + scales[1])  # noqa: E731
@@ -77,7 +77,7 @@ def test_hard_edges_get_adaptive_rays(edge, samples):
     scene = Scene.build(ball, minimal.read({"points": points}, "edge"), 1.0, (-0.8, 1.0))
     start = initialise(scene, VbmOptions(4000, 128)).gaussians
     for size, rule in ((128, INRIA), (64, INRIA.at(0.5))):
-        assert fine_enough(scene, start, size, rule).samples == samples
+        assert ray_settings(scene, start, size, rule).samples == samples
 
 
 def test_descent_may_begin_elsewhere_but_never_ends_below_the_start():

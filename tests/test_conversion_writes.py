@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vvgt_cli.conversion.convert import planned
+from vvgt_cli.conversion.convert import plan_conversion
 from vvgt_cli.conversion.plan import WRITE
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.field.source import SourceRequest
@@ -16,9 +16,9 @@ from vvgt_cli.progress import Console
 )
 def test_the_plan_counts_how_often_the_file_is_written(tmp_path, output, options, times):
     output = output if output in (None, "-") else str(tmp_path / output)
-    found = planned(
+    found = plan_conversion(
         ConvertRequest(SourceRequest("example:marschner-lobb:24"), output, FitOptions(400, 48), **options),
         Console(quiet=True),
     )
-    assert found.costs()[-1] == ("write", pytest.approx(times * WRITE * found.case.pace))
+    assert found.costs()[-1] == ("write", pytest.approx(times * WRITE * found.workload.pace))
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))

@@ -207,7 +207,7 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     monkeypatch.setattr("vvgt_cli.conversion.shards.score.A_GAUSSIAN", 1 << 40)
     run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
     assert run.code == 0
-    assert "left out: test views" in run.err
+    assert "skipped: test views" in run.err
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
@@ -215,7 +215,7 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(bytes(720000))
     for command, options, word in (
-        ("init", ("--init", "wavelet", "-o", tmp_path / "a" / "lod-meta.json"), "made of moments"),
+        ("init", ("--init", "wavelet", "-o", tmp_path / "a" / "lod-meta.json"), "needs moments"),
         ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "blocks of moments"),
         ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
     ):

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write, check_room, claim, discard_leftovers, temporary_folder
+from vvgt_cli.files import atomic_write, check_disk_space, claim, discard_leftovers, temporary_folder
 from vvgt_cli.gaussians import read_ply
 
 ROOT = Path(__file__).parent.parent
@@ -32,7 +32,7 @@ def process(code: str, folder: Path, *args: object) -> subprocess.Popen[str]:
 HOLD = "from vvgt_cli.files import claim\nwith claim('a.ply'):\n    print('held', flush=True)\n    input()\n"
 
 
-def test_the_second_of_two_runs_to_one_name_is_told_at_once(tmp_path, vvgt, monkeypatch):
+def test_the_second_of_two_runs_to_one_name_fails_at_once(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     holder = process(HOLD, tmp_path)
     assert holder.stdout.readline() == "held\n"
@@ -82,7 +82,7 @@ def test_where_there_are_no_locks_everyone_may_write(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_said_before_the_work(tmp_path, vvgt, monkeypatch):
+def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     disk = {"f_frsize": 512, "f_blocks": 1000, "f_bavail": 4}
     monkeypatch.setattr(os, "statvfs", lambda folder: SimpleNamespace(**disk))
@@ -94,7 +94,7 @@ def test_a_full_disk_is_said_before_the_work(tmp_path, vvgt, monkeypatch):
     assert "closed form" in result.err
     assert "test views" not in result.err
     disk["f_blocks"] = 0  # a file system that does not tell
-    check_room(tmp_path / "a", 1 << 40)
+    check_disk_space(tmp_path / "a", 1 << 40)
 
 
 def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatch):
@@ -125,8 +125,8 @@ def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatc
     _, told = done.communicate()
     assert done.returncode == 1
     line = told.splitlines()[-1]
-    assert line.startswith("vvgt: error: a.ply: cannot be written (File too large); what was computed lies in ")
-    place = Path(line.rpartition(" lies in ")[2])
+    assert line.startswith("vvgt: error: a.ply: cannot be written (File too large); the Gaussians were saved to ")
+    place = Path(line.rpartition(" saved to ")[2])
     assert place.parent == elsewhere
     assert 0 < len(read_ply(place)[0]) <= 20
     assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]

@@ -227,14 +227,14 @@ def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
     result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     assert result.code == 0, result.err
-    found = re.search(r"PSNR ([\d.]+) dB, a \.ply has ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
+    found = re.search(r"PSNR ([\d.]+) dB, a \.ply would have ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
     after, before, cost = map(float, found.groups())
     assert cost == pytest.approx(before - after, abs=0.011)
     assert 0 < before < 60
     told = json.loads((tmp_path / "r.json").read_text())
     assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
     scored = vvgt("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis", "--json",
-                  "--no-seats", "--step", 0.5)  # fmt: skip
+                  "--no-conditions", "--step", 0.5)  # fmt: skip
     assert scored.code == 0, scored.err
     assert json.loads(scored.out)["size"] == 64
 

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.commands.view import expanded
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -56,9 +56,9 @@ def site(tmp_path: Path) -> Iterator[str]:
 
     said: list[str] = []
     parts = {
-        "": Part("text/html", lambda: b"page"),
-        "viewer.js": Part("text/javascript", lambda: gzip.compress(b"program"), packed=True),
-        "bad.ply": Part("application/octet-stream", broken),
+        "": Resource("text/html", lambda: b"page"),
+        "viewer.js": Resource("text/javascript", lambda: gzip.compress(b"program"), packed=True),
+        "bad.ply": Resource("application/octet-stream", broken),
     }
     with served(Site(parts, said.append)) as url:
         yield url
@@ -136,7 +136,7 @@ def test_what_was_sent_with_a_request_that_is_refused_is_not_read_as_another(sit
 
 
 def test_two_servers_have_two_ports_and_two_words():
-    parts = {"": Part("text/html", lambda: b"page")}
+    parts = {"": Resource("text/html", lambda: b"page")}
     with served(Site(parts, print)) as one, served(Site(parts, print)) as other:
         assert urlsplit(one).port != urlsplit(other).port
         assert urlsplit(one).path != urlsplit(other).path
@@ -216,15 +216,15 @@ def test_globs_become_files_of_gaussians_in_the_order_of_their_numbers(tmp_path,
     [
         (["nothing.ply"], 1, "nothing.ply"),
         (["nothing_*.ply"], 2, "no such files"),
-        (["a.ply", "--tf", "viridis"], 2, "and options of reading are of volumes"),
-        (["a.ply", "--tf-range", "rescale"], 2, "are of volumes"),
-        (["a.ply", "--spacing", "1", "1", "1"], 2, "are of volumes"),
-        (["a.ply", "example:blob:8"], 2, "expected all to hold Gaussians"),
+        (["a.ply", "--tf", "viridis"], 2, "and reading options are for volumes only"),
+        (["a.ply", "--tf-range", "rescale"], 2, "are for volumes only"),
+        (["a.ply", "--spacing", "1", "1", "1"], 2, "are for volumes only"),
+        (["a.ply", "example:blob:8"], 2, "a series needs files of Gaussians"),
         (["a.ply", "--port", "70000"], 2, "70000"),
         (["a.ply", "-o", "a.png"], 2, ".spz"),
-        (["a.ply", "-o", "b.html", "--port", "8000"], 2, "leave --port"),
-        (["a.ply", "a.ply", "-o", "b.spz"], 2, "which takes them all"),
-        (["a.ply", "a.ply", "--tf", "viridis", "-o", "b.html"], 2, "are of volumes"),
+        (["a.ply", "-o", "b.html", "--port", "8000"], 2, "omit --port"),
+        (["a.ply", "a.ply", "-o", "b.spz"], 2, "which holds several"),
+        (["a.ply", "a.ply", "--tf", "viridis", "-o", "b.html"], 2, "are for volumes only"),
         (["a.ply", "-o", "a.ply", "--overwrite"], 2, "is an input"),
         (["text.ply"], 1, "text.ply"),
     ],

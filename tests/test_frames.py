@@ -112,7 +112,7 @@ def test_slices_in_reversed_order_are_where_they_were(vvgt) -> None:
     np.testing.assert_allclose(clouds(cloud), anatomy.CENTRES, atol=0.5)
 
 
-def test_a_sheared_volume_is_said_and_its_balls_are_in_place(vvgt) -> None:
+def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:
     affine = anatomy.place(anatomy.OBLIQUE)
     affine[:3, 2] += 0.8 * affine[:3, 1] / 2
     path = anatomy.nifti(Path("v"), anatomy.balls(affine), affine)
@@ -266,8 +266,8 @@ def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
 
 def evaluated(vvgt, ply: str, volume: str, *options: str) -> dict:
     result = vvgt(
-        "evaluate", ply, "--volume", volume, "--tf", "tf.json", "--size", 48, "--no-seats", "--step", 0.5, "--json",
-        *options,
+        "evaluate", ply, "--volume", volume, "--tf", "tf.json", "--size", 48, "--no-conditions", "--step", 0.5,
+        "--json", *options,
     )  # fmt: skip
     assert result.code == 0, result.err
     return json.loads(result.out)["scores"] | {"said": result.err}
@@ -289,14 +289,14 @@ def test_evaluate_reads_every_frame_space_and_turn_back(vvgt) -> None:
         assert scores["psnr"] == pytest.approx(bare["psnr"], abs=2e-3), options
         assert "another volume" not in scores["said"]
     other = anatomy.nifti(Path("other"), data, anatomy.place(anatomy.CORONAL))
-    assert "its header's affine is not that of other" in evaluated(vvgt, "0.ply", str(other))["said"]
+    assert "its header's affine differs from that of other" in evaluated(vvgt, "0.ply", str(other))["said"]
 
 
 def test_no_comments_says_what_will_not_be_known(vvgt) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("v"), anatomy.balls(affine), affine)
     result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--no-comments")
-    assert "--no-comments: nothing in the file will say that it is in the unit frame with up z" in result.err
+    assert "--no-comments: the file will not record that it is in the unit frame with up z" in result.err
 
 
 def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:

@@ -67,4 +67,4 @@ def test_functions_of_one_name_are_refused(vvgt, tmp_path, functions):
     twin = tmp_path / "other" / "bone.json"
     twin.write_text((tmp_path / "bone.json").read_text())
     done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / "{}.ply"))
-    assert (done.code, "files would have one name" in done.err) == (2, True)
+    assert (done.code, "files would share a name" in done.err) == (2, True)

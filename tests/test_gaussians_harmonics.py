@@ -12,7 +12,7 @@ import pytest
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.conversion.resume import Checkpoint
-from vvgt_cli.conversion.stages.refinement import drawn_by_all
+from vvgt_cli.conversion.stages.refinement import without_undrawn
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, describe, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.frames import UP_NAMES, rescale, transform, turn, up_matrix
@@ -298,7 +298,7 @@ def test_what_makes_gaussians_of_gaussians_keeps_their_harmonics(tmp_path):
     np.testing.assert_array_equal(g.take(order).harmonics, g.harmonics[order])
     np.testing.assert_array_equal(as_stored(g).harmonics, g.harmonics)
     bright = replace(g, opacity_logits=np.where(np.arange(60) < 10, -9.0, 2.0))
-    np.testing.assert_array_equal(drawn_by_all(bright, 400).harmonics, g.harmonics[10:])
+    np.testing.assert_array_equal(without_undrawn(bright, 400).harmonics, g.harmonics[10:])
     kept = Checkpoint(tmp_path, "key")
     kept.save("fitted.npz", g)
     back = kept.load("fitted.npz")[0]
@@ -312,7 +312,7 @@ def test_what_makes_gaussians_of_gaussians_keeps_their_harmonics(tmp_path):
 
 
 def test_networks_refuse_them_in_one_line():
-    with pytest.raises(DataError, match=r"degree 3: a network knows only colours .* degree 0") as caught:
+    with pytest.raises(DataError, match=r"degree 3: a network supports only colours .* degree 0") as caught:
         pack(cloud())
     assert "\n" not in str(caught.value)
 

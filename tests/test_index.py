@@ -11,7 +11,7 @@ import pytest
 import xarray
 
 from tests.test_pages import clouds
-from vvgt_cli.conversion.frames import steps_of
+from vvgt_cli.conversion.frames import list_steps
 from vvgt_cli.conversion.index import index_path
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import read_ply
@@ -80,7 +80,7 @@ def test_what_an_index_says(vvgt, at, kind, blocks):
 
 
 @pytest.mark.parametrize("kind", LINES)
-def test_an_index_that_is_there_is_said_before_the_work(vvgt, at, kind):
+def test_an_existing_index_is_reported_before_the_work(vvgt, at, kind):
     Path("x_index.json").write_text("mine")
     done = vvgt("convert", *LINES[kind], "-o", "x_{}.ply", *HOW)
     assert (done.code, "x_index.json" in done.error) == (2, True), done.err
@@ -108,12 +108,12 @@ def test_times_are_those_of_the_file(at):
     values = np.zeros((3, 4, 5, 6), np.float32)
     time = ("time", [0.0, 10.0, 25.0], {"units": "hours since 2020-01-01", "axis": "T"})
     xarray.DataArray(values, dims=("time", "z", "y", "x"), coords={"time": time}, name="t").to_netcdf("t.nc")
-    assert [step.time for step in steps_of(SourceRequest("t.nc"))] == [
+    assert [step.time for step in list_steps(SourceRequest("t.nc"))] == [
         (at, "hours since 2020-01-01") for at in (0.0, 10.0, 25.0)
     ]
-    assert [step.time for step in steps_of(SourceRequest("four.nii"))] == [(1.0, "s"), (3.5, "s"), (6.0, "s")]
+    assert [step.time for step in list_steps(SourceRequest("four.nii"))] == [(1.0, "s"), (3.5, "s"), (6.0, "s")]
     nib.save(nib.Nifti1Image(np.zeros((4, 4, 4, 2), np.float32), np.eye(4)), "none.nii")
-    assert [step.time for step in steps_of(SourceRequest("none.nii"))] == [None, None]
+    assert [step.time for step in list_steps(SourceRequest("none.nii"))] == [None, None]
 
 
 def test_an_index_that_is_none_is_a_line(vvgt, at):

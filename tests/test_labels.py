@@ -147,7 +147,7 @@ def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
     report = json.loads((tmp_path / "a-r.json").read_text())
     assert report["scores"]["psnr"] > 25
     assert np.abs(gaussians.colors[:, 1] - 0.2 * gaussians.colors[:, 0]).max() < 0.1  # no colour that is no mix of both
-    own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-seats", "--step", 0.5, "--json", "-q")
+    own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-conditions", "--step", 0.5, "--json", "-q")
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
     views = ("--views", 2, "--test-views", 1, "--size", 32, "-q", "-o", tmp_path / "views")
     assert vvgt("render-views", seg, "--labels", labels, *views).code == 0
@@ -251,7 +251,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
     for options, said in (
         (("--labels", "auto", "--tf", "gray"), "expected one of --tf and --labels"),
         (("--labels", tmp_path / "no.ctbl"), "no such file"),
-        (("--split-labels", "--tf", "gray"), "the colours of labels come from --labels"),
+        (("--split-labels", "--tf", "gray"), "remove it"),
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):
@@ -339,7 +339,7 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     series = vvgt("convert", tmp_path / "*.seg.nrrd", *SMALL, "-o", tmp_path / "s_{}.ply")
     assert "convert such frames one by one" in series.error
     path.write_bytes(path.read_bytes().replace(b"Segment0_Layer:=0", b"Segment0_Layer:=7"))
-    assert "layer 0: no label in it" in vvgt("init", path, "-o", tmp_path / "n.ply").error
+    assert "layer 0: no labels" in vvgt("init", path, "-o", tmp_path / "n.ply").error
 
 
 def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> None:
@@ -379,7 +379,7 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     again = table(
         tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
     )
-    asked = ("evaluate", ply, "--volume", seg, "--no-seats", "--step", 0.5, "-q")
+    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 0.5, "-q")
     for options, others in (
         (("--labels", labels), False),
         (("--labels", again), False),  # other names, and a label that the volume has not got
@@ -389,7 +389,7 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     ):
         done = vvgt(*asked[:-1], *options)
         assert done.code == 0, done.err
-        assert ("made under other labels, functions or layers" in done.err) is others, options
+        assert ("made with other labels, functions or layers" in done.err) is others, options
     assert vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "s.ply").code == 0
     assert read_ply(str(tmp_path / "s.ply"))[1].optics is None  # of scalars the header is what it was
     header = read_ply(str(ply))[1]

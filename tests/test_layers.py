@@ -349,7 +349,9 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
     assert red.sum() > 5
     assert np.abs(made.means[red]).max() < 0.35 < np.abs(made.means[~red]).max()
     assert len(json.loads(report.read_text())["transfer_function"]["layers"]) == 2
-    own = vvgt("evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, "--no-seats", "--step", 0.5, "--json", "-q")
+    own = vvgt(
+        "evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, "--no-conditions", "--step", 0.5, "--json", "-q"
+    )
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(
         json.loads(report.read_text())["scores"]["psnr"], abs=1
     )

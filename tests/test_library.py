@@ -103,7 +103,7 @@ def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeyp
     _, images = vvgt.render_views(session, "gray", 1, size=32)
     assert images[..., 3].max() > 0
     assert session.volume.spacing == SPACING
-    with pytest.raises(vvgt.UsageError, match="spacing: a session's volume has been read"):
+    with pytest.raises(vvgt.UsageError, match="spacing: the session's volume is read already"):
         vvgt.convert(session, "gray", spacing=SPACING)
 
 
@@ -146,7 +146,7 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     assert re.match(r'<iframe title="array" sandbox="allow-scripts allow-downloads" ', frame)
     page = html.unescape(re.search(r'srcdoc="([^"]*)"></iframe>$', frame)[1]).encode()
     assert len(read_html(page, "page")) == len(converted.gaussians)
-    scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, seats=False, step=0.5)
+    scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, conditions=False, step=0.5)
     ten = [view["psnr"] for view in scores.scores["per_view"]]
     three = [-10 * np.log10(np.mean([10 ** (-ten[n] / 10) for n in (0, 4, 9)])), np.mean([ten[n] for n in (0, 4, 9)])]
     assert min(three) - 0.3 < converted.scores["psnr"] < max(three) + 0.3
@@ -182,9 +182,9 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
         (np.zeros((4, 4, 4)), {"affine": np.eye(3)}, r"expected \(4, 4\)"),
         (np.zeros((4, 4, 4)), {"affine": np.eye(4), "spacing": (1, 1, 1)}, "leave out"),
         (np.zeros((4, 4, 4)), {"component": 1}, "an array is one volume"),
-        (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: no such option; of reading expected dims, "),
+        (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: unknown option; expected one of dims, "),
         (np.zeros((4, 4, 4)), {"space": "RAS"}, "give affine too"),
-        ("example:blob:8", {"affine": np.eye(4)}, "a file says itself"),
+        ("example:blob:8", {"affine": np.eye(4)}, "affine and origin are for arrays"),
         ("nothing.nrrd", {}, "no such file"),
         (pyvista.Sphere(), {}, "surface"),
         (pyvista.ImageData(dimensions=(3, 3, 3)), {}, "array"),
@@ -195,7 +195,7 @@ def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
         vvgt.read_volume(volume, **reading)
 
 
-def test_saving_again_replaces_the_file_unless_it_is_told_not_to(converted, tmp_path):
+def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     small = converted.save(tmp_path / "a.ply")
     assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
     with pytest.raises(vvgt.UsageError, match="exists"):

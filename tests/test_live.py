@@ -262,7 +262,7 @@ def test_recolor_shows_other_functions_without_the_volume(vvgt, live_file, tmp_p
     scores = []
     for file in (live_file, tmp_path / "v.ply"):
         done = vvgt(
-            "evaluate", file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--json", "--no-seats"
+            "evaluate", file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--json", "--no-conditions"
         )
         scores.append(json.loads(done.out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
@@ -342,7 +342,7 @@ def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
 
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     """Of Gaussians that lie across blocks, and beyond the volume; and a conversion in blocks is as near the volume."""
-    from vvgt_cli.conversion.convert import opened
+    from vvgt_cli.conversion.convert import open_field
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions
     from vvgt_cli.field.settings import BlockOptions
     from vvgt_cli.field.source import SourceRequest
@@ -353,7 +353,7 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     for blocks in (None, BlockOptions(16)):
         request = ConvertRequest(SourceRequest("example:marschner-lobb:40"), str(tmp_path / "a.ply"), blocks=blocks)
         request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
-        with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
+        with open_field(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
             wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
             foggy = field.with_look(field.source.with_function(fog(field.source.statistics)))
             found.append((field.sample(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))

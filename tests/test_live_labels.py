@@ -168,7 +168,7 @@ def test_labels_under_gaussians_and_the_way_they_end() -> None:
     assert gradient[0, 0] < 0 < gradient[1, 0]
 
 
-def test_a_fog_of_labels_distinguishes_them() -> None:
+def test_labels_of_a_fog_differ_in_colour() -> None:
     table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8})
     assert len({label.color[0] for label in table.labels}) == 3
     assert [label.opacity > 0 for label in table.labels] == [True, True, False]
@@ -216,7 +216,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     scores = []
     for file in (label_file, tmp_path / "a.ply"):
         shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", "--labels", tmp_path / "t.json")
-        scores.append(json.loads(vvgt(*shown, "--json", "--no-seats").out)["scores"]["psnr"])
+        scores.append(json.loads(vvgt(*shown, "--json", "--no-conditions").out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
     assert scores[0] > 18
     told = json.loads(vvgt("info", label_file, "--json").out)["live_labels"]
@@ -252,8 +252,8 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     (tmp_path / "t.json").write_text(json.dumps(table | {"9": {"name": "nine", "color": "#ffffff"}}))
     (tmp_path / "one.json").write_text(json.dumps({"1": {"name": "one", "color": "#ffffff"}}))
     for more, code, said in (
-        (("--tf", "viridis"), 2, "leave out --tf (--labels gives"),
-        (("--tf-range", "0,1"), 2, "leave out --tf-range (--labels gives"),
+        (("--tf", "viridis"), 2, "replace --tf by --labels"),
+        (("--tf-range", "0,1"), 2, "replace --tf-range by --labels"),
         (("--labels", tmp_path / "t.json"), 1, "none of its labels is visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
@@ -261,7 +261,7 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
         assert (done.code, said in done.error) == (code, True), done.error
     done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
-    assert (done.code, "leave out --tf-range" in done.error) == (2, True), done.error
+    assert (done.code, "replace --tf-range" in done.error) == (2, True), done.error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 

@@ -17,7 +17,7 @@ from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
 from tests.test_page_live import compare, options
 from vvgt_cli.commands.live_site import Cloud
-from vvgt_cli.conversion.place import in_frame_of
+from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
@@ -100,7 +100,7 @@ def test_gaussians_of_one_grid_in_the_frame_of_another() -> None:
     one = Volume(empty, (1.0, 2.0, 0.5), (3.0, 1.0, 0.0))
     other = Volume(empty, (2.0, 1.0, 1.5), (-4.0, 0.0, 2.0))
     some = cloud()
-    moved = in_frame_of(some, one, other)
+    moved = to_frame_of(some, one, other)
     worlds = [
         (g.means / v.unit_frame().scale + np.array(v.unit_frame().centre), np.exp(g.log_scales) / v.unit_frame().scale,
          g.live[:, 2] / v.unit_frame().scale)  # type: ignore[index]
@@ -199,10 +199,10 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     source += ("--layer", f"{pair / 'right.nii'},tf={pair / 'tf.json'}")
     source += ("--layer", f"{pair / 'top_label.nii'},labels={pair / 't.json'}")
     for name in ("live.ply", "blocked.ply"):
-        done = vvgt("evaluate", pair / name, *source, "--json", "--no-seats")
+        done = vvgt("evaluate", pair / name, *source, "--json", "--no-conditions")
         assert done.code == 0, done.err
         assert json.loads(done.out)["scores"]["psnr"] > 21
-    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-seats")
+    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
     assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
 
 
@@ -218,7 +218,7 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
     for blocks in ((), ("--blocks", "16")):
         scores = []
         for file in (pair / "live.ply", tmp_path / "r.ply"):
-            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-seats", *blocks)
+            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
             assert done.code == 0, done.err
             scores.append(json.loads(done.out)["scores"]["psnr"])
         assert scores[0] == pytest.approx(scores[1], abs=0.01)
@@ -249,7 +249,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     other = TF | {"opacity_unit_distance": 2.0}
     labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
-    saved = cloud.layered(sent)
+    saved = cloud.with_layers(sent)
     facts = saved.options.live
     assert facts is not None
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
@@ -261,7 +261,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     assert thinner.mean() > 0.4  # opacity is per twice the distance
     for wrong in (sent[:2], [labels, *sent[1:]], [*sent[:2], {"function": other}], None):
         with pytest.raises(vvgt_library.DataError):
-            cloud.layered(wrong)
+            cloud.with_layers(wrong)
 
 
 def test_channels_in_python(tmp_path) -> None:
@@ -279,5 +279,5 @@ def test_channels_in_python(tmp_path) -> None:
     assert "magma" in other.ply.function
     rgb = np.random.default_rng(0).integers(0, 255, (8, 9, 10, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "rgb.tif", rgb, photometric="rgb")
-    with pytest.raises(vvgt_library.UsageError, match="colours, of which"):
+    with pytest.raises(vvgt_library.UsageError, match="has colours, which Gaussians cannot carry"):
         vvgt_library.convert(str(tmp_path / "rgb.tif"), None, {"max_gaussians": 90, "size": 48}, live=True)

@@ -91,7 +91,7 @@ def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_recolor_uses_the_given_light_or_else_that_of_the_file(vvgt, lit_file, tmp_path) -> None:
+def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_path) -> None:
     _, header = read_ply(lit_file)
     assert (header.light, header.sh_degree) == (Lighting(), 2)
     found = {}
@@ -109,7 +109,7 @@ def test_recolor_uses_the_given_light_or_else_that_of_the_file(vvgt, lit_file, t
     scores = {}
     for light in ("headlight", "none"):
         shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
-        scores[light] = json.loads(vvgt(*shown, "--json", "--no-seats", "--size", 48).out)["scores"]["psnr"]
+        scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--size", 48).out)["scores"]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
     assert vvgt("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a").code == 0
     assert vvgt("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b").code == 0
@@ -123,7 +123,7 @@ def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> Non
     with pytest.raises(vvgt_library.UsageError, match="need the volume"):
         vvgt_library.recolor(lit_file, light=LightOptions(("x",), shadows=True))
     done = vvgt("recolor", lit_file, "--ambient", "0.5", "--light", "none", "-o", tmp_path / "a.ply")
-    assert (done.code, "nothing is lit" in done.error) == (2, True)
+    assert (done.code, "there is no light" in done.error) == (2, True)
     assert not list(tmp_path.iterdir())
 
 

@@ -138,7 +138,7 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
             np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
 
 
-def test_a_layer_that_is_empty_in_a_frame_is_skipped_there(vvgt, tmp_path) -> None:
+def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
     ball, low = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32), (z < -0.5).astype(np.uint8)
     for k in range(3):
@@ -154,7 +154,7 @@ def test_a_layer_that_is_empty_in_a_frame_is_skipped_there(vvgt, tmp_path) -> No
         f"{tmp_path / 'low.npy'},labels=auto",
     )
     done = vvgt(*source, "--live", *SMALL, "-o", tmp_path / "f_{}.ply")
-    assert (done.code, "left out: f1 (nothing but background)" in done.err) == (0, True), done.err
+    assert (done.code, "skipped: f1 (only background)" in done.err) == (0, True), done.err
     for k, numbers in enumerate(([0, 1], [1], [0, 1])):
         live = read_ply(tmp_path / f"f_{k}.ply")[0].live
         assert np.unique(live[:, 7]).tolist() == numbers  # type: ignore[index]

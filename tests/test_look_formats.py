@@ -180,7 +180,8 @@ def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
     assert vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "ct.json").code == 0
     assert read_transfer_function(str(tmp_path / "ct.json")).lighting == tf.lighting
     assert (
-        "holds no shading" in vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "p.json", "--format", "paraview").err
+        "stores no shading"
+        in vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "p.json", "--format", "paraview").err
     )
     assert vvgt("tf", "show", source + "#MR-Default", "-o", tmp_path / "mr.png").code == 0
 
@@ -272,7 +273,7 @@ def test_faulty_files_are_one_clear_line(file, content, name: str, message: str)
 
 def test_presets_that_do_not_exist(file) -> None:
     for content, name in ((vp(), "a.vp"), (vp_json(), "b.json"), (ITF.format(lo=0, hi=1, type=0), "c.itf")):
-        with pytest.raises(DataError, match="no presets to pick 'x' from"):
+        with pytest.raises(DataError, match="no presets; omit #x"):
             read_transfer_function(file(content, name) + "#x")
 
 
@@ -289,7 +290,7 @@ def test_convert_round_trip(vvgt, file, tmp_path: Path, form: str) -> None:
         np.testing.assert_allclose(after.color(at), before.color(at), atol=1e-15)
         kept = form == "minimal"
         assert after.opacity_unit_distance == (before.opacity_unit_distance if kept else None)
-        assert ("holds no unit distance: set it to 1 there" in done.err) == (not kept and name == "a.vp")
+        assert ("stores no unit distance: set it to 1 there" in done.err) == (not kept and name == "a.vp")
     assert vvgt("tf", "convert", file(vp(), "a.vp"), "-").out.startswith(b'{\n "name": "volume property"')
 
 
@@ -322,11 +323,11 @@ def test_convert_refusals(vvgt, file, tmp_path: Path) -> None:
     share = file({"range": "percentile", "points": points}, "p.json")
     out = tmp_path / "out.json"
     for args, message in (
-        ((bent, out, "--format", "paraview"), "midpoints or sharpness of colours; a ParaView preset cannot hold that"),
-        ((bent, out), "midpoints, sharpness or a logarithmic scale; the minimal format cannot hold that"),
+        ((bent, out, "--format", "paraview"), "midpoints or sharpness of colours; a ParaView preset cannot store that"),
+        ((bent, out), "midpoints, sharpness or a logarithmic scale; the minimal format cannot store that"),
         ((itf, out, "--format", "paraview"), "a share of the volume's edge"),
-        ((share, out, "--format", "paraview"), "percentiles; a ParaView preset cannot hold that"),
-        ((share, out, "--tf-range", "0,1"), "leave out --tf-range"),
+        ((share, out, "--format", "paraview"), "percentiles; a ParaView preset cannot store that"),
+        ((share, out, "--tf-range", "0,1"), "omit --tf-range"),
         ((itf, out, "--tf-range", "rescale"), "needs the data"),
         ((bent, tmp_path / "out.vp"), r"expected a name ending in .json"),
         ((bent, bent, "--overwrite"), "is an input of this run"),

@@ -118,7 +118,7 @@ def test_percentiles_follow_the_histogram():
     resolved = resolve(tf, statistics(values))
     expected = np.quantile(values, [0, 0.5, 0.9])
     np.testing.assert_allclose(resolved.breakpoints(), expected, atol=(values.max() - values.min()) / 256)
-    with pytest.raises(UsageError, match="leave out --tf-range"):
+    with pytest.raises(UsageError, match="omit --tf-range"):
         resolve(tf, statistics(values), "rescale")
 
 

@@ -103,7 +103,7 @@ def test_separated_tables(
 
 def test_labels_without_a_colour_get_distinct_ones(tmp_path: Path) -> None:
     text = BIDS.replace("#0000FF", "n/a").replace("White", "")
-    with pytest.warns(UserWarning, match=r"dseg.tsv: 1 labels have no colour; shown in distinct ones"):
+    with pytest.warns(UserWarning, match=r"dseg.tsv: 1 labels have no colour; given distinct ones"):
         first, second = read_labels(saved(tmp_path, "dseg.tsv", text)).labels
     assert first.color == (1, 0.2, 0)
     assert second.name == "label 3"

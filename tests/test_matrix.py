@@ -133,7 +133,7 @@ def test_a_feature_works_in_memory_and_in_blocks_and_errors_agree(vvgt, at, tmp_
     memory = converted(vvgt, *ROWS[row], tmp_path / "memory.ply")
     blocks, _ = blocks_of_16(vvgt, row)
     assert abs(memory["scores"]["psnr"] - blocks["scores"]["psnr"]) <= AGREE
-    assert abs(memory["seats"][0]["psnr"] - blocks["seats"][0]["psnr"]) <= CLOSER
+    assert abs(memory["conditions"][0]["psnr"] - blocks["conditions"][0]["psnr"]) <= CLOSER
     assert memory["scores"]["psnr"] > 20
     assert [stage["name"] for stage in memory["stages"] if stage["name"] not in ("scene", "compile")] == [
         stage["name"] for stage in blocks["stages"] if stage["name"] != "compile"
@@ -148,7 +148,7 @@ def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, 
     memory, blocks = (json.loads(vvgt(*shared, *more).out) for more in ((), BLOCKS))
     assert memory["reference_psnr"] == pytest.approx(blocks["reference_psnr"], abs=CLOSER)
     assert memory["scores"]["psnr"] == pytest.approx(blocks["scores"]["psnr"], abs=AGREE)
-    for one, other in zip(memory["seats"], blocks["seats"], strict=True):
+    for one, other in zip(memory["conditions"], blocks["conditions"], strict=True):
         assert one["psnr"] == pytest.approx(other["psnr"], abs=CLOSER)
     assert memory["texture"] == pytest.approx(blocks["texture"], abs=0.05, nan_ok=True)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vvgt_cli.conversion.place import placed as layout
+from vvgt_cli.conversion.place import with_place as layout
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats

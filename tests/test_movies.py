@@ -99,9 +99,7 @@ def test_a_movie_has_one_size(ply, tmp_path, vvgt):
 
 
 def test_bad_calls_are_one_line(ply, tmp_path, vvgt, monkeypatch):
-    assert (
-        "--exr is of single pictures" in vvgt("render", ply[1], "--orbit", 2, "--exr", "-o", tmp_path / "a.gif").error
-    )
+    assert "--exr writes pictures" in vvgt("render", ply[1], "--orbit", 2, "--exr", "-o", tmp_path / "a.gif").error
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     result = vvgt("render", ply[1], "--orbit", 2, "-o", tmp_path / "a.mp4")
     assert result.code == 1

@@ -11,7 +11,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.prepare import pack, unpack
-from vvgt_cli.network.slopes import STEP, own_frame, slope_rows
+from vvgt_cli.network.slopes import STEP, own_axes_gradients, slope_rows
 from vvgt_cli.splat import render, render_backward_reference, render_reference
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import rotations
@@ -40,7 +40,7 @@ def test_gradients_in_the_own_frame_against_differences(columns):
     twin = render_backward_reference(gaussians, cameras[0], slope)
     fields = [twin[name] for name in ("means", "log_scales", "quaternions", "opacity_logits", "colors")]
     scales = np.exp(gaussians.log_scales)
-    found = own_frame(gaussians.quaternions, rotations(gaussians.quaternions), scales, fields)
+    found = own_axes_gradients(gaussians.quaternions, rotations(gaussians.quaternions), scales, fields)
     assert found.shape == (12, STEP)
     step = np.zeros((12, STEP))
     step[:, slice(*columns)] = np.random.default_rng(1).normal(size=(12, columns[1] - columns[0]))

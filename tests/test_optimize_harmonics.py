@@ -140,8 +140,8 @@ def test_a_checkpoint_holds_them(method, tmp_path):
 
 
 def test_the_plan_knows_that_steps_with_harmonics_take_longer():
-    case = Workload(100_000, 1e6, 1e6, 400, 0.05)
-    seconds = [step_seconds(replace(case, degree=degree), small=False) for degree in range(4)]
+    workload = Workload(100_000, 1e6, 1e6, 400, 0.05)
+    seconds = [step_seconds(replace(workload, degree=degree), small=False) for degree in range(4)]
     assert seconds == sorted(seconds)
     assert [s / seconds[0] for s in seconds] == pytest.approx(HARMONICS)
 
@@ -156,9 +156,9 @@ def test_a_conversion_keeps_what_its_closed_form_has(steps, monkeypatch, tmp_pat
         harmonics = np.full((len(start.gaussians), 3, 3), 0.2)
         return replace(start, gaussians=replace(start.gaussians, harmonics=harmonics), form=None)
 
-    def seen(self, case, *args, **options):
-        planned.append((self.sh_degree, case.degree))
-        return plan(self, case, *args, **options)
+    def seen(self, workload, *args, **options):
+        planned.append((self.sh_degree, workload.degree))
+        return plan(self, workload, *args, **options)
 
     plan = Planner.plan
     monkeypatch.setattr(closed_form, "initialise", glossy)

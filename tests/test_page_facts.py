@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.conversion.gaussian_files import layout_of
-from vvgt_cli.conversion.place import placed
+from vvgt_cli.conversion.place import with_place
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats.page_file import outermost, upright
@@ -140,11 +140,11 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
     xarray.DataArray(values, coords=along, dims=("z", "y", "x"), name="v").to_netcdf(tmp_path / "a.nc")
 
     def unit(name: str, **given: Any) -> str | None:
-        return placed(PlyOptions(), read_volume(str(tmp_path / name), ReadOptions(**given))).length_unit
+        return with_place(PlyOptions(), read_volume(str(tmp_path / name), ReadOptions(**given))).length_unit
 
     assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, "um")
     assert (unit("a.nii"), unit("ras.nii"), unit("a.nc")) == ("mm", None, "nm")
-    assert placed(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None
+    assert with_place(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None
 
 
 def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "with a page of several clouds" in done.error
     done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
-    assert (done.code, "--max-size is of" in done.error) == (2, True)
+    assert (done.code, "--max-size needs .ply output" in done.error) == (2, True)
     white = {"rgb": [1, 1, 1]}
     dark = json.dumps({"points": [{"x": 900, "opacity": 0, **white}, {"x": 901, "opacity": 1, **white}]})
     Path("dark.json").write_text(dark)
@@ -147,4 +147,4 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert (done.code, "a page of 2 clouds of Gaussians; expected one" in done.error) == (1, True)
     assert vvgt("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply").code == 0
     done = vvgt("view", "a.ply", "a.ply", "-o", "b.spz")
-    assert (done.code, "expected a page (.html), which takes them all" in done.error) == (2, True)
+    assert (done.code, "expected a page (.html), which holds several" in done.error) == (2, True)

@@ -133,14 +133,14 @@ def test_pixels_that_show_them():
         assert shown[(v[inside] // BLOCK).astype(int), (u[inside] // BLOCK).astype(int)].all()
 
 
-def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
+def test_pictures_of_the_next_frame_are_as_drawn_again(tmp_path):
     first, second = (Resident.of(one) for one in sources(tmp_path, body(0.2), body(0.26)))
     kept = RememberedViews(200, first)
     camera, how = default_views("test", 5, size=190)[3], RenderSettings(samples=1)
     kept.view(camera, how)
     found = changes(first.source, second.source)
     assert 0.02 < found.blocks.mean() < 0.2
-    kept.outdate(found)
+    kept.invalidate(found)
     drawn = []
 
     class Counted:
@@ -262,7 +262,7 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
 
     def check(plan, pictures=0, beside=None):
         if beside is not None:  # not after the closed form
-            asked.append(pictures + beside(plan.case))
+            asked.append(pictures + beside(plan.workload))
 
     monkeypatch.setattr("vvgt_cli.conversion.convert.check_memory", check)
     start = PreviousFrame(96)
@@ -292,7 +292,7 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
     done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     assert done.code == 0, done.err
-    assert "left out: starting from the frame before" in done.err
+    assert "skipped: starting from the previous frame" in done.err
     assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
     assert uncertified(beat / "a.ply") == uncertified(beat / "f_1.ply")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt
-from vvgt_cli.conversion.place import into_box, out_of_box
-from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recoloured
+from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
+from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
@@ -61,7 +61,7 @@ def earlier(session):
 
 
 def started_warm(result):
-    return not [why for name, why in result.report.left_out if name == WARM_START]
+    return not [why for name, why in result.report.skipped if name == WARM_START]
 
 
 def names(result):
@@ -102,7 +102,7 @@ def test_another_light_and_another_size(session, earlier):
 @pytest.mark.parametrize(
     ("look", "goal", "why"),
     [
-        (OUTSIDE, {}, "something else"),
+        (OUTSIDE, {}, "differs too much"),
         (SHELL, {"max_gaussians": 300}, "Gaussians"),
         (SHELL, {"steps": 0}, "no steps"),
         (vvgt.Look(SHELL, light=vvgt.LightOptions(("above",), shadows=True)), {}, "shadows"),
@@ -111,18 +111,18 @@ def test_another_light_and_another_size(session, earlier):
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
     later, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
-    assert why in dict(later.report.left_out)[WARM_START]
+    assert why in dict(later.report.skipped)[WARM_START]
     assert np.array_equal(later.gaussians.means, alone.gaussians.means)
     assert np.array_equal(later.gaussians.colors, alone.gaussians.colors)
-    assert names(later)[-1] == "seats"
+    assert names(later)[-1] == "conditions"
 
 
 def test_refused(session, earlier):
     with pytest.raises(vvgt.UsageError, match="same volume"):
         vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
-    with pytest.raises(vvgt.UsageError, match=r"after with --live: .*leave it out"):
+    with pytest.raises(vvgt.UsageError, match=r"after with --live: .*remove it"):
         session.convert(SHELL, GOAL, after=earlier, live=True)
-    with pytest.raises(vvgt.UsageError, match=r"after with labels: .*leave it out"):
+    with pytest.raises(vvgt.UsageError, match=r"after with labels: .*remove it"):
         vvgt.convert("example:blob:16", goal=GOAL, after=earlier, split_labels=True)
     with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
         session.convert([SHELL, "gray"], GOAL, after=earlier)
@@ -130,7 +130,7 @@ def test_refused(session, earlier):
 
 def test_the_same_look_changes_nothing(session, earlier):
     field = earlier.field
-    same, before = recoloured(earlier, field), into_box(earlier.gaussians, field.source.volume)
+    same, before = recolor_earlier(earlier, field), to_box_frame(earlier.gaussians, field.source.volume)
     clipped = opacity(before).clip(*OPAQUE)
     assert np.allclose(opacity(same), clipped, atol=1e-6)
     assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
@@ -139,14 +139,14 @@ def test_the_same_look_changes_nothing(session, earlier):
 
 def test_depth_goes_with_extinction(session, earlier):
     thin = session.convert(shell(times=0.5), {**GOAL, "steps": 0})
-    found = recoloured(earlier, thin.field)
-    before = into_box(earlier.gaussians, earlier.field.source.volume)
+    found = recolor_earlier(earlier, thin.field)
+    before = to_box_frame(earlier.gaussians, earlier.field.source.volume)
     seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
     ratio = np.log1p(-opacity(found)[seen]) / np.log1p(-opacity(before)[seen])
     assert np.median(ratio) == pytest.approx(np.log1p(-0.2) / np.log1p(-0.4), rel=0.15)
     assert ratio.min() >= 1 / MOST
     assert replace(found, means=before.means).degree == 0
-    assert out_of_box(found, thin.field.source.volume).means.shape == before.means.shape
+    assert to_unit_frame(found, thin.field.source.volume).means.shape == before.means.shape
 
 
 def test_in_blocks_too(values):

@@ -235,7 +235,7 @@ def test_cameras_of_several_sizes_share_a_contact_sheet(vvgt, tmp_path):
     kept = json.loads((tmp_path / "t.json").read_text())
     kept["test_filenames"] = ["wide.png", "tall.png"]
     (tmp_path / "t.json").write_text(json.dumps(kept))
-    assert "expected some to train on" in vvgt(*call).error
+    assert "expected some training views" in vvgt(*call).error
     for frame, name in zip(kept["frames"], ("a.1.png", "a_1.png"), strict=True):
         frame["file_path"] = name
     (tmp_path / "t.json").write_text(json.dumps(kept))
@@ -255,7 +255,7 @@ def test_orbit():
         (("--cameras", "nowhere.json"), 2, "--cameras nowhere.json: no such file"),
         (("--samples", "many"), 2, "--samples"),
         (("--samples", "0"), 2, "--samples"),
-        (("--samples", "3", "--renderer", "vtk"), 2, "one ray a pixel"),
+        (("--samples", "3", "--renderer", "vtk"), 2, "one ray per pixel"),
         (("--shard", "0/2"), 2, "--shard 0/2"),
         (("--shard", "3/2"), 2, "I from 1 to N"),
         (("--shard", "1"), 2, "expected I/N"),

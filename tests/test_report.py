@@ -1,4 +1,4 @@
-"""`vvgt report`: the ladder end to end, and what is made of runs: fronts, tables, charts, the page, comparisons."""
+"""`vvgt report`: all runs end to end; fronts, tables, charts, the page, comparisons."""
 
 from __future__ import annotations
 
@@ -14,11 +14,23 @@ import pytest
 
 from tests.onnx_models import write_model
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands.ladder import LadderOptions, random_points, rungs
+from vvgt_cli.commands.report_runs import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
 from vvgt_cli.score.charts import FILES, draw, log_ticks
-from vvgt_cli.score.curves import OTHER, STAGES, Series, cost, front, knee, psnr, read_series, short, table, unit_costs
+from vvgt_cli.score.curves import (
+    OTHER,
+    STAGES,
+    Series,
+    cost,
+    knee,
+    pareto,
+    psnr,
+    read_series,
+    short,
+    table,
+    unit_costs,
+)
 from vvgt_cli.score.page import Pictures, page
 
 SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
@@ -48,7 +60,7 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def ladder(tmp_path_factory):
+def scene_report(tmp_path_factory):
     """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
     from vvgt_cli.cli.main import run as vvgt
 
@@ -61,29 +73,29 @@ def ladder(tmp_path_factory):
     return folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
 
-def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
-    folder, found = ladder
+def test_a_report_writes_every_file_and_scores_every_run(scene_report):
+    folder, found = scene_report
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         ["report.json", "report.csv", "report.html", *FILES]
     )
-    names = [rung["name"] for rung in found["runs"]]
+    names = [run["name"] for run in found["runs"]]
     assert names == [
         "closed form, K = 1", "closed form, K = 3", "closed form, K = 15", "closed form, K = 60", "live form, K = 60",
         "network worse", "2 steps", "3DGS, 2 steps", "iVR-GS setting, 2 steps",
     ]  # fmt: skip
-    scores = {rung["name"]: rung["scores"]["psnr"] for rung in found["runs"]}
+    scores = {run["name"]: run["scores"]["psnr"] for run in found["runs"]}
     assert scores["closed form, K = 1"] < scores["closed form, K = 15"]
     assert scores["network worse"] == pytest.approx(scores["closed form, K = 60"], abs=0.5)  # what is worse is not kept
     network = next(s for s in found["runs"][5]["stages"] if s["name"] == "network")
     assert not network["kept"]
     assert network["psnr"] < network["psnr_before"]
     assert scores["3DGS, 2 steps"] < scores["iVR-GS setting, 2 steps"]
-    for rung in found["runs"]:
-        assert rung["scores"]["views"] == 10
-        assert rung["bytes"] > 68 * rung["gaussians"] > 0
-        assert rung["cost"] == pytest.approx(cost(rung))
-        assert rung["cost"] > 0
-        assert {"read", "write"} <= {stage["name"] for stage in rung["stages"]}
+    for one in found["runs"]:
+        assert one["scores"]["views"] == 10
+        assert one["bytes"] > 68 * one["gaussians"] > 0
+        assert one["cost"] == pytest.approx(cost(one))
+        assert one["cost"] > 0
+        assert {"read", "write"} <= {stage["name"] for stage in one["stages"]}
     assert found["format"] == "vvgt-report"
     assert found["reference"] == {"views": 10, "size": 24, "step": 0.125, "rays": 9}
     assert found["knee"] in found["front"]
@@ -92,22 +104,22 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     assert found["machine"]["cpu"]
 
 
-def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
-    folder, found = ladder
+def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
+    folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     result = vvgt("report", *args, "-o", tmp_path / "out")
     assert result.code == 0, result.err
     assert "in blocks of 16" in result.err
     blocks = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "--blocks 16" in blocks["command_line"]
-    assert [rung["name"] for rung in blocks["runs"]] == [rung["name"] for rung in found["runs"]]
+    assert [run["name"] for run in blocks["runs"]] == [run["name"] for run in found["runs"]]
     for one, other in zip(found["runs"], blocks["runs"], strict=True):
         assert one["scores"]["psnr"] == pytest.approx(other["scores"]["psnr"], abs=0.1)
-        assert one["seats"][0]["psnr"] == pytest.approx(other["seats"][0]["psnr"], abs=0.3)
+        assert one["conditions"][0]["psnr"] == pytest.approx(other["conditions"][0]["psnr"], abs=0.3)
 
 
-def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
-    folder, found = ladder
+def test_the_page_opens_offline_and_shows_its_pictures(scene_report):
+    folder, found = scene_report
     text = (folder / "report.html").read_text("utf-8")
     reader = Reader(text)
     assert all(value.startswith("data:image/png;base64,") for value in reader.loads)
@@ -117,7 +129,7 @@ def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
     assert f"vvgt {found['versions']['vvgt']}" in text
     held = json.loads(re.search(r'id="images">(.*?)</script>', text, re.S)[1])
     assert len(held["reference"]) == 2
-    assert [own["name"] for own in held["runs"]] == [rung["name"] for rung in found["runs"]]
+    assert [own["name"] for own in held["runs"]] == [run["name"] for run in found["runs"]]
     import base64
 
     def pixels(uri):
@@ -131,10 +143,10 @@ def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
     assert off == pytest.approx(found["runs"][best]["scores"]["per_view"][0]["psnr"], abs=0.3)  # 8 bits
 
 
-def test_csv_and_plots_of_the_ladder(ladder):
-    folder, found = ladder
+def test_csv_and_plots_of_a_report(scene_report):
+    folder, found = scene_report
     rows = list(csv.DictReader(io.StringIO((folder / "report.csv").read_text())))
-    assert [row["name"] for row in rows] == [rung["name"] for rung in found["runs"]]
+    assert [row["name"] for row in rows] == [run["name"] for run in found["runs"]]
     assert float(rows[3]["psnr"]) == pytest.approx(found["runs"][3]["scores"]["psnr"], abs=1e-4)
     assert {row["name"] for row in rows if row["pareto"] == "1"} == set(found["front"])
     for name in FILES:
@@ -143,15 +155,15 @@ def test_csv_and_plots_of_the_ladder(ladder):
         assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
 
 
-def test_nothing_is_overwritten_unasked(ladder, vvgt):
-    folder, _ = ladder
+def test_nothing_is_overwritten_unasked(scene_report, vvgt):
+    folder, _ = scene_report
     result = vvgt("report", "example:blob:10", *SMALL, "-o", folder)
     assert result.code == 2
     assert "exists; give --overwrite" in result.error
 
 
-def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
-    folder, _ = ladder
+def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
+    folder, _ = scene_report
     assert vvgt("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
                 "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json").code == 0  # fmt: skip
     result = vvgt("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
@@ -167,7 +179,7 @@ def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("report", "-", "-o", "x"), "every run of the ladder reads it anew"),
+        (("report", "-", "-o", "x"), "every run reads it again"),
         (("report", "example:blob", "-o", "-"), "a folder of files"),
         (("report", "example:blob", "-o", "no/where"), "does not exist"),
         (("report", "example:blob", "-o", "file"), "is a file"),
@@ -207,16 +219,16 @@ def test_files_that_are_no_reports(content, tmp_path):
 
 def test_the_front_is_what_nothing_beats():
     found = runs()
-    best = front(found)
+    best = pareto(found)
     assert [r["name"] for r in best] == [r["name"] for r in found if r["kind"] in ("closed form", "steps")]
     for r in found:
         beaten = any(cost(o) <= cost(r) and psnr(o) >= psnr(r) and o is not r for o in found)
         assert beaten == (r not in best)
-    assert front([]) == []
+    assert pareto([]) == []
     assert knee(found)["name"] == "closed form, K = 25k"
     assert knee(found[:1]) is found[0]
     twins = [run("a", "a", "steps", 10, 1.0, 30.0, 5), run("b", "b", "steps", 10, 1.0, 30.0, 5)]
-    assert [r["name"] for r in front(twins)] == ["a"]
+    assert [r["name"] for r in pareto(twins)] == ["a"]
 
 
 def test_the_scoring_costs_nothing_and_units_are_medians():
@@ -271,7 +283,7 @@ def test_charts_name_every_run_and_follow_the_page():
     assert [chart.svg() for chart in charts] == [chart.svg() for chart in again]
 
 
-def test_labels_in_charts_lie_apart_and_inside():
+def test_labels_in_charts_are_separate_and_inside():
     for chart in draw([Series("s", runs())])[:3]:
         axes = chart.figure.axes[0]
         boxes = [note.get_window_extent() for note in axes.texts]
@@ -293,7 +305,7 @@ def test_names_cannot_break_out_of_the_page():
     assert "u" not in reader.tags
 
 
-def test_several_reports_are_told_apart(tmp_path, vvgt):
+def test_several_reports_have_different_names(tmp_path, vvgt):
     other = copy.deepcopy(document())
     for one in other["runs"]:
         one["scores"]["psnr"] -= 1
@@ -312,11 +324,11 @@ def test_several_reports_are_told_apart(tmp_path, vvgt):
 
 
 def test_rungs_follow_the_options_and_random_points_fill_the_box():
-    names = [r.name for r in rungs(LadderOptions(64_000, 100, (100, 25, 25), "m/net", 3))]
+    names = [r.name for r in plan_runs(RunOptions(64_000, 100, (100, 25, 25), "m/net", 3))]
     assert names[:5] == ["closed form, K = 1k", "closed form, K = 4k", "closed form, K = 16k", "closed form, K = 64k",
                          "network net"]  # fmt: skip
     assert names[5:] == ["25 steps", "100 steps", "3DGS, 100 steps", "iVR-GS setting, 100 steps"]
-    assert len(rungs(LadderOptions(1))) == 1 + 4 + 2
+    assert len(plan_runs(RunOptions(1))) == 1 + 4 + 2
     half = np.array([1.0, 0.5, 0.1])
     points = random_points(half, 2000, 0)
     assert (np.abs(points.means) <= half).all()

@@ -61,7 +61,7 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
     assert early.code == 1
     assert "is missing; remove its other files" in early.err
     last = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3")
-    assert "all blocks are there" in last.err
+    assert "all blocks are complete" in last.err
     raw.unlink()  # is not needed any more
     assert vvgt("merge", folder, "-o", out).code == 0
     assert out.read_bytes() == alone
@@ -332,7 +332,7 @@ def jobs(slurm, monkeypatch):
     from vvgt_cli.field import dask_runner
 
     monkeypatch.setattr(dask_runner, "AGAIN", 0.5)
-    monkeypatch.setattr(dask_runner, "asked_memory", lambda: 1e9)
+    monkeypatch.setattr(dask_runner, "memory_limit", lambda: 1e9)
     for name, value in slurm[1].items():
         monkeypatch.setenv(name, value)
     return lambda: dask_runner.DaskRunner("slurm", 2, 1)

@@ -56,12 +56,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.ply"))}
 
 
-def test_frames_are_those_of_single_conversions_and_dark_ones_are_left_out(vvgt, series: Path) -> None:
+def test_frames_are_those_of_single_conversions_and_dark_ones_are_skipped(vvgt, series: Path) -> None:
     out, tf = series / "out" / "f_{:03d}.ply", series / "tf.json"
     done = vvgt("convert", series / "run_*.npy", "--tf", tf, "-o", out, *[a for a in SMALL if a != "-q"])
     assert done.code == 0, done.err
     assert "values 0 to 10" in done.err
-    assert "run_8.npy: nothing of it is visible" in done.err
+    assert "skipped: run_8.npy (nothing of it is visible)" in done.err
     made = contents(series / "out")
     assert list(made) == ["f_001.ply", "f_002.ply", "f_003.ply"]
     alone = series / "alone.ply"
@@ -94,7 +94,7 @@ def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand
     before = (series / "out" / "03.ply").stat().st_mtime_ns
     again = vvgt(*[part for part in whole if part != "-q"])
     assert again.code == 0
-    assert "1 frames converted, 2 were done before" in again.err
+    assert "1 frames converted, 2 were complete before" in again.err
     assert contents(series / "out") == made
     assert (series / "out" / "03.ply").stat().st_mtime_ns == before
 
@@ -113,7 +113,7 @@ def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
         made[source] = contents(folder)
     assert list(made["cells.ome.tif"]) == ["p_01.ply", "p_02.ply", "p_03.ply"]
     assert made["cells.ome.tif"] == made["bold.nii.gz"] == made["run_*.npy"]
-    assert "bold.nii.gz time 0: nothing of it is visible" in done.err
+    assert "skipped: bold.nii.gz time 0 (nothing of it is visible)" in done.err
     assert [request.source.read.time for request in stand_in] == [None] * 3 + [1, 2, 3] * 2
     error = vvgt("convert", series / "bold.nii.gz", "-o", series / "p.ply", *run).error
     assert "4 time steps; expected one: try --time N (0 to 3), or a number in the output" in error
@@ -154,10 +154,10 @@ def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path
 def test_calls_that_are_wrong(vvgt, series: Path) -> None:
     frames, tf = series / "run_*.npy", series / "tf.json"
     for args, message in (
-        ((series / "none_*.npy", "-o", "{}.ply"), "no such files"),
+        ((series / "none_*.npy", "-o", "{}.ply"), "no file matches"),
         ((frames, "-o", series / "{}{}.ply"), "expected one place for the frame's number"),
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "r.json"), "--report .*expected one place"),
-        ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "go to one folder"),
+        ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "expected one folder"),
         ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
         ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),
@@ -218,7 +218,7 @@ def test_frames_of_colours(vvgt, series: Path) -> None:
     done = vvgt("convert", series / "rgb_*.tif", "-o", out, *[a for a in SMALL if a != "-q"])
     assert done.code == 0, done.err
     assert "opacity by luminance" in done.err
-    assert "rgb_0.tif: nothing of it is visible" in done.err
+    assert "skipped: rgb_0.tif (nothing of it is visible)" in done.err
     made = contents(series / "out")
     assert list(made) == ["c_1.ply", "c_2.ply"]
     assert vvgt("convert", series / "rgb_1.tif", "-o", series / "alone.ply", *SMALL).code == 0

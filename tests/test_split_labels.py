@@ -13,7 +13,7 @@ import pytest
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
-from vvgt_cli.conversion.label_assignment import Hidden, assign_labels, hidden_in
+from vvgt_cli.conversion.label_assignment import HiddenCells, assign_labels, hidden_cells
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
@@ -50,8 +50,8 @@ def rows(gaussians: Gaussians) -> list[bytes]:
 
 def test_the_files_hold_the_gaussians_of_the_whole(vvgt, tmp_path: Path, monkeypatch) -> None:
     made = []
-    fitted = split.fitted
-    monkeypatch.setattr(split, "fitted", lambda run, request: made.append(fitted(run, request)) or made[-1])
+    fitted = split.fit_gaussians
+    monkeypatch.setattr(split, "fit_gaussians", lambda run, request: made.append(fitted(run, request)) or made[-1])
     files = converted(vvgt, tmp_path, nested(cut=True))
     whole, together = rows(made[-1]), [row for part in files.values() for row in rows(part)]
     assert sorted(files) == [1, 3]
@@ -71,14 +71,14 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
     assert len(core) > 50
     scores = json.loads((tmp_path / "r_3-label-3.json").read_text())
     assert scores["scores"]["psnr"] > 25
-    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "seats"]
+    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "conditions"]
     assert scores["gaussians"] == len(core)
 
 
 def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:
     counts, cost = [], ViewingConditions.cost
     monkeypatch.setattr(
-        ViewingConditions, "cost", lambda stage, case: counts.append(case.gaussians) or cost(stage, case)
+        ViewingConditions, "cost", lambda stage, workload: counts.append(workload.gaussians) or cost(stage, workload)
     )
     files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "r_{}.json")
     names = {1: "r_1-label-1.json", 3: "r_3-label-3.json"}
@@ -98,7 +98,7 @@ def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
     time = vvgt(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
     )
-    assert (time.code, "--time-budget with labels: several conversions share the work" in time.error) == (2, True)
+    assert (time.code, "--time-budget with labels: it is for one conversion" in time.error) == (2, True)
 
 
 def test_standard_input_is_read_once(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
     assert ours > score() + 1
 
 
-def test_whose_a_gaussian_is() -> None:
+def test_gaussians_are_assigned_to_the_label_with_most_of_them() -> None:
     """A box of label 1 beside one of label 2 along x, which is faint."""
     values = np.zeros((8, 8, 16), np.uint8)
     values[:, :, 2:8], values[:, :, 8:14] = 1, 2
@@ -148,26 +148,26 @@ def test_whose_a_gaussian_is() -> None:
 def hidden_of(source):
     field = Resident(source, source.scene())
     form = field.pyramid(VbmOptions(600, 64)).form
-    return hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+    return hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_what_is_hidden(cut: bool) -> None:
+def test_hidden_cells_are_those_that_no_view_sees(cut: bool) -> None:
     values = nested(cut=cut)
     source = load(SourceRequest(Volume(values), labels="auto"))
     hides = hidden_of(source)
-    assert hides.any_of(source.volume, 3)
-    assert hides.any_of(source.volume, 1)  # its wall towards the core
+    assert hides.meet_label(source.volume, 3)
+    assert hides.meet_label(source.volume, 1)  # its wall towards the core
     apart = np.where(values == 3, 3, 0)
     alone = load(SourceRequest(Volume(apart), labels="auto"))
-    assert not hidden_of(alone).any_of(alone.volume, 3)
+    assert not hidden_of(alone).meet_label(alone.volume, 3)
     centre = np.zeros((2, 3))
     centre[1] = -0.95 / np.sqrt(3)  # on the outer surface, opposite to the cut
     points = Gaussians(centre, centre * 0 - 3, np.tile([1.0, 0, 0, 0], (2, 1)), np.zeros(2), centre)
-    np.testing.assert_array_equal(hides.whether(points), [True, False])
+    np.testing.assert_array_equal(hides.contain(points), [True, False])
 
 
-def test_of_a_hidden_label_its_surface_counts():
+def test_a_label_is_hidden_where_its_surface_is():
     """Each voxel hidden alone: its label is hidden somewhere where a neighbour is of another, or the box ends."""
     numbers = np.ones((5, 6, 7), np.uint8)
     numbers[1, 4, 3] = numbers[3, 2, 2] = numbers[4, 0, 6] = 2
@@ -175,9 +175,9 @@ def test_of_a_hidden_label_its_surface_counts():
     for z, y, x in np.ndindex(numbers.shape):
         cells = np.zeros(numbers.shape, bool)
         cells[z, y, x] = True
-        hidden = Hidden(cells, np.ones(3), np.full(3, 0.5), np.ones(3))
+        hidden = HiddenCells(cells, np.ones(3), np.full(3, 0.5), np.ones(3))
         number, middle = numbers[z, y, x], np.array([z, y, x]) + 1
         moves = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
         surface = any(around[tuple(middle + move)] != number for move in moves)
-        assert hidden.any_of(Volume(numbers), number) == surface, (z, y, x)
-        assert not hidden.any_of(Volume(numbers), 3 - number)
+        assert hidden.meet_label(Volume(numbers), number) == surface, (z, y, x)
+        assert not hidden.meet_label(Volume(numbers), 3 - number)

@@ -16,10 +16,10 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.commands.view import named_files
-from vvgt_cli.conversion.shards.apart import errors_apart
-from vvgt_cli.conversion.shards.ladder import Ladder
+from vvgt_cli.conversion.shards.level_errors import level_errors
+from vvgt_cli.conversion.shards.level_selection import CutErrors
 from vvgt_cli.conversion.shards.streamed_files import Files, Level
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
@@ -110,7 +110,7 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
             rows = np.arange(place["offset"], place["offset"] + place["count"])
             turned = gaussians_of(files[place["file"]].take(rows), "a")[0]
             cuts.append(transform(turned, up_matrix("z").T))  # they are measured before what shows is turned upright
-        squares, energy, pixels = errors_apart(cuts)
+        squares, energy, pixels = level_errors(cuts)
         np.testing.assert_allclose(squares / energy, node["errors"], rtol=0.1, atol=2e-4)
         np.testing.assert_allclose(np.sqrt(squares / pixels) / 2, node["rms"], rtol=0.1, atol=2e-3)
         assert node["errors"] == sorted(node["errors"])
@@ -118,36 +118,36 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
         assert node["errors"][0] == 0 < node["errors"][-1]
 
 
-def ladder_of(nodes: int, rungs: int) -> Ladder:
-    """Rungs of half the Gaussians of the one before, each with a larger error."""
+def cut_errors(nodes: int, cuts: int) -> CutErrors:
+    """Return cuts with half the Gaussians of the one before each, and a larger error."""
     rng = np.random.default_rng(6)
-    counts = 1000 * rng.integers(1, 9, (nodes, 1)) // 2 ** np.arange(rungs)
-    squares = np.cumsum(rng.uniform(0, 1, (nodes, rungs)) * 3.0 ** np.arange(rungs), axis=1)
+    counts = 1000 * rng.integers(1, 9, (nodes, 1)) // 2 ** np.arange(cuts)
+    squares = np.cumsum(rng.uniform(0, 1, (nodes, cuts)) * 3.0 ** np.arange(cuts), axis=1)
     squares[:, 0] = 0
-    return Ladder(np.arange(float(rungs)), counts, squares, np.full(nodes, 1e4), np.full(nodes, 100))
+    return CutErrors(np.arange(float(cuts)), counts, squares, np.full(nodes, 1e4), np.full(nodes, 100))
 
 
 def test_no_other_choice_of_as_many_gaussians_has_a_smaller_error() -> None:
-    small = ladder_of(4, 5)
+    small = cut_errors(4, 5)
     counts = small.counts
     every = np.stack(np.meshgrid(*[np.arange(5)] * 4), axis=-1).reshape(-1, 4)
-    totals = np.array([small.total(rungs) for rungs in every])
-    errors = np.array([small.rms(rungs) for rungs in every])
+    totals = np.array([small.total(cuts) for cuts in every])
+    errors = np.array([small.rms(cuts) for cuts in every])
     assert (small.for_count(counts[:, 0].sum()) == 0).all()
     assert (small.for_count(0) == 4).all()  # nothing less can be had
     for count in totals.max() * np.array([0.7, 0.4, 0.2, 0.1]):
-        rungs = small.for_count(count)
-        assert small.total(rungs) <= count
-        assert small.rms(rungs) <= errors[totals <= small.total(rungs)].min() * (1 + 1e-12)
+        cuts = small.for_count(count)
+        assert small.total(cuts) <= count
+        assert small.rms(cuts) <= errors[totals <= small.total(cuts)].min() * (1 + 1e-12)
 
 
 def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_one_before() -> None:
-    ladder = ladder_of(30, 10)
-    levels = ladder.levels()
+    errors = cut_errors(30, 10)
+    levels = errors.levels()
     assert (levels[0] == 0).all()
     assert all((a <= b).all() for a, b in pairwise(levels))
-    assert all(9 * ladder.total(b) <= ladder.total(a) or (b == 9).all() for a, b in pairwise(levels))
-    assert ladder.rms(levels[0]) == 0 < ladder.rms(levels[1]) < ladder.rms(levels[2])
+    assert all(9 * errors.total(b) <= errors.total(a) or (b == 9).all() for a, b in pairwise(levels))
+    assert errors.rms(levels[0]) == 0 < errors.rms(levels[1]) < errors.rms(levels[2])
 
 
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
@@ -162,14 +162,14 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--init", "wavelet"), "made of moments"),
-        (("--frame", "world"), "leave out --frame"),
-        (("--steps", "50"), "levels of one closed form"),
-        (("--live",), "levels of one closed form"),
-        (("--tf", "a.json", "--tf", "b.json"), "levels of one closed form"),
-        (("--target-psnr", "30"), "levels of one closed form"),
-        (("--dry-run",), "levels of one closed form"),
-        (("--preview", "p.png"), "levels of one closed form"),
+        (("--init", "wavelet"), "needs moments"),
+        (("--frame", "world"), "remove --frame"),
+        (("--steps", "50"), "made by one closed form"),
+        (("--live",), "made by one closed form"),
+        (("--tf", "a.json", "--tf", "b.json"), "made by one closed form"),
+        (("--target-psnr", "30"), "made by one closed form"),
+        (("--dry-run",), "made by one closed form"),
+        (("--preview", "p.png"), "made by one closed form"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
@@ -179,7 +179,7 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_run_goes_on_with_the_same_bytes(
+def test_an_interrupted_run_resumes_with_the_same_bytes(
     vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.BATCH", 3000)
@@ -188,9 +188,9 @@ def test_an_interrupted_run_goes_on_with_the_same_bytes(
     whole, out = tmp_path / "whole", tmp_path / "out"
     line = ("convert", volume, *FIT, "--blocks", "32", "-o")
     assert vvgt(*line, whole / "lod-meta.json").code == 0
-    calls = {"errors_apart": 0, "images_of": 0}
-    real = {"ladder.errors_apart": errors_apart, "streamed_files.images_of": images_of}
-    stop = {"errors_apart": 20, "images_of": 0}
+    calls = {"level_errors": 0, "images_of": 0}
+    real = {"level_selection.level_errors": level_errors, "streamed_files.images_of": images_of}
+    stop = {"level_errors": 20, "images_of": 0}
 
     def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any) -> Any:
@@ -208,13 +208,13 @@ def test_an_interrupted_run_goes_on_with_the_same_bytes(
     nodes, files = len(nodes_of(read_manifest(whole / "lod-meta.json"), "")), len(list(whole.glob("*/meta.json")))
     assert nodes > 20
     assert files > 3
-    stop = {"errors_apart": 0, "images_of": 3}
+    stop = {"level_errors": 0, "images_of": 3}
     assert vvgt(*line, out / "lod-meta.json").code == 130
-    assert calls["errors_apart"] < nodes + 20  # those of the batches that were whole are not drawn again
+    assert calls["level_errors"] < nodes + 20  # those of the batches that were whole are not drawn again
     assert not (out / "lod-meta.json").exists()
-    calls, stop["images_of"] = {"errors_apart": 0, "images_of": 0}, 0
+    calls, stop["images_of"] = {"level_errors": 0, "images_of": 0}, 0
     assert vvgt(*line, out / "lod-meta.json").code == 0
-    assert calls == {"errors_apart": 0, "images_of": files - 2}
+    assert calls == {"level_errors": 0, "images_of": files - 2}
     found = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (whole, out)]
     assert found[0] == found[1]
     assert not list(tmp_path.glob(".*"))
@@ -239,7 +239,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
     assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
-def test_an_existing_folder_is_replaced_only_on_request(vvgt, volume: Path, folder: Path) -> None:
+def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, folder: Path) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     manifest["filenames"].append("3_7/meta.json")
     (folder / "lod-meta.json").write_text(json.dumps(manifest))
@@ -275,7 +275,7 @@ def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
 
 def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None:
     assert [file for _, file in named_files([str(folder)])] == [str(folder / "lod-meta.json")]
-    with served(Site(streamed_parts(str(folder / "lod-meta.json")), print)) as url:
+    with served(Site(streamed_resources(str(folder / "lod-meta.json")), print)) as url:
         path = url[url.index("/", 8) :]
         status, text, _ = ask(url)
         assert (status, b'"streamed": true' in text) == (200, True)
@@ -284,7 +284,7 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
         assert ask(url, f"{path}../secret")[0] == 404
 
 
-def test_a_folder_with_a_missing_file_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
@@ -321,10 +321,10 @@ def test_manifests_that_cannot_be_are_one_line(
 
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     assert vvgt("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply").code == 0
-    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-seats", "--json").out)
+    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-conditions", "--json").out)
     found = []
     for name in (f"{folder}", f"{folder / 'lod-meta.json'}#1", f"{folder}#2"):
-        line = ("evaluate", name, "--volume", volume, "--no-seats", "--json")
+        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--json")
         found.append(json.loads(vvgt(*line).out))
     counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
     assert [scores["gaussians"] for scores in found] == counts[:3]
@@ -374,7 +374,7 @@ def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch:
         assert sum(map(len, levels._cached.values())) == len(seen)
 
 
-def test_levels_that_cannot_be_read_are_reported_in_one_line(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "b"
     shutil.copytree(folder, broken)
     (broken / "1_0" / "sh0.webp").unlink()
@@ -393,6 +393,6 @@ def test_levels_that_cannot_be_read_are_reported_in_one_line(vvgt, folder: Path,
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
     result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), goal={"max_gaussians": 20, "steps": 0})
-    with pytest.raises(UsageError, match="levels are made of a volume's closed form"):
+    with pytest.raises(UsageError, match="streamed levels need the volume"):
         result.save(tmp_path / "lod-meta.json")
     assert not list(tmp_path.iterdir())

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.test_view_volume import desk, send  # noqa: F401
+from tests.test_view_volume import controller, send  # noqa: F401
 from vvgt_cli.cli.main import run
-from vvgt_cli.commands.converter import Made, Message, Scored
-from vvgt_cli.commands.converter_process import Telling
-from vvgt_cli.commands.converter_process import Volume as ConvertedVolume
-from vvgt_cli.commands.live_site import Cloud, Desk, labels_sent
+from vvgt_cli.commands.converter import Converted, Message, Scored
+from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
+from vvgt_cli.commands.live_site import Cloud, PageController, parse_labels
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
 
@@ -36,8 +35,8 @@ def rows(shown: dict[int, float]) -> list[dict[str, Any]]:
     return [{"number": n, "color": [n / 8, 0, 1], "opacity": shown.get(n, 0.0)} for n in range(1, 9)]
 
 
-def test_saved_labels_have_the_colours_of_the_page(desk: tuple[str, Desk], eight: Cloud) -> None:
-    url, of = desk
+def test_saved_labels_have_the_colours_of_the_page(controller: tuple[str, PageController], eight: Cloud) -> None:
+    url, of = controller
     of.first = lambda: eight
     assert eight.options.live is not None
     saved = Cloud.of(send(url, "save", {"file": "ply", "labels": rows({2: 0.9, 7: 0.5})})[1], "x")
@@ -64,12 +63,12 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> Non
     np.save(tmp_path / "eight.npy", CUBES)
     source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto")
     told: list[Message] = []
-    console = Telling(told.append)
-    volume = ConvertedVolume(source, "eight", console)
-    volume.live(console)
-    volume.under(labels_sent(rows({2: 1.0})), console)
-    _, made, scored = [one for one in told if isinstance(one, Made | Scored)]
-    assert isinstance(made, Made)
+    console = MessageConsole(told.append)
+    volume = LoadedVolume(source, "eight", console)
+    volume.send_live(console)
+    volume.convert(parse_labels(rows({2: 1.0})), console)
+    _, made, scored = [one for one in told if isinstance(one, Converted | Scored)]
+    assert isinstance(made, Converted)
     gaussians = Cloud.of(made.ply, "x").gaussians
     assert (gaussians.means[:, 0] > -0.2).all()  # one of the eight, to the right
     assert isinstance(scored, Scored)

@@ -26,8 +26,8 @@ from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Start
-from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
-from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.commands.live_site import Cloud, PageController, parse_function, plain_name
+from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion.live import lit
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
@@ -174,8 +174,8 @@ def test_a_conversion_ends_with_a_server_that_is_killed(tmp_path: Path, temporar
     assert list(temporary.iterdir()) == []
 
 
-@pytest.mark.parametrize("begun", [False, True], ids=["before it begins", "while it speaks"])
-def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Path, begun: bool) -> None:
+@pytest.mark.parametrize("ready", [False, True], ids=["before it begins", "while it speaks"])
+def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Path, ready: bool) -> None:
     folder = tmp_path / "temporary"
     folder.mkdir()
     code = "from vvgt_cli.commands.converter_process import main; main()"
@@ -184,7 +184,7 @@ def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Pat
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        if begun:  # the input stays open: it is the answers that nobody hears
+        if ready:  # the input stays open: it is the answers that nobody hears
             process.stdout.close()
             pickle.dump(Start(SourceRequest("example:blob:12"), "blob", None), process.stdin)
             pickle.dump((1, None), process.stdin)
@@ -196,19 +196,19 @@ def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Pat
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
+def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
     """The site of a live file, which says that it converts, without a process."""
 
     class Still(Converter):
-        def ask(self, job: Any) -> int:
+        def submit(self, job: Any) -> int:
             self._number += 1
             return self._number
 
     site = Site({}, print)
-    found = Desk(site.parts, site.posts, "x", Console(quiet=True))
+    found = PageController(site.resources, site.posts, "x", Console(quiet=True))
     some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
-    found.converter = Still(SourceRequest("none"), "x", found.hear)
-    found.parts["state"] = Part("application/json", found._told)
+    found.converter = Still(SourceRequest("none"), "x", found.on_message)
+    found.resources["state"] = Resource("application/json", found._state_json)
     found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
     with served(site) as url:
         yield url, found
@@ -217,9 +217,9 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
 @pytest.mark.parametrize(
     ("sent", "said"),
     [
-        (b"{", "no JSON"),
-        (b"\xff", "no JSON"),
-        (b"[" * 60000, "no JSON"),
+        (b"{", "not JSON"),
+        (b"\xff", "not JSON"),
+        (b"[" * 60000, "not JSON"),
         (b'{"points": NaN}', "NaN is no number"),
         ([], "a list of at most"),
         ({}, "a list of at most"),
@@ -235,8 +235,10 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
         ({**FUNCTION, "file": "/etc/passwd"}, "'file'"),
     ],
 )  # fmt: skip
-def test_what_is_no_function_is_refused_with_the_reason(desk: tuple[str, Desk], sent: Any, said: str) -> None:
-    url, of = desk
+def test_what_is_no_function_is_refused_with_the_reason(
+    controller: tuple[str, PageController], sent: Any, said: str
+) -> None:
+    url, of = controller
     status, text = send(url, "function", sent)
     assert status == 400
     assert said in text.decode()
@@ -244,8 +246,8 @@ def test_what_is_no_function_is_refused_with_the_reason(desk: tuple[str, Desk], 
     assert of.state["number"] == 0
 
 
-def test_who_may_send_what(desk: tuple[str, Desk]) -> None:
-    url, of = desk
+def test_who_may_send_what(controller: tuple[str, PageController]) -> None:
+    url, of = controller
     assert send(url, "function", FUNCTION, Origin="http://evil.example")[0] == 403
     assert send(url, "function", FUNCTION, Host="evil.example")[0] == 403
     assert send(url, "function", FUNCTION, Sec_Fetch_Site="cross-site")[0] == 403
@@ -265,44 +267,44 @@ def test_who_may_send_what(desk: tuple[str, Desk]) -> None:
     [None, {}, {"file": "png"}, {"file": "../x.ply"}, {"file": "ply", "number": 7}, {"file": "ply", "path": "/tmp/x"},
      {"file": "ply", "function": {}}],
 )  # fmt: skip
-def test_what_cannot_be_saved_is_refused(desk: tuple[str, Desk], sent: Any) -> None:
-    assert send(desk[0], "save", sent)[0] == 400
+def test_what_cannot_be_saved_is_refused(controller: tuple[str, PageController], sent: Any) -> None:
+    assert send(controller[0], "save", sent)[0] == 400
 
 
-def test_the_page_hears_why_a_conversion_failed(desk: tuple[str, Desk]) -> None:
-    url, of = desk
+def test_the_page_says_why_a_conversion_failed(controller: tuple[str, PageController]) -> None:
+    url, of = controller
     send(url, "function", FUNCTION)
-    of.hear(1, Failed(DataError("mine: nothing is visible")))
+    of.on_message(1, Failed(DataError("mine: nothing is visible")))
     assert state_of(url) == {"number": 1, "state": "failed", "said": "mine: nothing is visible"}
     assert of.error is None
     assert "live" in scene_of(url)
 
 
-def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk]) -> None:
+def test_a_saved_live_file_has_the_colours_of_the_function(controller: tuple[str, PageController]) -> None:
     function = {
         "points": [{"x": LO, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": HI, "rgb": [0, 0, 1], "opacity": 0.4}],
         "opacity_unit_distance": 0.5,
     }
-    saved = Cloud.of(send(desk[0], "save", {"file": "ply", "function": function})[1], "x")
-    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05, GRAIN), pixel_width(SIZE))
+    saved = Cloud.of(send(controller[0], "save", {"file": "ply", "function": function})[1], "x")
+    wanted = baked(live_cloud(), Table.of_function(parse_function(function), LO, HI, 0.05, GRAIN), pixel_width(SIZE))
     np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
-    plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
+    plain = Cloud.of(send(controller[0], "save", {"file": "ply"})[1], "x")
     assert np.abs(plain.gaussians.colors - wanted.colors).max() > 0.1
 
 
-def test_a_long_function_is_taken(desk: tuple[str, Desk]) -> None:
+def test_a_long_function_is_taken(controller: tuple[str, PageController]) -> None:
     points = [{"x": LO + k / 7e3, "rgb": [0.1234, 0.5678, 0.9012], "opacity": 0.123456} for k in range(4096)]
-    assert send(desk[0], "function", {**FUNCTION, "points": points})[0] == 200
+    assert send(controller[0], "function", {**FUNCTION, "points": points})[0] == 200
 
 
-def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, Desk]) -> None:
-    url, of = desk
+def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple[str, PageController]) -> None:
+    url, of = controller
     assert of.first is not None
     plain, side = of.first(), Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
     lit_file = replace(plain, options=replace(plain.options, light=side))
     of.first = lambda: lit_file
-    table = Table.of_function(function_sent(FUNCTION), LO, HI, 0.1 * 0.1, GRAIN)
+    table = Table.of_function(parse_function(FUNCTION), LO, HI, 0.1 * 0.1, GRAIN)
     dark = baked(live_cloud(), table, pixel_width(SIZE))
 
     def saved(**more: Any) -> Cloud:
@@ -312,17 +314,17 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
     assert kept.options.light == side
     assert kept.options.function == "mine"
     np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
-    begun = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
-    again = saved(light=begun).options.light
+    base = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
+    again = saved(light=base).options.light
     assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)
     assert replace(again, directions=side.directions) == side
-    assert saved(light=begun | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
-    none = saved(light=begun | {"kind": "none"})
+    assert saved(light=base | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
+    none = saved(light=base | {"kind": "none"})
     assert none.options.light is None
     np.testing.assert_allclose(none.gaussians.colors, dark.colors, atol=1e-5)
-    for wrong in ([], {}, {"kind": "sun"}, begun | {"from": [0, 0, 0]}, begun | {"from": 1}, begun | {"ambient": "x"},
-                  begun | {"power": None}, begun | {"diffuse": -1}, begun | {"from": [1e999, 0, 0]}):  # fmt: skip
+    for wrong in ([], {}, {"kind": "sun"}, base | {"from": [0, 0, 0]}, base | {"from": 1}, base | {"ambient": "x"},
+                  base | {"power": None}, base | {"diffuse": -1}, base | {"from": [1e999, 0, 0]}):  # fmt: skip
         assert send(url, "save", {"file": "ply", "function": FUNCTION, "light": wrong})[0] == 400
 
 
@@ -341,17 +343,20 @@ def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) 
         assert "live" not in scene_of(url)
 
 
-def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: Path) -> None:
+def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Path) -> None:
     site = Site({}, print)
-    desk = Desk(site.parts, site.posts, "x", Console(quiet=True))
-    with served(site) as url, Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", desk.hear) as converter:
-        desk.await_volume(converter)
+    controller = PageController(site.resources, site.posts, "x", Console(quiet=True))
+    with (
+        served(site) as url,
+        Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", controller.on_message) as converter,
+    ):
+        controller.await_volume(converter)
         assert scene_of(url)["waits"]
         assert state_of(url)["state"] in ("first", "failed")
-        assert desk.there.wait(120)
+        assert controller.shown.wait(120)
         assert "no such file" in state_of(url)["said"]
-        assert desk.error is not None
-        assert desk.error.exit_code == 1
+        assert controller.error is not None
+        assert controller.error.exit_code == 1
 
 
 @pytest.mark.parametrize(

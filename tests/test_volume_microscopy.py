@@ -333,7 +333,7 @@ def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
     out = tmp_path / "a.ply"
     for command in (
         ("convert", path, *SMALL, "-o", out),
-        ("evaluate", out, "--volume", path, "--no-seats", "--json"),
+        ("evaluate", out, "--volume", path, "--no-conditions", "--json"),
         ("render-views", path, "-o", tmp_path / "views", "--size", 32, "--views", 3, "--test-views", 1),
         ("info", path),
     ):

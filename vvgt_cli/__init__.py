@@ -1,4 +1,4 @@
-"""Scientific volumes to 3D Gaussian splats (VVGT): the library; `docs/python.md` shows it.
+"""The library of VVGT, which turns scientific volumes into 3D Gaussian splats; see docs/python.md.
 
 >>> import vvgt_cli as vvgt
 >>> result = vvgt.convert("example:blob:16", goal={"max_gaussians": 50, "size": 48, "steps": 0})
@@ -14,7 +14,7 @@ from vvgt_cli.version import VERSION
 
 # Read when numba is imported. With TBB a parallel region costs the more the more have run before (docs/log/kernels.md).
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
-# Threads that wait for the next region sleep; else they keep processors from whoever has work to do.
+# Threads that wait for the next region sleep, and leave the processors to others.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = VERSION
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import Volume
 
-_WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
+_WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
@@ -79,10 +79,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public name on its first use."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
+    """List public names, those not yet imported included."""
     return sorted([*globals(), *_MODULES])

@@ -1,10 +1,10 @@
-"""The two errors a user can meet: each message says what was read, what was expected, what to try."""
+"""Errors that users meet; each message says what was read, what was expected, and what to try."""
 
 from collections.abc import Sequence
 
 
 class VvgtError(Exception):
-    """Base of every error that the command line shows as one line.
+    """The base of every error that the command line prints as one line.
 
     ``exit_code`` is the process's exit status: 1 for data, 2 for usage.
     """
@@ -13,7 +13,7 @@ class VvgtError(Exception):
 
 
 class DataError(VvgtError):
-    """A file or an array is not what it must be (exit status 1)."""
+    """A file or an array with unexpected content (exit status 1)."""
 
     exit_code = 1
 
@@ -23,13 +23,14 @@ class DeviceFailed(DataError):
 
 
 class Unsuitable(DataError):
-    """Whole and readable data of which no run can make anything: the same command ends the same way."""
+    """Readable data that cannot be converted: the same command would fail again."""
 
 
 class NothingVisible(Unsuitable):
-    """A function that shows nothing of a volume, from any view."""
+    """A volume in which a transfer function shows nothing from any view."""
 
     def __init__(self, volume: str, function: str) -> None:
+        """Build the message from the names of the volume and the function."""
         super().__init__(
             f"{volume} under {function}: nothing visible from any view; expected opacity above 0 where the data are "
             "(try 'vvgt tf show TF -o tf.png --volume VOLUME')"
@@ -37,18 +38,18 @@ class NothingVisible(Unsuitable):
 
 
 class UsageError(VvgtError):
-    """The call itself is wrong: options that contradict, a name that does not exist (exit status 2)."""
+    """Incorrect usage, such as contradictory options or unknown names (exit status 2)."""
 
     exit_code = 2
 
 
 class SeveralSteps(UsageError):
-    """A file of several time steps and none chosen.
+    """A file with several time steps, of which none was chosen.
 
     Attributes:
-        steps: how many there are.
-        times: of each, in ``unit`` (which may be ""), None where the file does not say.
-        names: of each, where the file has any.
+        steps: number of time steps.
+        times: time of each step in ``unit`` (which may be ""); None where the file has none.
+        names: name of each step, where the file has names.
     """
 
     def __init__(
@@ -60,36 +61,38 @@ class SeveralSteps(UsageError):
         unit: str = "",
         names: Sequence[str] = (),
     ) -> None:
+        """Build the message; ``what`` names the steps."""
         super().__init__(
             f"{source}: {steps} {what}; expected one: try --time N (0 to {steps - 1}), or a number in the output of "
-            "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them, or -o p.html, a page of them all"
+            "vvgt convert, as -o 'p_{:02d}.ply', for a series of all steps, or -o p.html, for a page of all"
         )
         self.steps, self.times, self.unit, self.names = steps, times, unit, list(names)
 
 
 class SeveralArrays(UsageError):
-    """A file of several arrays, images or groups and none chosen.
+    """A file with several arrays, images or groups, of which none was chosen.
 
     Attributes:
-        option: what chooses one.
-        choices: what it may be given.
-        names: of them, for people.
+        option: the option that chooses one.
+        choices: valid values of the option.
+        names: readable names of the choices.
     """
 
     def __init__(self, text: str, option: str, choices: Sequence[str], names: Sequence[str] = ()) -> None:
+        """Store the message and the choices."""
         super().__init__(text)
         self.option, self.choices, self.names = option, list(choices), list(names or choices)
 
 
 class SeveralComponents(UsageError):
-    """A volume of several components or channels and none chosen.
+    """A volume with several components or channels, of which none was chosen.
 
     Attributes:
-        count: how many there are.
-        color: they are red, green, blue and perhaps opacity.
-        colors: RGB in [0, 1] of each channel, None where the file says none.
-        channels: they are channels of a microscope, which are shown together.
-        names: of the channels, where they have any.
+        count: number of components.
+        color: whether they are red, green, blue and perhaps opacity.
+        colors: RGB in [0, 1] of each channel; None where the file has none.
+        channels: whether they are channels of a microscope, which are shown together.
+        names: names of the channels, where the file has names.
     """
 
     def __init__(
@@ -101,5 +104,6 @@ class SeveralComponents(UsageError):
         channels: bool = False,
         names: Sequence[str] = (),
     ) -> None:
+        """Store the message and what is known of the components."""
         super().__init__(text)
         self.count, self.color, self.colors, self.channels, self.names = count, color, colors, channels, names

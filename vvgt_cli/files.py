@@ -1,5 +1,4 @@
-"""Files: written beside the target and renamed, never over an existing one unasked, by one run at a time; read from
-pipes as from disk."""
+"""Atomic writing, locks against a second run, and reading from pipes as from files."""
 
 from __future__ import annotations
 
@@ -19,18 +18,18 @@ from vvgt_cli.resources import free_memory
 
 MAX_TEXT = 64 << 20  # bytes; parsed JSON takes some ten times as many
 _CHUNK = 1 << 20
-_SPARE = 64 << 20  # bytes that what comes through a pipe leaves free
-_OPEN = ("/dev", "/dev/fd", "/proc/self/fd")  # folders of names for what is open already, as /dev/stdout
+_SPARE = 64 << 20  # bytes of memory that the content of a pipe must leave free
+_OPEN = ("/dev", "/dev/fd", "/proc/self/fd")  # folders that name open files, such as /dev/stdout
 _leftovers: set[Path] = set()  # temporary names and locks of this process
-_taken_in: dict[tuple[int, int], IO[bytes]] = {}  # by device and inode of the pipe: what came out of it
+_spooled: dict[tuple[int, int], IO[bytes]] = {}  # content of pipes, by device and inode
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a small file (UTF-8).
+    """Return the text of a small UTF-8 file.
 
     Raises:
-        DataError: more than 64 MiB.
-        OSError, UnicodeDecodeError: it cannot be read, or is not text.
+        DataError: the file has more than 64 MiB.
+        OSError, UnicodeDecodeError: the file cannot be read, or is not text.
     """
     with open(seekable(path), "rb") as file:
         content = file.read(MAX_TEXT + 1)
@@ -40,7 +39,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 def is_stream(path: str | os.PathLike[str]) -> bool:
-    """Whether a path to write to is a pipe, a socket, a device or what is open already: nothing to be replaced."""
+    """Return whether an output path is a pipe, a socket, a device or an open file, which a rename must not replace."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -51,12 +50,12 @@ def is_stream(path: str | os.PathLike[str]) -> bool:
 
 
 def seekable(path: str | os.PathLike[str]) -> Path:
-    """The path itself, or for a pipe (``<(gunzip -c a.nii.gz)``, a FIFO) that of all that came through it, in memory.
+    """Return the path itself, or for a pipe (``<(gunzip -c a.nii.gz)``, a FIFO) that of its content in memory.
 
-    A pipe is read once, to its end, however often this is asked.
+    A pipe is read once, to its end, however often this is called.
 
     Raises:
-        DataError: it cannot be read, more came than the memory holds, or the system cannot keep it.
+        DataError: the pipe cannot be read, has more than fits in memory, or the system has no files in memory.
     """
     try:
         about = os.stat(path)
@@ -66,39 +65,39 @@ def seekable(path: str | os.PathLike[str]) -> Path:
         return Path(path)
     try:
         key = about.st_dev, about.st_ino
-        if key not in _taken_in:
-            _taken_in[key] = _taken(path)
+        if key not in _spooled:
+            _spooled[key] = _spool(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    return Path(f"/proc/self/fd/{_taken_in[key].fileno()}")
+    return Path(f"/proc/self/fd/{_spooled[key].fileno()}")
 
 
-def _taken(path: str | os.PathLike[str]) -> IO[bytes]:
-    """What comes through a pipe, in a file in memory."""
+def _spool(path: str | os.PathLike[str]) -> IO[bytes]:
+    """Copy the content of a pipe to a file in memory."""
     if not hasattr(os, "memfd_create") or not os.path.isdir("/proc/self/fd"):
-        raise DataError(f"{path}: is a pipe; expected a file: write what comes through it to one first")
+        raise DataError(f"{path}: is a pipe; expected a file: write its content to one first")
     kept = os.fdopen(os.memfd_create("pipe"), "w+b")
     with open(path, "rb", buffering=0) as stream:
-        came = 0
+        count = 0
         while chunk := stream.read(_CHUNK):
             free = free_memory()
             if free is not None and free < _SPARE:
                 kept.close()
                 raise DataError(
-                    f"{path}: {came} bytes came through this pipe, and the free memory is used up; write it to a file "
-                    "first: large files are read where they lie"
+                    f"{path}: the free memory is used up after {count} bytes of this pipe; write them to a file "
+                    "first: large files are read in blocks"
                 )
             kept.write(chunk)
-            came += len(chunk)
+            count += len(chunk)
     kept.flush()
     return kept
 
 
 def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
-    """The path as a `Path`, if a file may be written there, or a pipe or device is.
+    """Return the path as a `Path` if it can be written: a new file, a pipe or a device.
 
     Raises:
-        UsageError: it exists and ``overwrite`` is not set, is a folder, or its folder does not exist.
+        UsageError: the file exists and ``overwrite`` is not set, is a folder, or its folder does not exist.
     """
     target = Path(path)
     if is_stream(target):
@@ -112,11 +111,11 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
     return target
 
 
-def check_room(path: str | os.PathLike[str], need: int) -> None:
-    """See that the disk of ``path`` has room for ``need`` bytes.
+def check_disk_space(path: str | os.PathLike[str], need: int) -> None:
+    """Check that the disk of ``path`` has ``need`` bytes free.
 
     Raises:
-        DataError: it has not, in the system's own words for a full disk.
+        DataError: it has not; the message has the system's own words for a full disk.
     """
     folder = Path(path).parent
     if is_stream(path) or not hasattr(os, "statvfs"):
@@ -124,7 +123,7 @@ def check_room(path: str | os.PathLike[str], need: int) -> None:
     with suppress(OSError):
         disk = os.statvfs(folder)
         free = disk.f_bavail * disk.f_frsize
-        if disk.f_blocks and free < need:  # some file systems do not tell: they have no blocks
+        if disk.f_blocks and free < need:  # some file systems report no blocks
             raise DataError(
                 f"{path}: {os.strerror(errno.ENOSPC)}: needs {need} bytes, {free} are free in {folder}; make room, or "
                 "give a name on another disk"
@@ -133,13 +132,13 @@ def check_room(path: str | os.PathLike[str], need: int) -> None:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary name beside ``path`` to write to; rename it to ``path`` when the block ends well.
+    """Yield a temporary path beside ``path`` to write to, and rename it to ``path`` when the block succeeds.
 
-    The temporary keeps the suffix (libraries choose the format by it) and is removed on any error,
-    so that no partial file is left under either name. Pipes and devices get its content.
+    The temporary file keeps the suffix (libraries choose the format by it) and is removed on any error,
+    so that no partial file remains under either name. Its content is copied to pipes and devices.
 
     Raises:
-        UsageError: as `check_target`.
+        UsageError: see `check_target`.
         DataError: the operating system refuses (no permission, disk full).
     """
     target = check_target(path, overwrite)
@@ -167,29 +166,29 @@ def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Itera
 
 @contextmanager
 def claim(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold the right to write ``path`` within the block: of two runs to one name the second is told at once.
+    """Lock ``path`` for this run within the block, so that a second run with the same output fails at once.
 
-    A lock on ``.NAME.lock`` beside it, which the system lets go of however the run ends; file systems without locks,
-    and systems without `fcntl`, grant it to everyone.
+    The lock is on ``.NAME.lock`` beside it; the system releases it however the run ends. File systems without locks,
+    and systems without `fcntl`, grant it to every run.
 
     Raises:
-        UsageError: another process holds it.
+        UsageError: another process holds the lock.
     """
     target = Path(path)
     lock = target.with_name(f".{target.name[:200]}.lock")
-    held = None if is_stream(target) else _locked(lock, target)
+    held = None if is_stream(target) else _lock(lock, target)
     try:
         yield
     finally:
         if held is not None:
             with suppress(OSError):
-                lock.unlink(missing_ok=True)  # before it is let go of: whoever waits finds another file there
+                lock.unlink(missing_ok=True)  # before the release: a waiting run then finds another file
             _leftovers.discard(lock)
             held.close()
 
 
-def _locked(lock: Path, target: Path) -> IO[bytes] | None:
-    """The open lock file, locked; None where there are no locks."""
+def _lock(lock: Path, target: Path) -> IO[bytes] | None:
+    """Return the open, locked lock file; None where locks are not supported."""
     try:
         import fcntl
     except ImportError:
@@ -198,7 +197,7 @@ def _locked(lock: Path, target: Path) -> IO[bytes] | None:
         try:
             held = open(lock, "ab")  # noqa: SIM115 - the caller closes it
         except OSError:
-            return None  # what is wrong with the folder is said where the file is written
+            return None  # errors of the folder are reported where the file is written
         try:
             fcntl.lockf(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -207,7 +206,7 @@ def _locked(lock: Path, target: Path) -> IO[bytes] | None:
                 f"{target}: another run is at work on it; wait until that has ended, or give another name"
             ) from None
         except OSError as error:
-            if error.errno == errno.EACCES:  # as some systems say that it is held
+            if error.errno == errno.EACCES:  # on some systems: another process holds it
                 held.close()
                 raise UsageError(f"{target}: another run is at work on it; give another name") from None
             held.close()
@@ -218,15 +217,15 @@ def _locked(lock: Path, target: Path) -> IO[bytes] | None:
             if os.stat(lock).st_ino == os.fstat(held.fileno()).st_ino:
                 _leftovers.add(lock)
                 return held
-        held.close()  # the run that held it has ended and taken the file away
+        held.close()  # the run that held it has ended and removed the file
 
 
 @contextmanager
 def temporary_folder(target: str | os.PathLike[str]) -> Iterator[Path]:
-    """A hidden folder beside ``target``, for what it is put together of; gone after the block.
+    """Yield a hidden folder beside ``target`` for its pieces, and remove it after the block.
 
     Raises:
-        OSError: nothing can be written there.
+        OSError: the folder cannot be written.
     """
     place = Path(target)
     folder = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
@@ -239,7 +238,7 @@ def temporary_folder(target: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def discard_leftovers() -> None:
-    """Remove temporary files, folders and locks of this process: for those who end it without unwinding."""
+    """Remove temporary files, folders and locks of this process, for exits that do not unwind the stack."""
     for path in list(_leftovers):
         with suppress(OSError):
             if path.is_dir():

@@ -1,4 +1,4 @@
-"""What a run says on standard error: one line a stage, and bars where someone is watching."""
+"""Messages of a run on standard error: a line for each stage, and progress bars on a terminal."""
 
 from __future__ import annotations
 
@@ -12,31 +12,35 @@ from typing import Any, TextIO
 ProgressCallback = Callable[[int, int], None]
 _WIDTH = 24  # characters of a bar
 _INTERVAL = 0.1  # seconds between two drawings of a bar
-_LINES = 30.0  # seconds between two lines where nobody watches
+_LINES = 30.0  # seconds between two lines without a terminal
 
 
 class MessageStream:
-    """A text stream of messages that never fails: on a full disk or a closed pipe they are lost, the work is not."""
+    """A text stream that never fails: on a full disk or a closed pipe messages are lost, but no work."""
 
     def __init__(self, stream: TextIO) -> None:
+        """Wrap ``stream``."""
         self._stream = stream
 
     def write(self, text: str) -> int:
+        """Write text if possible, and return its length."""
         with suppress(OSError, ValueError):
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
+        """Flush the stream if possible."""
         with suppress(OSError, ValueError):
             self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
+        """Return other attributes of the stream."""
         return getattr(self._stream, name)
 
 
 @contextmanager
-def uninterrupted(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """A block in which interrupts are what they always are."""
+def uninterrupted(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Leave interrupts as they are within the block; the yielded function returns False."""
     yield lambda: False
 
 
@@ -48,27 +52,27 @@ class Console:
     """Messages on standard error; standard output is for data.
 
     Attributes:
-        quiet: say nothing (errors are printed by the command line itself).
-        stream: where to; standard error unless told otherwise.
-        interruption: given what says a line, a block within which a first interrupt makes its function return True; the
-            command line's, since handlers of signals are the program's and not a library's.
+        quiet: print nothing (errors are printed by the command line itself).
+        stream: destination, standard error by default.
+        interruption: takes a function that prints a line, and returns a context manager within which a first Ctrl-C
+            makes the yielded function return True; only the command line sets one, as libraries install no handlers.
     """
 
     quiet: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stderr)
     interruption: Interruption = uninterrupted
 
-    def say(self, line: str) -> None:
-        """Print one line: what separates lines in it (in the name of a file, say) becomes a blank."""
+    def message(self, line: str) -> None:
+        """Print one line; line breaks within it, such as those of a file name, become blanks."""
         if not self.quiet:
             print(" ".join(line.splitlines()), file=self.stream, flush=True)
 
     def stage(self, name: str, seconds: float, detail: str = "") -> None:
-        """Print a stage's line: name, wall seconds, and what there is to say about it."""
-        self.say(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
+        """Print the line of a stage: name, wall seconds and details."""
+        self.message(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
 
     def bar(self, label: str) -> ProgressCallback | None:
-        """A callback ``(done, total)`` that draws a bar, or where no terminal is says a line every half minute."""
+        """Return a callback ``(done, total)`` that draws a bar, or without a terminal prints a line at times."""
         if self.quiet:
             return None
         terminal = self.stream.isatty()
@@ -80,10 +84,10 @@ class Console:
             if not terminal:
                 if done < total and now - last >= _LINES:
                     last = now
-                    self.say(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
+                    self.message(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
                 return
             if done >= total:
-                self.stream.write("\r\x1b[K")  # the stage's line follows
+                self.stream.write("\r\x1b[K")  # the line of the stage follows
             elif now - last >= _INTERVAL:
                 last = now
                 filled = "#" * (_WIDTH * done // max(total, 1))

@@ -1,4 +1,4 @@
-"""What the process may have of the machine: memory and processors, as its job and its limits leave them."""
+"""Memory and processors that this process may use, within the limits of its job, cgroups and options."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _asked: int | None = None  # bytes that the whole process may take (`--memory`)
 
 
 def parse_size(text: str) -> int:
-    """Bytes of ``4G``, ``500M``, ``4GiB`` or a number; units are powers of 1024, as job schedulers count.
+    """Parse ``4G``, ``500M``, ``4GiB`` or a number to bytes; units are powers of 1024, as in job schedulers.
 
     Raises:
-        UsageError: anything else.
+        UsageError: the text is not a size.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:I?B)?\s*", text.upper())
     if match is None or float(match[1]) <= 0:
@@ -30,34 +30,37 @@ def parse_size(text: str) -> int:
 
 
 def set_memory(limit: int | None) -> None:
-    """Let the whole process count on ``limit`` bytes at most; None: on what the system leaves it."""
+    """Limit the memory of the whole process to ``limit`` bytes; None removes the limit."""
     global _asked
     _asked = limit
 
 
-def asked_memory() -> int | None:
-    """What `set_memory` was told."""
+def memory_limit() -> int | None:
+    """Return the limit of `set_memory`, bytes."""
     return _asked
 
 
 def free_memory() -> int | None:
-    """Bytes of memory that this process can still have, or None where the system does not say.
+    """Return the bytes of memory that this process can still allocate, None where the system does not report it.
 
-    The least of what the machine has free, what every cgroup (v1 and v2) above the process leaves, the process's own
-    limits (RLIMIT_AS, RLIMIT_DATA) less what it has of them, and `set_memory` less what it and its workers
-    hold.
+    This is the minimum of the free memory of the machine, of every cgroup (v1 and v2) above the process, of the limits
+    of the process (RLIMIT_AS, RLIMIT_DATA), and of `set_memory` less what the process and its workers hold.
     """
-    found = [*_machine(), *(room for room in map(_room, _groups("memory")) if room is not None), *_own_limits()]
+    found = [
+        *_machine(),
+        *(room for room in map(_free_in_group, _groups("memory")) if room is not None),
+        *_own_limits(),
+    ]
     if _asked is not None:
         from multiprocessing import active_children
 
-        others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # workers in wait
+        others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # idle workers
         found.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
     return max(min(found), 0) if found else None
 
 
 def processors() -> int:
-    """CPUs that this process may keep busy: those of its affinity, and no more than its cgroups' quotas allow."""
+    """Return the number of CPUs that affinity and cgroup quotas leave to this process."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for group in _groups("cpu"):
         quota = group.words("cpu.max") or [*group.words("cpu.cfs_quota_us"), *group.words("cpu.cfs_period_us")]
@@ -67,7 +70,7 @@ def processors() -> int:
 
 
 def _machine() -> list[int]:
-    """What the whole machine has free."""
+    """Return the free memory of the machine, bytes, in a list that is empty where it is unknown."""
     free = _table(PROC / "meminfo").get("MemAvailable")
     if free is not None:
         return [free]
@@ -93,7 +96,7 @@ def _status() -> dict[str, int]:
 
 
 def _table(path: Path) -> dict[str, int]:
-    """The lines ``Name: N kB`` of a file in bytes; empty where there is none."""
+    """Return the lines ``Name: N kB`` of a file, in bytes; empty without the file."""
     try:
         text = path.read_text("ascii", "replace")
     except OSError:
@@ -103,45 +106,45 @@ def _table(path: Path) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Group:
-    """A cgroup that the process is in, or one above it, by its folder."""
+    """A cgroup of the process, or an ancestor of it, by its folder."""
 
     folder: Path
 
     def words(self, name: str) -> list[str]:
-        """The words of one of its files; none where it has no such file."""
+        """Return the words of a file of the group; none without the file."""
         try:
             return (self.folder / name).read_text("ascii", "replace").split()
         except OSError:
             return []
 
     def number(self, *names: str) -> int | None:
-        """The number in the first of its files ``names`` that holds one."""
+        """Return the number in the first existing file of ``names``; None where it is not a number."""
         words = next(filter(None, map(self.words, names)), [""])
         return int(words[0]) if words[0].isdecimal() else None
 
     def counter(self, name: str) -> int:
-        """An entry of its memory.stat; 0 where it has none."""
+        """Return an entry of memory.stat, 0 without one."""
         words = self.words("memory.stat")
         return next((int(value) for key, value in zip(words[::2], words[1::2], strict=False) if key == name), 0)
 
 
-def _room(group: Group) -> int | None:
-    """Bytes that a cgroup leaves, None where it sets no limit; pages of files are given back when memory is short."""
+def _free_in_group(group: Group) -> int | None:
+    """Return the bytes that a cgroup leaves, None without a limit; cached files count as free."""
     limits = [group.number(name) for name in ("memory.max", "memory.high", "memory.limit_in_bytes")]
     known = [limit for limit in limits if limit is not None and limit < UNLIMITED]
     used = group.number("memory.current", "memory.usage_in_bytes")
     if not known or used is None:
         return None
-    total = "" if group.words("memory.current") else "total_"  # of v1, the groups within included
+    total = "" if group.words("memory.current") else "total_"  # in v1, with descendant groups
     files = sum(group.counter(f"{total}{kind}_file") for kind in ("active", "inactive"))
     return min(known) - max(used - files, 0)
 
 
 def _groups(controller: str) -> Iterator[Group]:
-    """The cgroups that the process is in, of v1 and v2, from its own up to where they are mounted.
+    """Yield the cgroups (v1 and v2) of the process, from its own up to the mount point.
 
-    Source: cgroups(7), proc_pid_cgroup(5), proc_pid_mountinfo(5). A container may see only its own part of the tree:
-    the mount's root tells which.
+    Source: cgroups(7), proc_pid_cgroup(5), proc_pid_mountinfo(5). A container may see only a subtree, whose root the
+    mount names.
     """
     try:
         own = (PROC / "self" / "cgroup").read_text("utf-8", "replace").splitlines()

@@ -1,4 +1,4 @@
-"""Cases of `vvgt check`: what is measured, the limit that it must keep, and what came of running it."""
+"""Cases of `vvgt check`: a measured figure, its limit, and the outcome."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Case:
-    """One case.
+    """A case.
 
     Attributes:
-        stage: part of the program, or of a file, that it is about.
-        name: the case in one line.
-        run: measures its figure; raises where something other than the figure is wrong.
+        stage: part of the program or of a file that it tests.
+        name: one line.
+        run: measures the figure; raises if anything else is wrong.
     """
 
     stage: str
@@ -43,7 +43,7 @@ class Outcome:
 
     Attributes:
         stage, name: of the case.
-        passed: the figure is within its limit and nothing was raised.
+        passed: whether the figure is within its limit and nothing was raised.
         what, value, limit: the figure; empty and None if there is none.
         problem: one line; empty if the case passed.
         seconds: wall time.

@@ -1,4 +1,4 @@
-"""Cases of one scene: views against the float64 twin, optical mass, a conversion from closed form to file."""
+"""Cases of one scene: views against the float64 twin, optical mass, and a conversion from closed form to file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FORM_BUDGET, FORM_SIZE = 1000, 64  # of the closed form whose mass is compared
 
 
 def scene_cases(scene: Scene, name: str = "") -> Iterator[Case]:
-    """Yield the cases of a scene; ``name`` ends theirs."""
+    """Yield the cases of a scene; ``name`` is appended to their names."""
     camera, of = default_views("check", size=16)[0], f", {name}" if name else ""
     twin = partial(compare_with_twin, scene, camera, 1 / 8, 2e-2, empty=True)
     yield Case("ray caster", f"16 x 16 pixels against the twin{of}", twin)
@@ -50,11 +50,11 @@ def compare_with_twin(
     """Measure the mean difference of a view from its float64 twin, relative to the twin's largest value.
 
     Args:
-        scene: is drawn by both.
+        scene: scene to draw.
         camera: of the view.
-        twin_step: of the twin, in the smallest voxel edge.
+        twin_step: sampling step of the twin, in the smallest voxel edge.
         limit: largest difference that passes.
-        empty: the view may be empty.
+        empty: whether the view may be empty.
     """
     image = render_view(scene, camera, FINE)
     require_valid(image)
@@ -110,7 +110,7 @@ def compare_levels(scene: Scene) -> Figure:
 
 
 def convert_scene(scene: Scene) -> Figure:
-    """Measure what is lost between closed form and file on views that nothing was fitted to: no stage may lose."""
+    """Measure the loss between closed form and file on views that nothing was fitted to; no stage may lose."""
     cameras, judges = (default_views(which, 4, size=SIZE) for which in ("train", "check"))
     views, reference = render_views(scene, cameras), render_views(scene, judges)
     start = initialise(scene, VbmOptions(BUDGET, SIZE))

@@ -1,4 +1,4 @@
-"""Cases of an installation: it compiles, draws, converts, writes what it reads, and agrees with the float64 twins."""
+"""Cases of an installation: kernels compile and agree with float64 twins, scenes convert, files can be read back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cases of a file of Gaussians by any program: its rows and values, its place in the volume, and the drawing order."""
+"""Cases of a file of Gaussians by any program: rows and values, place in the volume, and drawing order."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def finite_rows(columns: Splats) -> np.ndarray:
 
 
 def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:
-    """Yield cases of rows that no program can draw or that float32 is too coarse for; ``good`` is of `finite_rows`."""
+    """Yield cases of rows that cannot be drawn or that float32 rounds too coarsely; ``good``: from `finite_rows`."""
 
     def broken(name: str) -> Figure:
         rows = np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1)
@@ -58,7 +58,7 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
 
     Args:
         gaussians: in the unit frame if a volume is given.
-        edge: longest edge of the volume; None: that of most of the centres.
+        edge: longest edge of the volume; None: the extent of most of the centres.
         size: pixels of the screen.
     """
     sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
@@ -91,11 +91,11 @@ def _extent(gaussians: Gaussians, sigma: np.ndarray) -> float:
 def place_cases(
     gaussians: Gaussians, world: Gaussians, half: np.ndarray, seen: list[np.ndarray], rule: Rule = INRIA
 ) -> Iterator[Case]:
-    """Yield cases of the place and the orientation of Gaussians in the volume's box.
+    """Yield cases of the position and orientation of Gaussians in the volume's box.
 
     Args:
         gaussians: in the box frame.
-        world: the same if the numbers of the file are taken as world coordinates.
+        world: the same with the numbers of the file taken as world coordinates.
         half: half edges of the box, (3,).
         seen: views of the volume by `orientation_cameras`, (h, w, 4) float32 each.
         rule: to draw by at that size.
@@ -107,7 +107,7 @@ def place_cases(
 
     def outside() -> Figure:
         found, other = share(gaussians), share(world)
-        hint = f" ({other:.2g} of it, taken as world coordinates)" if other < found / 10 else ""
+        hint = f" ({other:.2g} if read as world coordinates)" if other < found / 10 else ""
         return Figure(f"share of the opacity{hint}", found, 0.002)
 
     def turned() -> Figure:
@@ -118,14 +118,14 @@ def place_cases(
         own, best = error["x y z"], min(error, key=lambda name: error[name])
         gain = 10 * np.log10((own + 1e-12) / (error[best] + 1e-12))
         hint = "" if best == "x y z" else f" with axes {best}{', a mirror image' if is_mirror(best) else ''}"
-        return Figure(f"dB that it looks more like the volume{hint}", float(gain), 1.0)
+        return Figure(f"dB closer to the volume{hint}", float(gain), 1.0)
 
     yield Case("place", "centres outside the volume's box", outside)
-    yield Case("place", "the other way round", turned)
+    yield Case("place", "axes swapped or mirrored", turned)
 
 
 def orientation_cameras() -> list[Camera]:
-    """Return the cameras by whose views orientations are compared."""
+    """Return the cameras whose views decide the orientation."""
     cameras = default_views("check", size=ORIENTATION_SIZE)
     return [cameras[i] for i in (0, 1, 2)]
 
@@ -144,7 +144,7 @@ def is_mirror(name: str) -> bool:
 
 
 def order_cases(gaussians: Gaussians, camera: Camera) -> Iterator[Case]:
-    """Yield cases of the drawing order and of how much there is to draw; ``gaussians`` are in the box frame."""
+    """Yield cases of the drawing order and the amount to draw; ``gaussians`` are in the box frame."""
 
     def order() -> Figure:
         far = project(gaussians, camera, by_distance=True)

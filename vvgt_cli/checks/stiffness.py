@@ -52,7 +52,7 @@ class _Ranges:
             width *= 2
 
     def change(self, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (maximum - minimum, maximum) over nodes ``first`` to ``last``, inclusive, arrays of one shape."""
+        """Return maximum - minimum and maximum over nodes ``first`` to ``last``, inclusive, arrays of one shape."""
         level = np.frexp(last - first + 1)[1] - 1  # floor of log2
         low, high = np.empty(first.shape), np.empty(first.shape)
         for n in np.unique(level):

@@ -1,1 +1,1 @@
-"""The command line: parses, calls, prints. Nothing here imports numpy before a command runs."""
+"""Command line: parses, calls, prints; imports numpy only when a command runs."""

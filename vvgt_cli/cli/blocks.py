@@ -1,4 +1,4 @@
-"""Options of what goes through a volume in blocks."""
+"""Options of commands that process a volume in blocks."""
 
 from __future__ import annotations
 
@@ -69,20 +69,20 @@ shared_block_options = group("blocks", **_options, **_shard_option)
 ONE = ("workers",)  # options that are 1 where they are not given
 
 
-def asked_for(blocks: dict[str, Any]) -> bool:
-    """Whether any of the options is given."""
+def any_given(blocks: dict[str, Any]) -> bool:
+    """Return whether any of the options is given."""
     return any(value is not None and (key not in ONE or value > 1) for key, value in blocks.items())
 
 
-def chosen(blocks: dict[str, Any]) -> BlockOptions | None:
-    """What the options add up to; None: the program chooses.
+def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
+    """Return the options of blocks, None to let the program choose.
 
     Raises:
-        UsageError: options that do not fit.
+        UsageError: options that do not fit together.
     """
     from vvgt_cli.field.settings import BlockOptions
 
-    if not asked_for(blocks):
+    if not any_given(blocks):
         return None
     size = blocks.pop("block_size")
     return BlockOptions(**{**blocks, "size": None if size == "auto" else size})

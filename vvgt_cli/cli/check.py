@@ -32,15 +32,14 @@ def command(
 ) -> None:
     """Test this installation and print a table; exit status 1 if a case fails.
 
-    Kernels are compiled if they are not yet, renderer, splatter and gradients compared with float64 twins, three tiny
-    volumes converted, and every format written and read. Takes some seconds, a minute or two the first time.
+    Compiles missing kernels, compares renderer, splatter and gradients with float64 twins, converts three tiny volumes,
+    and writes and reads every format. Takes some seconds, a minute or two the first time.
 
     With VOLUME, examines that scene: four cases, its stiffness, and the sampling step that its views need.
 
-    With GAUSSIANS (.ply, .spz, .sog, .glb, ... by any program), examines that file: its values, and with --volume and
-    its look place, orientation, errors of pictures, differences between viewers, and texture.
+    With GAUSSIANS (.ply, .spz, .sog, .glb, ... by any program), examines that file: its values; with --volume and
+    its look also position, orientation, errors of pictures, differences between viewers, and texture.
 
-    \b
     Examples:
       vvgt check
       vvgt check head.nrrd --tf bone.json --tolerance 0.001

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, chosen
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import (
     common_options,
@@ -45,7 +45,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option(
     "--live", is_flag=True,
-    help="Let the Gaussians carry the values under them, so that 'vvgt recolor' can show them under any function.",
+    help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function.",
 )  # fmt: skip
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @ply_options
@@ -79,11 +79,10 @@ def command(
     OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb or .usdc.
     FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
-    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a place for the number, such
-    as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
-    .html without a place makes one page of all frames, functions or labels.
+    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a placeholder for the number,
+    such as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
+    .html without a placeholder makes one page of all frames, functions or labels.
 
-    \b
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
@@ -103,8 +102,8 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    said = command_line(click.get_current_context(), ASIDE, folders=False)
-    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live, command=said)
+    line = command_line(click.get_current_context(), ASIDE, folders=False)
+    request = replace(convert_request(volume, **options), blocks=block_options_of(blocks), live=live, command=line)
     plan = convert_files(
         request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console
     )  # fmt: skip

@@ -22,7 +22,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @click.option(
-    "--no-seats", "seats", is_flag=True, default=True, flag_value=False,
+    "--no-conditions", "conditions", is_flag=True, default=True, flag_value=False,
     help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
 )  # fmt: skip
 @click.option(
@@ -43,25 +43,24 @@ from vvgt_cli.progress import Console
 def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
-    OUT.ply may be FOLDER of streamed levels: its finest, or FOLDER#1 for level 1.
+    OUT.ply may be a FOLDER of streamed levels, scored at the finest level; FOLDER#1 is level 1.
 
     Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
     (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures
-    above 565 px are scored on a sample of blocks. A .ply of 'vvgt convert --live' is scored as it is under --tf.
+    above 565 px are scored on a sample of blocks. A .ply of 'vvgt convert --live' is scored under --tf.
 
     The reference is ray-cast with steps of 1/8 voxel and up to 9 rays per pixel; its own error is printed too. Size,
     viewer, light and opacity unit distance are those recorded in the file unless given.
 
-    \b
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    from vvgt_cli.cli.blocks import chosen
+    from vvgt_cli.cli.blocks import block_options_of
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"], options["light"])
-    names = ("size", "rule", "step", "seats", "preview", "overwrite")
+    names = ("size", "rule", "step", "conditions", "preview", "overwrite")
     asked = {name: options[name] for name in names}
-    evaluation = evaluate(EvaluateRequest(ply, source, blocks=chosen(blocks), **asked), console)
+    evaluation = evaluate(EvaluateRequest(ply, source, blocks=block_options_of(blocks), **asked), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

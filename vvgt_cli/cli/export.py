@@ -23,7 +23,6 @@ def command(checkpoint: str, output: str, storage: str, overwrite: bool, console
     Before the folder is created, onnxruntime is compared with torch on random scenes; the largest difference is
     recorded in the card. Requires torch, onnx and onnxscript: install vvgt[train].
 
-    \b
     Example:
       vvgt export run/best.pt -o models/small --storage float16
     """

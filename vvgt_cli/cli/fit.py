@@ -1,4 +1,4 @@
-"""Options of the commands that make Gaussians, and the request that they add up to."""
+"""Options of the commands that make Gaussians, and the request that they make."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.ga
 
 
 def rule_option(help: str, default: str | None = None) -> Callable[[Any], Any]:
-    """``--rule``."""
+    """Return the option ``--rule``."""
     return click.option(
         "--rule", type=click.Choice(RULES), default=default, show_default=default is not None, help=help
     )
@@ -87,7 +87,7 @@ ply_options = group(
 def source_request(
     volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
 ) -> SourceRequest:
-    """What the shared options of `options.py` add up to."""
+    """Return the source that the shared options of `options.py` describe."""
     from vvgt_cli.field.source import SourceRequest, parse_layer
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
@@ -118,7 +118,7 @@ def convert_request(
     checkpoint: str | None = None,
     device: str = "cpu",
 ) -> ConvertRequest:
-    """The request that the options of `convert` and `init` add up to."""
+    """Return the request that the options of `convert` and `init` describe."""
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
     from vvgt_cli.gaussians import PlyOptions
 

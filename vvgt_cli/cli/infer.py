@@ -29,7 +29,6 @@ def command(
     The network reads a fixed number of training views, chosen far apart. Up to four other views judge the result: if
     their PSNR does not rise, the Gaussians of IN.ply are written unchanged and a message says so. IN.ply may be "-".
 
-    \b
     Example:
       vvgt render-views head.nrrd --tf bone.json -o views
       vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model small -o head.ply

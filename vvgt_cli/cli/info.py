@@ -31,10 +31,10 @@ def command(
     file: str | None, machine: bool, as_json: bool, tf: str | None, layers: tuple[str, ...], tf_range: str,
     opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
 ) -> None:  # fmt: skip
-    """Describe FILE, whose type is detected from its content: a volume, a transfer function, a label table, a view set
-    (transforms.json), a .ply of Gaussians, or the index of several.
+    """Describe FILE: a volume, transfer function, label table, view set, .ply of Gaussians, or index of several.
 
-    \b
+    The type is detected from the content. A view set is a transforms.json.
+
     Examples:
       vvgt info example:frog
       vvgt info frog.ply --json | jq .gaussians
@@ -69,7 +69,7 @@ def command(
 
 
 def _text(value: object) -> str:
-    """A value as a line shows it."""
+    """Return a value as one line shows it."""
     if isinstance(value, list):
         return " ".join(map(_text, value)) if value else "-"
     if isinstance(value, dict):

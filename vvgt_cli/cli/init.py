@@ -37,17 +37,16 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     Volumes larger than memory are processed in blocks, automatically or as set by --blocks, --workers, --scheduler
     and --shard. The output does not depend on the partition.
 
-    \b
     Examples:
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
       vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G
     """
-    from vvgt_cli.cli.blocks import chosen
+    from vvgt_cli.cli.blocks import block_options_of
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
-    from vvgt_cli.conversion.shards.run import init_in_blocks, streams
+    from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
     from vvgt_cli.field.open import automatic
 
     request = convert_request(volume, **options)
-    request = replace(request, blocks=chosen(blocks) or automatic(request.source, console))
-    (init_in_blocks if streams(request) else initialise_only)(request, console)
+    request = replace(request, blocks=block_options_of(blocks) or automatic(request.source, console))
+    (init_in_blocks if writes_streaming(request) else initialise_only)(request, console)

@@ -1,4 +1,4 @@
-"""`vvgt`: the group of commands, and the one place where errors become a line and an exit status."""
+"""`vvgt`: the group of commands, which turns every error into one line and an exit status."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, heard, open_streams
+from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.version import VERSION
 
@@ -48,12 +48,14 @@ DEBUG = "VVGT_TRACEBACK"
 
 
 class LazyGroup(click.Group):
-    """Imports a subcommand's module when it is asked for."""
+    """A group that imports a subcommand's module when it is needed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import and return a command, None if there is none of this name."""
         if cmd_name not in COMMANDS:
             return None
         result: click.Command = importlib.import_module(COMMANDS[cmd_name]).command
@@ -62,6 +64,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command of a command line; suggest similar names for an unknown one."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-"):
             near = get_close_matches(name, COMMANDS)
@@ -83,7 +86,7 @@ def cli() -> None:
 
 def _fail(message: str, code: int) -> int:
     if not first_of_group():
-        time.sleep(ALONE)  # what ends all processes is told by the first; torchrun ends the others meanwhile
+        time.sleep(ALONE)  # the first process reports what ends all; torchrun ends the others meanwhile
     print(f"vvgt: error: {' '.join(message.split())}", file=sys.stderr)
     return code
 
@@ -96,7 +99,7 @@ def _note(
     file: object = None,
     line: object = None,
 ) -> None:
-    """A warning as one line (`warnings.showwarning`)."""
+    """Print a warning as one line (replaces `warnings.showwarning`)."""
     print(f"vvgt: note: {' '.join(str(message).split())}", file=sys.stderr)
 
 
@@ -116,7 +119,7 @@ def _os_error(error: OSError) -> str:
 
 
 def _stdout_fails() -> bool:
-    """Whether what was printed cannot be written; the interpreter is kept from trying again at exit."""
+    """Return whether standard output cannot be written; keep the interpreter from trying again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -127,7 +130,7 @@ def _stdout_fails() -> bool:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
-    heard.clear()
+    received.clear()
     try:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
         with cli.make_context("vvgt", expand(sys.argv[1:] if args is None else args)) as context:
@@ -137,11 +140,11 @@ def run(args: Sequence[str] | None = None) -> int:
     except BaseException as error:
         if os.environ.get(DEBUG):
             traceback.print_exc()
-        return _status(_ended(heard[0]) if heard else error)
+        return _status(_ended(received[0]) if received else error)
 
 
 def _ended(number: int) -> BaseException:
-    """What a signal raises, whatever a kernel that was being called has made of it."""
+    """Return the exception of a signal, whatever a running kernel turned it into."""
     return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
 
@@ -172,7 +175,7 @@ def _status(error: BaseException) -> int:
 
 
 def main() -> None:
-    """Entry point of the `vvgt` command."""
+    """Run the `vvgt` command and exit."""
     open_streams()
     end_on_signals()
     warnings.showwarning = _note

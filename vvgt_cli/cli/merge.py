@@ -21,7 +21,6 @@ def command(folder: str, output: str, overwrite: bool, console: Console) -> None
 
     The volume is no longer needed. FOLDER is left unchanged.
 
-    \b
     Example:
       vvgt merge huge.blocks -o huge.ply
       vvgt merge huge.blocks -o huge/lod-meta.json

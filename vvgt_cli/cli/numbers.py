@@ -1,4 +1,4 @@
-"""Options of several numbers as people write them: ``64 64 93``, ``64,64,93`` or ``64x64x93``."""
+"""Options with several numbers in the forms people write: ``64 64 93``, ``64,64,93`` or ``64x64x93``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LONGEST = 5  # words: 64 x 64 x 93
 
 
 def expand(args: Sequence[str]) -> list[str]:
-    """A command line as the options are declared: three words for `THREES`, one, ``LO,HI``, for `RANGE`.
+    """Return a command line in the declared form: three words for `THREES`, one word ``LO,HI`` for `RANGE`.
 
     Args:
-        args: words of a command line; those after ``--`` stay as they are.
+        args: words of a command line; those after ``--`` are not changed.
 
     Raises:
         UsageError: an option of `THREES` without three numbers.
@@ -51,7 +51,7 @@ def expand(args: Sequence[str]) -> list[str]:
 
 
 def _numbers(words: list[str], count: int) -> tuple[int, list[str]]:
-    """How many words hold ``count`` numbers, and these; (0, []) where the words are something else."""
+    """Return how many words hold ``count`` numbers, and the numbers; (0, []) if the words are something else."""
     found: list[str] = []
     for taken, word in enumerate(words[:_LONGEST], 1):
         parts = [part.strip() for part in _BETWEEN.split(word)]

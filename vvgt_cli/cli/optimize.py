@@ -62,7 +62,6 @@ def command(
     on the check views is written, never worse than IN.ply. If the folder has no check views, every 8th training view
     is used instead. Ctrl-C ends the descent early and writes the result.
 
-    \b
     Examples:
       vvgt render-views head.nrrd --tf bone.json -o views
       vvgt optimize head.ply --views views --steps 200 -o better.ply

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -20,10 +21,10 @@ THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK
 
 
 def group(name: str, **options: Decorator) -> Decorator:
-    """Several options as one keyword argument, a dict by option name.
+    """Bundle several options into one keyword argument, a dict by option name.
 
-    Keeps commands from carrying a dozen parameters: ``group("read", dims=click.option(...))`` calls the
-    command with ``read={"dims": ...}``.
+    Commands keep few parameters: ``group("read", dims=click.option(...))`` calls the command with
+    ``read={"dims": ...}``.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -107,7 +108,7 @@ LABELS = dict(
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",
-        help="Add another volume in its place in the world, with its own tf, labels, distance, array, component "
+        help="Add another volume, placed by its own coordinates, with its own tf, labels, distance, array, component "
         "(channel) or time. Repeatable.",
     ),
 )  # fmt: skip
@@ -165,7 +166,7 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite exi
 
 
 def default_threads() -> int:
-    """Threads without `--threads`: the first of `THREAD_VARIABLES` that holds a number, else the CPUs free to us."""
+    """Return the threads without `--threads`: the first number in `THREAD_VARIABLES`, else the CPUs we may use."""
     for variable in THREAD_VARIABLES:
         value = os.environ.get(variable, "").split(",")[0].strip()
         if value.isascii() and value.isdecimal() and int(value) > 0:
@@ -174,7 +175,7 @@ def default_threads() -> int:
 
 
 def set_threads(count: int) -> None:
-    """Let the kernels run on ``count`` threads; before numba is imported where that is still possible."""
+    """Run the kernels on ``count`` threads; set before numba is imported if that is still possible."""
     if "numba" in sys.modules:
         import numba
 
@@ -209,7 +210,7 @@ def _memory(ctx: click.Context, param: click.Parameter, value: str | None) -> No
 
 
 def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--threads``, ``--memory`` and ``--quiet``; the command gets a ``console``."""
+    """Add ``--threads``, ``--memory`` and ``--quiet``; call the command with a ``console``."""
 
     @click.option(
         "--threads",
@@ -234,4 +235,6 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 warnings.simplefilter("ignore")  # they are notes on standard error
             return function(*args, console=Console(quiet, interruption=interruption), **kwargs)
 
+    # click wraps a paragraph's lines unless it begins with \b
+    wrapper.__doc__ = re.sub(r"\n( *)(Examples?:\n)", "\n\\1\b\n\\1\\2", function.__doc__ or "")
     return wrapper

@@ -1,4 +1,4 @@
-"""What the process has of the system: its three streams, whatever they are, and an end within seconds when asked."""
+"""Standard streams and signals of the process: streams that may be closed, and an exit within seconds of a signal."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from vvgt_cli.progress import MessageStream
 
 GRACE = 0.5  # seconds to end as an exception does, after which the process ends as it is
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-heard: list[int] = []  # signals that have ended the present run; what is raised after one is its doing
+received: list[int] = []  # signals that ended the current run; later exceptions are their effect
 
 
 def open_streams() -> None:
-    """Put something where standard input, output or error are closed, and let talk fail unheard.
+    """Replace closed standard streams, and ignore failures to write messages.
 
-    Otherwise the next file that is opened would get their numbers, and what libraries print would end in it. Writing
-    to a standard output that is closed fails, as it must.
+    Otherwise the next opened file would get a standard stream's number, and printed text would end up in it. Writing to
+    a closed standard output still fails.
     """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
@@ -38,13 +38,14 @@ def open_streams() -> None:
 
 
 def end_on_signals() -> None:
-    """Let SIGTERM, SIGINT and SIGHUP (unless it is ignored, as under nohup) end the process as an exception does.
+    """Make SIGTERM, SIGINT and SIGHUP (unless ignored, as under nohup) end the process like an exception.
 
-    A compiled kernel that is being called at that moment turns the exception into another, so the signal is noted in
-    `heard` as well, and `vvgt_cli.cli.main.run` goes by that.
-    Python runs handlers between two steps of its own, so that one second in a kernel would go by unanswered, or
-    twenty. So another thread listens too: what has not ended after `GRACE` seconds ends without unwinding, its
-    temporary files removed. Where somebody else has taken a signal over (training does), it is theirs.
+    A compiled kernel that is running may replace the exception, so the signal is also recorded in `received`, which
+    `vvgt_cli.cli.main.run` reads.
+
+    Python runs signal handlers between its own instructions, so a long kernel would delay them. A second thread
+    therefore ends a process that has not ended after `GRACE` seconds, without unwinding but without temporary files
+    left. Signals that other code handles (training does) are left to it.
     """
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -59,13 +60,13 @@ def end_on_signals() -> None:
 
 
 def ended_by(status: int) -> str | None:
-    """Name of the signal that an exit status stands for, None where it is another's."""
+    """Return the name of the signal that an exit status stands for, None for other statuses."""
     return next((signal.Signals(number).name for number in ENDING if status == 128 + number), None)
 
 
 @contextmanager
-def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Within the block a first interrupt (Ctrl-C) only makes the given function return True; a second one ends all."""
+def interruption(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Make the first interrupt (Ctrl-C) in the block only set the yielded function's result; a second one raises."""
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stopped.is_set  # handlers belong to the main thread
@@ -74,7 +75,7 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: object) -> None:
         stopped.set()
         signal.signal(signal.SIGINT, before)
-        say("interrupted: what there is will be written; once more to leave without")
+        message("interrupted: saving the result so far; press Ctrl-C again to quit without saving")
 
     before = signal.signal(signal.SIGINT, note)
     try:
@@ -85,34 +86,34 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def ending() -> Iterator[list[int]]:
-    """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
-    told: list[int] = []
+    """Yield a list that receives the number of a signal to end, so that the current step can finish and be saved."""
+    caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield told  # handlers belong to the main thread
+        yield caught  # handlers belong to the main thread
         return
     names = ("SIGTERM", "SIGINT", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
-    before = [signal.signal(number, lambda n, frame: told.append(n)) for number in numbers]
+    before = [signal.signal(number, lambda n, frame: caught.append(n)) for number in numbers]
     try:
-        yield told
+        yield caught
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 
 
 def first_of_group() -> bool:
-    """Whether this process is the one that talks, of those that `torchrun` has started; alone it is."""
+    """Return whether this process prints for those that `torchrun` started; true for a single process."""
     return os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
 
 
 def _end(number: int, frame: object) -> None:
-    heard.append(number)
+    received.append(number)
     sys.exit(128 + number)
 
 
 def _interrupt(number: int, frame: object) -> None:
-    heard.append(number)
+    received.append(number)
     raise KeyboardInterrupt
 
 
@@ -121,10 +122,10 @@ def _listen(reader: int) -> None:
         for number in numbers:
             if number in ENDING and signal.getsignal(number) is _end:
                 time.sleep(GRACE)
-                _leave(number)
+                _exit_now(number)
 
 
-def _leave(number: int) -> None:
+def _exit_now(number: int) -> None:
     discard_leftovers()
     if first_of_group():
         with suppress(OSError):

@@ -21,7 +21,7 @@ from vvgt_cli.progress import Console
 @click.argument("ply", metavar="LIVE.ply")
 @click.option(
     "--tf", metavar="TF",
-    help="Transfer function: a file or the name of a matplotlib colour map. Default: the one that the file has.",
+    help="Transfer function: a file or the name of a matplotlib colour map. Default: the file's own.",
 )  # fmt: skip
 @click.option(
     "-o", "--output", required=True, metavar="OUT.ply",
@@ -29,7 +29,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option(
     "--labels", metavar="TABLE|auto",
-    help="Table of labels, for a file of a label map; opacity 0 hides one. Default: the one that the file has.",
+    help="Table of labels, for a file of a label map; opacity 0 hides a label. Default: the file's own.",
 )  # fmt: skip
 @layer_looks_option
 @tf_range_option
@@ -41,12 +41,10 @@ def command(
     ply: str, tf: str | None, labels: str | None, layers: tuple[str, ...], output: str, tf_range: str,
     opacity_unit_distance: str | None, light: dict[str, Any], overwrite: bool, console: Console,
 ) -> None:  # fmt: skip
-    """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF (of a label map: under
-    TABLE) and a light, as an ordinary file.
+    """Write LIVE.ply, made by 'vvgt convert --live', as an ordinary file under another function, table or light.
 
-    The volume is not needed. Gaussians that TF hides are left out. LIVE.ply may be "-".
+    The volume is not needed. Gaussians that TF hides are omitted. LIVE.ply may be "-".
 
-    \b
     Examples:
       vvgt recolor head-live.ply --tf bone.json -o bone.ply
       vvgt recolor head-live.ply --tf skin.json --light headlight -o skin.html

@@ -75,7 +75,6 @@ def command(
     or FOLDER of streamed levels: FOLDER#1 is its level 1, FOLDER#view what viewers show each camera.
     A .ply of 'vvgt convert --live' can be shown under any function (--tf) and light (--light).
 
-    \b
     Examples:
       vvgt render frog.ply --orbit 36 --size 800 -o turn
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, chosen
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
     LABELS,
@@ -135,7 +135,6 @@ def command(
     (Blender style), a COLMAP model, an initial point cloud and a contact sheet. Several --tf get DIR/NAME each.
     Running the same command again renders only what is missing or damaged.
 
-    \b
     Examples:
       vvgt render-views head.nrrd --tf bone.json -o views
       vvgt render-views head.nrrd --tf bone.json --tf skin.json -o views --views 36 --size 800
@@ -147,10 +146,10 @@ def command(
     from vvgt_cli.errors import UsageError
 
     if layout["half"] and layout["format"] == "png":
-        raise UsageError("--half applies to EXR, which --format png does not write; leave out one of the two")
+        raise UsageError("--half applies to EXR, which --format png does not write; give only one of the two")
     source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
-        shard=parse_shard(shard), overwrite=overwrite, blocks=chosen(blocks), device=device, **rays,
+        shard=parse_shard(shard), overwrite=overwrite, blocks=block_options_of(blocks), device=device, **rays,
     )  # fmt: skip
     render_view_sets(request, console)

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, chosen
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import command_line, typed
@@ -14,7 +14,7 @@ from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
-OF_BOTH = {"paths", "compare", "output", "overwrite", "threads", "quiet"}  # parameters that --compare takes too
+COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "quiet"}
 
 
 @click.command("report", cls=SectionedCommand, short_help="Plot error against run time, as an HTML page and tables.")
@@ -67,7 +67,6 @@ def command(
     separately, including its views, and scored on the same ten test views. DIR gets report.html (one file, works
     offline), report.json, report.csv and four PNG plots.
 
-    \b
     Examples:
       vvgt report head.nrrd --tf bone.json -o head-report
       vvgt report example:frog --size 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report
@@ -77,19 +76,19 @@ def command(
     from vvgt_cli.commands import report as pipeline
 
     if compare:
-        other = [p.opts[-1] for p in typed(ctx) if p.name not in OF_BOTH]
+        other = [p.opts[-1] for p in typed(ctx) if p.name not in COMPARE_PARAMETERS]
         if other:
             raise UsageError(f"{', '.join(other)}: not with --compare, which only overlays reports")
         pipeline.compare(paths, output, options["overwrite"], console)
         return
     if len(paths) != 1:
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
-    ladder = pipeline.LadderOptions(
+    runs = pipeline.RunOptions(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
-        chosen(options["blocks"]), peers=tuple(pipeline.Peer.of(text) for text in options["peers"]),
+        block_options_of(options["blocks"]), peers=tuple(pipeline.Peer.of(text) for text in options["peers"]),
     )  # fmt: skip
     source = source_request(paths[0], options["read"], options["optics"], options["light"])
     request = pipeline.ReportRequest(
-        source, output, ladder, options["picture_size"], options["overwrite"], command_line(ctx)
+        source, output, runs, options["picture_size"], options["overwrite"], command_line(ctx)
     )
     pipeline.report(request, console)

@@ -1,4 +1,4 @@
-"""`--help` in sections: the options most people need first, the others by what they are about."""
+"""Sections of `--help`: the options most people need first, the others by subject."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ SECTIONS = {  # parameters by name, in the order shown; all others come first, u
     "Input": "dims dtype byte_order header_bytes spacing space array component time crop mask",
     "Look": "tf_range opacity_unit_distance labels layers ambient diffuse specular specular_power occlusion",
     "Quality": "steps init model rule seed renderer samples step",
-    "Output": "frame up sh_degree comments split_labels format half background points report seats",
+    "Output": "frame up sh_degree comments split_labels format half background points report conditions",
     "Running": "device checkpoint shard block_size workers scheduler level threads memory quiet",
 }
 
@@ -17,6 +17,7 @@ class SectionedCommand(click.Command):
     """A command whose ``--help`` lists its options under the headings of `SECTIONS`."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options under their headings."""
         options = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
         rows = {option.name: row for option in options if (row := option.get_help_record(ctx))}
         sections = {

@@ -41,7 +41,6 @@ def command(
     scales), wells (smooth bumps, like molecular potentials), bodies (shells with vessels, metal and noise). Turbulence
     takes about a minute per turnover at 64 on one core, sixteen times as long at 128.
 
-    \b
     Example:
       vvgt synth tubes --seed 3 -o tubes.nrrd
       vvgt convert tubes.nrrd -o tubes.ply

@@ -28,7 +28,6 @@ def show(
 ) -> None:
     """Draw the colours and opacity of TF, over the histogram of --volume if given.
 
-    \b
     Example:
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
@@ -53,7 +52,6 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
 
     Features that the format cannot store are an error. OUT may be - for standard output.
 
-    \b
     Examples:
       vvgt tf convert CT-Bone.vp bone.json
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
@@ -66,9 +64,8 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
 @command.command("list", short_help="List the named functions.")
 @common_options
 def list_named(console: Console) -> None:
-    """Print the names of the functions that --tf and 'vvgt tf' take besides files and colour maps, and what each shows.
+    """Print the names of the built-in functions, which --tf and 'vvgt tf' accept, and what each shows.
 
-    \b
     Examples:
       vvgt tf list
       vvgt tf convert ct-bone mine.json
@@ -101,7 +98,6 @@ def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwri
     The background is excluded and the remaining values are divided evenly, half by value and half by number of
     voxels. The files are minimal JSON, ready to use or edit; their paths are printed.
 
-    \b
     Example:
       vvgt tf suggest head.nrrd -n 10 -o bands
     """

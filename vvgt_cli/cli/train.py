@@ -31,7 +31,6 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     use several processes: torchrun --nproc-per-node N -m vvgt_cli.cli.main train ... Requires torch and PyYAML:
     install vvgt[train].
 
-    \b
     Example:
       mkdir -p data/train data/held
       vvgt synth shells --seed 1 -o data/train/shells_1.nrrd

@@ -1,4 +1,4 @@
-"""What was typed on the command line."""
+"""Arguments typed on the command line."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("threads", "memory", "workers", "scheduler", "block_size"),
 }
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
-_IN_PARTS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
-_PART = re.compile(r"\d+/\d+")  # of a job array: no folder
+_LAYER_FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
+_SHARD = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
 def typed(ctx: click.Context) -> list[click.Parameter]:
-    """Parameters that were given on the command line."""
+    """Return the parameters given on the command line."""
     return [p for p in ctx.command.params if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE]
 
 
 def command_line(ctx: click.Context, without: Collection[str] = (), folders: bool = True) -> str:
-    """The call, arguments first; without ``--threads``, which reports record by themselves.
+    """Return the call, arguments first, without ``--threads``, which reports record separately.
 
     Args:
-        ctx: of the call.
-        without: names of parameters that are left out.
-        folders: paths as they were given; False: names alone.
+        ctx: context of the call.
+        without: names of parameters to omit.
+        folders: whether paths keep their folders.
     """
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):
         value = ctx.params.get(parameter.name or "")
-        before = None if folders else _IN_PARTS if parameter.name == "layers" else _FOLDERS
-        values = [_told(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
+        before = None if folders else _LAYER_FOLDERS if parameter.name == "layers" else _FOLDERS
+        values = [_without_folders(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
         if parameter.name in without:
             continue
         if isinstance(parameter, click.Argument):
@@ -47,5 +47,5 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     return shlex.join(words)
 
 
-def _told(value: str, folders: re.Pattern[str] | None) -> str:
-    return value if folders is None or _PART.fullmatch(value) else folders.sub("", value)
+def _without_folders(value: str, folders: re.Pattern[str] | None) -> str:
+    return value if folders is None or _SHARD.fullmatch(value) else folders.sub("", value)

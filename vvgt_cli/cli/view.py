@@ -44,20 +44,19 @@ def command(
 ) -> None:
     """Show FILE in a browser: Gaussians in any supported format, or a volume.
 
-    A volume is shown live within seconds: its transfer function can be changed in the page, for which the volume is
-    then converted in the background.
+    A volume appears within seconds. If its transfer function is changed in the page, the volume is converted for it in
+    the background.
 
     A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
-    address is printed; Ctrl-C ends it. Several files, a glob or the index that convert writes beside several form a
-    series with a slider.
+    address is printed; Ctrl-C stops the server. Several files, a glob, or an index written by convert form a series
+    with a slider.
 
-    A folder with a lod-meta.json is streamed: what is near is loaded finely, what is far coarsely. FOLDER#1
-    is level 1 alone.
+    A folder with a lod-meta.json is streamed: near parts load in fine detail, far ones coarsely. FOLDER#1 is level 1
+    alone.
 
     With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
     .sog, .glb and .usdc are for other programs. The loss due to the format is printed.
 
-    \b
     Examples:
       vvgt view frog.ply
       vvgt view example:frog
@@ -71,7 +70,7 @@ def command(
     from vvgt_cli.errors import UsageError
 
     if output is not None and (port is not None or not browser):
-        raise UsageError("-o writes a file and serves nothing: leave --port and --no-browser out")
+        raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
     source = source_request(files[0], read, optics)
     request = ViewRequest(files, source, output, port or 0, browser, overwrite)
     view(request, lambda url: click.echo(url), console)

@@ -17,7 +17,6 @@ def command(console: Console) -> None:
     is inside the package if that is writable, else in the user's cache; NUMBA_CACHE_DIR overrides it. Code is specific
     to the processor type: on a mixed cluster, run this once per type.
 
-    \b
     Examples:
       vvgt warmup
       NUMBA_CACHE_DIR=/scratch/kernels vvgt warmup && sbatch convert.sh
@@ -32,7 +31,7 @@ def command(console: Console) -> None:
         count, left, folder = compile_ahead(ALL, progress=console.bar("compile"))
         stage.note = f"{count} kernels were missing" if count else "nothing was missing"
     if folder is None:
-        raise DataError("the compiled kernels could not be kept; try NUMBA_CACHE_DIR=FOLDER that can be written to")
+        raise DataError("no folder can keep the compiled kernels; set NUMBA_CACHE_DIR to a writable one")
     if left:
         raise DataError(f"{left} of {count} kernels were not compiled; see {folder}, and try again")
     click.echo(folder)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.tree import Tree
 
-LEAST, MOST = 0.25, 30.0  # times the mean that an error counts at a score: what is flat keeps cells for other seats
+LEAST, MOST = 0.25, 30.0  # times the mean that an error counts at a score: what is flat keeps cells for other views
 UNSEEN = 0.08  # of the mean blending weight in views: Gaussians below are hidden (0.1: fogs lose, 0.05: less gain)
 SHARED = 1.0  # mean scores that the cells above count for: an error of few pixels says little
 

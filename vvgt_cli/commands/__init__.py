@@ -1,1 +1,1 @@
-"""What the smaller commands do."""
+"""Work of the smaller commands."""

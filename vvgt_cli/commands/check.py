@@ -1,4 +1,4 @@
-"""`check`: the self-test of an installation, the cases and stiffness of one scene, or those of a file of Gaussians."""
+"""`check`: self-test of an installation, cases and stiffness of one scene, or cases of a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def _stiffness_lines(found: Stiffness) -> list[str]:
     rows = {
         "largest optical depth of a step of 0.5": f"{found.depth_per_step:.4g}",
         "largest change of extinction per voxel": f"{found.change_per_voxel:.4g} of the largest extinction",
-        "neighbours that change by more than half of it": f"{100 * found.abrupt:.3g} % of those that show anything",
-        "explicit Euler overshoots in steps above": f"{found.explicit_step:.3g} voxels (this renderer in none)",
+        "neighbours that differ by more than half of it": f"{100 * found.abrupt:.3g} % of the visible pairs",
+        "explicit Euler overshoots with steps above": f"{found.explicit_step:.3g} voxels (this renderer never does)",
         "error by step in voxels (RMS of RGBA)": ", ".join(f"{k}: {v:.2g}" for k, v in found.errors.items()),
-        f"step that an error of {found.tolerance:g} needs": steps,
+        f"largest step with an error of at most {found.tolerance:g}": steps,
     }
     width = max(map(len, rows))
     return [f"{key:<{width}}  {value}" for key, value in rows.items()]
@@ -103,7 +103,7 @@ def check(
     if source is None:
         return CheckReport(_run_cases(list(self_test_cases()), console))
     loaded = load(source)
-    console.say(describe_source(loaded))
+    console.message(describe_source(loaded))
     scene = loaded.scene()
     found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = _run_cases(list(scene_cases(scene)), console)

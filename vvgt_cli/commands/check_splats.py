@@ -1,4 +1,4 @@
-"""`check` of a file of Gaussians by any program, alone or against the volume and the look that it shows."""
+"""`check` of a file of Gaussians from any program, alone or against the volume and look that it shows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vvgt_cli.checks.splats import (
 )
 from vvgt_cli.commands.evaluate import EvaluateRequest, opened, shown
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
-from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.field import Field, Picture
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
@@ -35,7 +35,7 @@ from vvgt_cli.gaussians.frames import rescale
 from vvgt_cli.gaussians.live_facts import WORD as LIVE
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import CLOSE, PREVIEW_VIEWS, condition_views, from_above, score_conditions, score_texture
+from vvgt_cli.score.viewing import CLOSE, PREVIEW_VIEWS, condition_views, score_conditions, score_texture, screens
 from vvgt_cli.score.views import score_test_views
 
 SIZE = 1080  # pixels, for files without a recorded size
@@ -77,7 +77,7 @@ def open_splats(
     columns = read_columns(file)
     good = finite_rows(columns)
     if not good.any():
-        raise DataError(f"{file}: {len(columns)} Gaussians, none of finite numbers; expected at least one")
+        raise DataError(f"{file}: {len(columns)} Gaussians, none with finite values; expected at least one")
     if good.all():
         gaussians, header = open_gaussians(file)
     else:  # check the others, whose values and certificate no longer fit
@@ -111,8 +111,8 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
     from vvgt_cli.dvr import RenderSettings
 
     rule, settings, volume = file_rule(header), RenderSettings(), field.source.volume
-    frame, gaussians = volume.unit_frame(), into_box(unit, volume)
-    world = into_box(rescale(unit, frame.scale, -np.array(frame.centre), np.zeros(3)), volume)
+    frame, gaussians = volume.unit_frame(), to_box_frame(unit, volume)
+    world = to_box_frame(rescale(unit, frame.scale, -np.array(frame.centre), np.zeros(3)), volume)
     pictures = [Picture(camera, settings) for camera in orientation_cameras()]
     field.views.expect(pictures)
     seen = [field.views.view(*picture) for picture in pictures]
@@ -126,7 +126,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
 
     @cache
     def conditions() -> Any:
-        places = [*from_above(size), (size, CLOSE)]
+        places = [*screens(size), (size, CLOSE)]
         return score_conditions(gaussians, condition_views(field.views, places, settings))
 
     def error(name: str) -> Figure:
@@ -150,7 +150,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
     for name, what in (("psnr", "over black"), ("psnr_white", "over white"), ("psnr_alpha", "alpha")):
         yield Case("pictures", f"{what}, {size} px", partial(error, name))
     yield Case("pictures", "over black, close up", near)
-    for edge, _ in from_above(size):
+    for edge, _ in screens(size):
         yield Case("pictures", f"worst viewer, {edge} px", partial(viewers, edge))
     yield Case("pictures", "texture on smooth faces, near", woven)
     yield from _order(gaussians, size)

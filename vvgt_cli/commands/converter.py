@@ -1,7 +1,8 @@
-"""Conversions for a page that is being looked at, in a process of their own, which is ended when the next one is asked.
+"""Background conversions for an open viewer page, in a separate process.
 
-The process reads the volume once and keeps it for one function after the other. It is told what to do by pickles on its
-standard input, and answers by pickles on its standard output. When the input closes, it ends.
+The process reads the volume once and keeps it for every function that the page sends. Jobs reach its standard input as
+pickles, and messages leave its standard output the same way. It exits when the input closes. A new job replaces the
+running one: the process is killed unless only scores are missing.
 """
 
 from __future__ import annotations
@@ -25,41 +26,41 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.resources import asked_memory
+from vvgt_cli.resources import memory_limit
 
 
 @dataclass(frozen=True)
-class Said:
-    """A line to be told."""
+class ConsoleLine:
+    """A line for the console."""
 
     line: str
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far it is."""
+    """Progress of a job, in words."""
 
     text: str
 
 
 @dataclass(frozen=True)
-class Made:
-    """What became of a job; of what is converted `Scored` follows.
+class Converted:
+    """Gaussians that a job produced; `Scored` follows if they were converted.
 
     Attributes:
         ply: the file that `vvgt convert` would write, without a certificate.
-        parts: of the first job the page's text, named "", and what it asks for; of others the `.ply` that it shows.
-        live: it can be shown under any function.
+        files: of the first job the page's text, named "", and the file it loads; of later jobs the `.ply` to swap in.
+        live: whether they can be shown under any function.
     """
 
     ply: bytes
-    parts: dict[str, bytes]
+    files: dict[str, bytes]
     live: bool = False
 
 
 @dataclass(frozen=True)
 class Scored:
-    """What is known of what was made last.
+    """Scores of the Gaussians that were produced last.
 
     Attributes:
         ply: the file with its certificate.
@@ -72,22 +73,22 @@ class Scored:
 
 @dataclass(frozen=True)
 class Failed:
-    """What a job ended by."""
+    """Error that ended a job."""
 
     error: VvgtError
 
 
-Message = Said | Progress | Made | Scored | Failed
+Message = ConsoleLine | Progress | Converted | Scored | Failed
 
 
 @dataclass(frozen=True)
 class Start:
-    """What a process begins with.
+    """Initial message to the process.
 
     Attributes:
-        source: the volume, and the function to begin with.
+        source: the volume, and the first function.
         name: of what is shown, without ending.
-        memory: bytes that it may take (`--memory`).
+        memory: limit in bytes (`--memory`).
     """
 
     source: SourceRequest
@@ -99,27 +100,30 @@ Job = TransferFunction | LabelTable | None  # the look to convert for; None: the
 
 
 class Converter:
-    """A context in which volumes are converted in the background: one job at a time, the latest.
+    """Context that converts a volume in the background: one job at a time, the latest.
 
     Args:
-        source: what to convert.
+        source: volume and look to convert.
         name: of what is shown, without ending.
-        heard: is told the number of a job and what there is to say of it, by another thread, which holds the ``lock``.
+        on_message: called with a job's number and a message about it, on another thread, which holds ``lock``.
     """
 
-    def __init__(self, source: SourceRequest, name: str, heard: Callable[[int, Message], None]) -> None:
-        self._source, self._name, self._heard = source, name, heard
+    def __init__(self, source: SourceRequest, name: str, on_message: Callable[[int, Message], None]) -> None:
+        """Create the converter; no process is started yet."""
+        self._source, self._name, self._on_message = source, name, on_message
         self.lock = threading.RLock()
         self._process: subprocess.Popen[bytes] | None = None
         self._number, self._busy, self._scoring = 0, False, False
         self._folder: str | None = None
 
     def __enter__(self) -> Converter:
+        """Make the folder for temporary files."""
         self._folder = tempfile.mkdtemp(prefix="vvgt-view-")
         atexit.register(self._close)  # where interrupts come so fast that the context is not left in order
         return self
 
     def __exit__(self, *error: object) -> None:
+        """End the process and remove the folder."""
         closing = threading.Thread(target=self._close)  # which a second interrupt does not reach
         closing.start()
         closing.join()
@@ -134,10 +138,10 @@ class Converter:
             self._folder = None
             atexit.unregister(self._close)
 
-    def ask(self, job: Job) -> int:
-        """Begin a job in place of the one that is being done, if any; returns its number.
+    def submit(self, job: Job) -> int:
+        """Start a job in place of the running one, if any, and return its number.
 
-        A job that only lacks its scores is not ended, for the next one may go on from it.
+        A process that only lacks scores is kept: the next job may continue from its result.
         """
         with self.lock:
             if self._folder is None:
@@ -153,7 +157,7 @@ class Converter:
             return self._number
 
     def cancel(self) -> None:
-        """End the job that is being done, if any; nothing more is heard of it."""
+        """End the running job, if any; no further message about it arrives."""
         with self.lock:
             self._number += 1
             self._scoring = False
@@ -162,7 +166,7 @@ class Converter:
 
     @property
     def process(self) -> int | None:
-        """Number of the process, None where there is none."""
+        """Return the process id, None if no process runs."""
         return self._process.pid if self._process else None
 
     def _begin(self) -> subprocess.Popen[bytes]:
@@ -174,12 +178,12 @@ class Converter:
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Start(self._source, self._name, asked_memory()), cast(IO[bytes], self._process.stdin))
+            pickle.dump(Start(self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 
     def _end(self) -> None:
-        """At once, with all that it has started, and what it was writing."""
+        """Kill the process with all that it started, and remove its temporary files."""
         process, self._process, self._busy, self._scoring = self._process, None, False, False
         if process is None:
             return
@@ -193,7 +197,7 @@ class Converter:
             shutil.rmtree(os.path.join(cast(str, self._folder), name), ignore_errors=True)
 
     def _listen(self, process: subprocess.Popen[bytes]) -> None:
-        """Pass on what a process says, as long as it is about the latest job."""
+        """Pass on the messages of a process as long as they are about the latest job."""
         stream = cast(IO[bytes], process.stdout)
         while True:
             try:
@@ -206,12 +210,12 @@ class Converter:
                 if message is None:  # it has ended by itself
                     awaited = self._busy or self._scoring
                     self._end()
-                    message = Failed(DataError("the conversion was ended by the system (out of memory?)"))
+                    message = Failed(DataError("out of memory? The system ended the conversion; try --crop"))
                     if awaited:
-                        self._heard(number, message)
+                        self._on_message(number, message)
                     return
                 if number != self._number:
                     continue
-                if isinstance(message, Made | Scored | Failed):
-                    self._busy, self._scoring = False, isinstance(message, Made) and not message.live
-                self._heard(number, message)
+                if isinstance(message, Converted | Scored | Failed):
+                    self._busy, self._scoring = False, isinstance(message, Converted) and not message.live
+                self._on_message(number, message)

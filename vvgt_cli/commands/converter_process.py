@@ -1,4 +1,4 @@
-"""The process of `converter`: reads a volume once, makes the live form of it, or converts it for a function."""
+"""Process of `converter`: reads a volume once, makes its live form, and converts it for one look after the other."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import IO, Any, NoReturn
 
-from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Scored, Start
-from vvgt_cli.commands.live_site import Cloud, page_of, stored
-from vvgt_cli.conversion.convert import convert_in_memory, opened, ply_options
-from vvgt_cli.conversion.live import live_conversion, refusal
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Start
+from vvgt_cli.commands.live_site import Cloud, page_files, stored
+from vvgt_cli.conversion.convert import convert_in_memory, open_field, ply_options
+from vvgt_cli.conversion.live import convert_live, live_refusal
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -38,60 +38,62 @@ from vvgt_cli.volume import ReadOptions
 INTERVAL = 0.2  # seconds between two words of progress
 
 
-class Telling(Console):
-    """A console whose lines and bars are messages."""
+class MessageConsole(Console):
+    """A console that sends its lines and bars as messages."""
 
-    def __init__(self, tell: Callable[[Message], None]) -> None:
+    def __init__(self, send: Callable[[Message], None]) -> None:
+        """Send messages by ``send``."""
         super().__init__()
-        self.tell = tell
+        self.send = send
 
-    def say(self, line: str) -> None:
-        """A line."""
-        self.tell(Said(line))
+    def message(self, line: str) -> None:
+        """Send a line."""
+        self.send(ConsoleLine(line))
 
     def bar(self, label: str) -> ProgressCallback | None:
-        """Progress in words."""
+        """Return a callback that sends progress in words, at most every `INTERVAL` seconds."""
         last = 0.0
-        self.tell(Progress(label))
+        self.send(Progress(label))
 
         def draw(done: int, total: int) -> None:
             nonlocal last
             if time.monotonic() - last >= INTERVAL:
                 last = time.monotonic()
-                self.tell(Progress(f"{label} {100 * done // max(total, 1)} %"))
+                self.send(Progress(f"{label} {100 * done // max(total, 1)} %"))
 
         return draw
 
 
-class Volume:
-    """The volume of a request, read once where it fits into memory."""
+class LoadedVolume:
+    """Volume of a request, read once if it fits in memory."""
 
     def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
+        """Read the volume, unless it is better processed in blocks."""
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
         self.table: LabelTable | None = None  # the labels to begin with
         self.last: PreviousLook | None = None  # what the next conversion goes on from
-        if automatic(source, Console(quiet=True)) is None:  # `opened` says it
+        if automatic(source, Console(quiet=True)) is None:  # `open_field` reports it
             console.bar("reading")
             content = open_content(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
 
-    def live(self, console: Telling) -> None:
-        """Tell the live form, or of what has none an ordinary conversion."""
+    def send_live(self, console: MessageConsole) -> None:
+        """Send the live form, or an ordinary conversion if the volume has none."""
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
-        with opened(run, request, INIT) as field:
-            why = refusal(request, field.source) or _missing()
+        with open_field(run, request, INIT) as field:
+            why = live_refusal(request, field.source) or _missing()
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
                 self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
-                console.tell(self._paged(live_conversion(run, request, field, ply, scored=False)))
+                console.send(self._with_page(convert_live(run, request, field, ply, scored=False)))
                 return
-        console.say(f"not live, but converted: {why}")
-        self._converted(replace(request, live=False), console, self._paged)
+        console.message(f"converted without a live form: {why}")
+        self._converted(replace(request, live=False), console, self._with_page)
 
-    def under(self, job: Job, console: Telling) -> None:
-        """Tell a conversion for labels, or a function, on data values, that says the distance its opacity is per."""
+    def convert(self, job: Job, console: MessageConsole) -> None:
+        """Send a conversion for labels, or for a function on data values with an opacity unit distance."""
         assert job is not None
         if isinstance(job, LabelTable):
             source = replace(self.source, labels=self._labels(job))
@@ -100,29 +102,31 @@ class Volume:
             source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
         self.last = PreviousLook(self._converted(ConvertRequest(source), console, _plain_file))
 
-    def _converted(self, request: ConvertRequest, console: Telling, made: Callable[[Conversion], Made]) -> Conversion:
-        """Tell what is ``made`` of a conversion as soon as it is there, and its scores when they are."""
-        conversion = convert_in_memory(request, console, self.last, lambda unscored: console.tell(made(unscored)))
+    def _converted(
+        self, request: ConvertRequest, console: MessageConsole, message: Callable[[Conversion], Converted]
+    ) -> Conversion:
+        """Convert; send ``message(conversion)`` before the scores are known, then the scores."""
+        conversion = convert_in_memory(request, console, self.last, lambda unscored: console.send(message(unscored)))
         assert conversion.scores is not None
-        console.tell(Scored(_file(conversion), conversion.scores["psnr"]))
+        console.send(Scored(_file(conversion), conversion.scores["psnr"]))
         return conversion
 
     def _labels(self, sent: LabelTable) -> LabelTable:
-        """The labels to begin with, in the colours and opacities of those that are sent."""
+        """Return the volume's labels with the colours and opacities of ``sent``."""
         assert self.table is not None
         new = {label.number: label for label in sent.labels}
         labels = tuple(replace(new.get(label.number, label), name=label.name) for label in self.table.labels)
         return replace(self.table, labels=labels)
 
-    def _paged(self, conversion: Conversion) -> Made:
-        """With the page of it: here the libraries that it takes are there already."""
+    def _with_page(self, conversion: Conversion) -> Converted:
+        """Return a conversion with its page: the libraries that a page needs are loaded here already."""
         cloud = Cloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
-        return Made(cloud.ply, page_of(cloud, converts=True), cloud.live)
+        return Converted(cloud.ply, page_files(cloud, converts=True), cloud.live)
 
 
 def _missing() -> str | None:
-    """What a page of live Gaussians needs and is not installed."""
+    """Return why pages of live Gaussians cannot be written, None if they can."""
     try:
         ready("the page.html")
     except DataError as error:
@@ -130,9 +134,9 @@ def _missing() -> str | None:
     return None
 
 
-def _plain_file(conversion: Conversion) -> Made:
-    """With the `.ply` that a page swaps in."""
-    return Made(_file(conversion), {"ply": stored(conversion.gaussians, conversion.ply)})
+def _plain_file(conversion: Conversion) -> Converted:
+    """Return a conversion with the `.ply` that an open page swaps in."""
+    return Converted(_file(conversion), {"ply": stored(conversion.gaussians, conversion.ply)})
 
 
 def _file(conversion: Conversion) -> bytes:
@@ -142,52 +146,52 @@ def _file(conversion: Conversion) -> bytes:
 
 
 def main() -> None:
-    """Do one job after the other until the input ends; the folder for what is temporary then goes (first argument)."""
+    """Run jobs until the input ends; the first argument is the folder of temporary files, removed at the end."""
     folder = sys.argv[1]
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
     try:
         start: Start = pickle.load(orders)
     except Exception:
-        _alone(folder)
+        _exit(folder)
     set_memory(start.memory)
     jobs: list[tuple[int, Job]] = []
-    there = threading.Semaphore(0)
-    threading.Thread(target=_receive, args=(orders, folder, jobs, there), daemon=True).start()
-    volume: Volume | None = None
+    waiting = threading.Semaphore(0)
+    threading.Thread(target=_receive, args=(orders, folder, jobs, waiting), daemon=True).start()
+    volume: LoadedVolume | None = None
     while True:
-        there.acquire()
+        waiting.acquire()
         number, job = jobs.pop(0)
 
-        def tell(message: Message, number: int = number) -> None:
+        def send(message: Message, number: int = number) -> None:
             _send(answers, folder, (number, message))
 
-        note: Any = _note(tell)
+        note: Any = _note(send)
         warnings.showwarning = note
-        console = Telling(tell)
+        console = MessageConsole(send)
         try:
-            volume = volume or Volume(start.source, start.name, console)
+            volume = volume or LoadedVolume(start.source, start.name, console)
             if job is None:
-                volume.live(console)
+                volume.send_live(console)
             else:
-                volume.under(job, console)
+                volume.convert(job, console)
         except VvgtError as error:
-            tell(Failed(_plain(error)))
+            send(Failed(_plain(error)))
         except MemoryError:
-            tell(Failed(DataError("out of memory: try a smaller volume (--crop)")))
+            send(Failed(DataError("out of memory: try a smaller volume (--crop)")))
         except OSError as error:
-            tell(Failed(DataError(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+            send(Failed(DataError(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
         except Exception as error:
-            tell(Failed(DataError(f"internal: {type(error).__name__}: {error} (a bug)")))
+            send(Failed(DataError(f"internal: {type(error).__name__}: {error} (a bug)")))
 
 
-def _note(tell: Callable[[Message], None]) -> Callable[..., None]:
-    """What shows warnings (`warnings.showwarning`)."""
-    return lambda message, *rest: tell(Said(f"vvgt: note: {message}"))
+def _note(send: Callable[[Message], None]) -> Callable[..., None]:
+    """Return a replacement for `warnings.showwarning` that sends warnings as lines."""
+    return lambda message, *rest: send(ConsoleLine(f"vvgt: note: {message}"))
 
 
 def _plain(error: VvgtError) -> VvgtError:
-    """Without what some errors say to programs beside their line."""
+    """Return an error with its line and exit status alone, which can be pickled."""
     found = VvgtError(str(error))
     found.exit_code = error.exit_code
     return found
@@ -198,21 +202,21 @@ def _send(stream: IO[bytes], folder: str, message: tuple[int, Message]) -> None:
         pickle.dump(message, stream)
         stream.flush()
     except OSError:
-        _alone(folder)
+        _exit(folder)
 
 
-def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], there: threading.Semaphore) -> None:
-    """Take jobs."""
+def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], waiting: threading.Semaphore) -> None:
+    """Append jobs to ``jobs`` as they arrive, and signal each."""
     while True:
         try:
             jobs.append(pickle.load(stream))
         except Exception:  # the end of the input, in the middle of a job too
-            _alone(folder)
-        there.release()
+            _exit(folder)
+        waiting.release()
 
 
-def _alone(folder: str) -> NoReturn:
-    """End where the other side has ended, with what lies in the temporary folder."""
+def _exit(folder: str) -> NoReturn:
+    """Exit because the other side has ended; remove the temporary folder."""
     for _ in range(10):  # for a job still writes into it
         shutil.rmtree(folder, ignore_errors=True)
         if not os.path.exists(folder):

@@ -1,4 +1,4 @@
-"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every seat."""
+"""`evaluate`: scores of a `.ply` against its volume, on test views and under all viewing conditions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.certify import checked
+from vvgt_cli.conversion.certify import verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
+from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -32,16 +32,16 @@ from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
 from vvgt_cli.score.viewing import (
     CLOSE,
     ViewingCondition,
+    condition_pictures,
     condition_views,
     near_cameras,
     score_conditions,
     score_texture,
-    seat_pictures,
     texture_note,
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import psnr_note, score_test_views, scored
+from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -49,17 +49,17 @@ MIDDLE = 200  # pixels along the edge of what the reference's own error is measu
 
 @dataclass(frozen=True)
 class EvaluateRequest:
-    """What to score.
+    """File of Gaussians to score, and how.
 
     Attributes:
         ply: Gaussians, "-" for standard input, or a stream of them.
-        source: the volume and the function that they were made from.
-        size: pixels along an image's edge; None: what the file is made for.
-        rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
-        step: of the reference, in voxels.
-        seats: score every rule at several sizes and close up as well, and texture on smooth areas.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
-        preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
+        source: volume and function that they were made from.
+        size: pixels along an image's edge; None: the size recorded in the file.
+        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
+        step: sampling distance of the reference, in voxels.
+        conditions: also score every rule at several sizes and close up, and texture on smooth areas.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
+        preview: PNG to write (reference, splats, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
     """
 
@@ -68,19 +68,19 @@ class EvaluateRequest:
     size: int | None = None
     rule: str | None = None
     step: float = 0.125
-    seats: bool = True
+    conditions: bool = True
     blocks: BlockOptions | None = None
     preview: str | None = None
     overwrite: bool = False
 
     def inputs(self) -> list[str]:
-        """Files that are read."""
+        """Return the files that are read."""
         return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
 
 
 @dataclass
 class Evaluation:
-    """Scores and seats, with what they were measured on, and whether the file's certificate holds (docs/report.md)."""
+    """Scores, what they were measured on, and whether the file's certificate holds (docs/report.md)."""
 
     gaussians: int
     size: int
@@ -91,18 +91,18 @@ class Evaluation:
     transfer_function: dict[str, Any]
     reference_psnr: float
     scores: dict[str, Any] = field(default_factory=dict)
-    seats: list[dict[str, Any]] = field(default_factory=list)
+    conditions: list[dict[str, Any]] = field(default_factory=list)
     texture: dict[str, Any] | None = None
     certificate: dict[str, Any] | None = None
     stages: list[StageRecord] = field(default_factory=list)
     seconds: float = 0.0
 
     def to_json(self) -> str:
-        """JSON with machine and versions."""
+        """Return JSON with machine and versions."""
         return document("vvgt-evaluation", asdict(self))
 
     def table(self) -> str:
-        """The scores, a row a number, then the seats by PSNR, worst first."""
+        """Return a table: one score per row, then the viewing conditions by PSNR, worst first."""
         lines = [f"made for {self.size} px, drawn as {self.rule}"]
         for key, value in self.scores.items():
             if key != "per_view":
@@ -112,9 +112,9 @@ class Evaluation:
             lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
         if self.certificate is not None:
             lines.append(f"certificate {self.certificate['text']}")
-        if self.seats:
-            lines.append(f"\n{'seat':<32}{'psnr':>10}")
-        lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        if self.conditions:
+            lines.append(f"\n{'viewing condition':<32}{'psnr':>10}")
+        lines += [f"{ViewingCondition(**one).name():<32}{one['psnr']:>10.2f}" for one in self.conditions]
         return "\n".join(lines) + "\n"
 
 
@@ -126,7 +126,7 @@ def _cell(value: Any) -> str:
 
 @contextmanager
 def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
-    """The volume, with the file's own anatomical space, light and unit distance where none is asked for."""
+    """Open the volume, by default in the file's own anatomical space, light and unit distance."""
     size, asked = request.size or header.made_for or SIZE, request.source.light
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
@@ -165,7 +165,7 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
 
 @contextmanager
 def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
-    """Pictures that are asked for within: those of a volume in blocks are made together, and let go of."""
+    """Draw the pictures requested within the block together if the volume is in blocks; forget them afterwards."""
     field.views.expect(pictures)
     yield
     for picture in pictures:
@@ -173,34 +173,35 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
 
 
 def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
-    """What carries values, under the function that is given; else the look of the file.
+    """Return live Gaussians under the requested function; without one, and for other files, the file's own look.
 
     Raises:
-        UsageError: values that are looked at as labels, or the other way round.
+        UsageError: labels are requested for values, or the reverse.
     """
     if header.live is None or (request.labels is None and request.tf is None and not request.layers):
         return gaussians
-    carried = ["labels" if one.labels else "values" for one in header.live.layers]
+    held = ["labels" if one.labels else "values" for one in header.live.layers]
     shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]
-    if carried != shown:
+    if held != shown:
         raise UsageError(
-            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
-            "--tf, --labels or --layer as they were converted with, or none of these, to score the look of the file"
+            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(held)}; expected the volume and "
+            "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return under_function(gaussians, header, looks if header.live.others else source.tf, options)
+    return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
     """Score a `.ply` against its volume.
 
     Raises:
-        UsageError, DataError: inputs that are not what they must be.
+        UsageError: both inputs are standard input, or the preview may not be written.
+        DataError: a file that is not valid.
     """
     if request.ply == STDIN == request.source.volume:
-        raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
+        raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
     if request.preview:
         check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
@@ -208,25 +209,25 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with opened(run, request, gaussians, header) as volume:
         source = volume.source
         gaussians = shown(gaussians, header, source, request.source)
-        gaussians = into_box(gaussians, source.volume)
+        gaussians = to_box_frame(gaussians, source.volume)
         for remark in _doubts(request, header, source):
-            run.console.say(f"{request.ply}: {remark}")
+            run.console.message(f"{request.ply}: {remark}")
         return _scored(run, request, volume, gaussians, header)
 
 
 def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iterator[str]:
-    """What speaks against the file being of this volume, looked at so."""
+    """Yield reasons to doubt that the file was made from this volume and look."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
-        yield f"its header's affine is not that of {source.volume.name}: of another volume?"
+        yield f"its header's affine differs from that of {source.volume.name}; was it made from another volume?"
     if header.live is None and header.optics is not None and header.optics != source.optics():
         yield (
-            f"made under other labels, functions or layers than {source.name}, as its header says "
+            f"made with other labels, functions or layers than {source.name}, according to its header "
             f"({header.optics}, not {source.optics() or 'scalars'})"
         )
 
 
 def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussians, header: PlyHeader) -> Evaluation:
-    """The scores, and a preview."""
+    """Measure the scores, and write a preview if requested."""
     from vvgt_cli.dvr import REFERENCE
     from vvgt_cli.images import write_png
 
@@ -240,7 +241,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         tf_record(source, request.source), own,
     )  # fmt: skip
     settings = replace(REFERENCE, step=request.step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored(size, perceptual=True)]
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
@@ -248,15 +249,15 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
         with run.stage("certificate") as stage:
-            verdict = checked(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
+            verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     if request.preview:
-        camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
+        camera, axes = default_views("test", size=size)[PICTURED], upright_axes(source.volume, header.up)
         with run.stage("preview"):
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
-    if request.seats:
+    if request.conditions:
         _look_around(run, evaluation, volume, gaussians, rule)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
@@ -264,17 +265,17 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
 
 
 def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule) -> None:
-    """Seats, and texture from near."""
+    """Score the viewing conditions, and texture seen from near."""
     from vvgt_cli.dvr import RenderSettings
 
     size, settings = evaluation.size, RenderSettings()
     places = viewing_conditions(size)
-    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in seat_pictures(places)]
-    with run.stage("seats") as stage, _together(volume, wanted):
-        seen = condition_views(volume.views, places, settings, progress=run.console.bar("seats"))
-        seats = score_conditions(gaussians, seen)
-        evaluation.seats = [asdict(seat) for seat in seats]
-        stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in condition_pictures(places)]
+    with run.stage("conditions") as stage, _together(volume, wanted):
+        seen = condition_views(volume.views, places, settings, progress=run.console.bar("conditions"))
+        conditions = score_conditions(gaussians, seen)
+        evaluation.conditions = [asdict(condition) for condition in conditions]
+        stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
     with run.stage("texture") as stage, _together(volume, near):
         found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
@@ -283,7 +284,7 @@ def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gau
 
 
 def _reference_psnr(volume: Field, size: int, step: float) -> float:
-    """PSNR of the reference against half its step and twice its rays along a pixel's edge.
+    """Return the PSNR of the reference against half its step and twice its rays along a pixel's edge.
 
     Measured on the middle of the first test view: the whole of it would cost as much as eight views.
     """

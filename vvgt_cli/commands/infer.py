@@ -1,4 +1,4 @@
-"""`infer`: Gaussians through an exported network, kept if the views agree."""
+"""`infer`: Gaussians improved by an exported network, kept if the views agree."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class InferRequest:
 
 
 def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]]:
-    """Numbers of the views that the network reads, and of those that judge it.
+    """Return the indices of the views that the network reads, and of those that judge it.
 
-    The judges are views that it does not read, as far apart as may be; all of its own where there are no others.
+    The judges are other views, as far apart as possible; if there are none, the views that it reads.
     """
     from vvgt_cli.cameras import farthest_cameras
 
@@ -56,11 +56,11 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
 
 
 def infer_file(request: InferRequest, console: Console | None = None) -> ConversionReport:
-    """Improve a `.ply` by a network and write it; where the judging views see no gain, write the input's Gaussians.
+    """Improve a `.ply` with a network and write it; if the judging views show no gain, write the input's Gaussians.
 
     Raises:
-        UsageError: an output that may not be written, no such model or provider.
-        DataError: Gaussians, views or a model that are not what they must be.
+        UsageError: an output that may not be written, or an unknown model or provider.
+        DataError: Gaussians, views or a model that are not valid.
     """
     outputs = [Output("-o", request.output, (".ply",))]
     if request.report:
@@ -91,7 +91,7 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
     with run.stage("judge") as stage:
         before, after = (_psnr(g, cameras, images, judges) for g in (gaussians, better))
         stage.psnr, stage.kept = after, after > before
-        own = "" if set(judges) - set(read) else ", which the network has read"
+        own = "" if set(judges) - set(read) else ", all read by the network"
         stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
     run.report.options = {
         "model": model.card.name,

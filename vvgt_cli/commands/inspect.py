@@ -1,4 +1,4 @@
-"""What a file holds, for `vvgt info`."""
+"""Contents of a file, for `vvgt info`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
 from vvgt_cli.conversion.index import is_index, read_index
-from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, resolve_look
 from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
@@ -50,12 +50,13 @@ def machine_facts() -> dict[str, Any]:
 
 
 def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = None) -> dict[str, Any]:
-    """Facts about a volume, a transfer function, a view set, a `.ply` or an index of several; the first is "kind".
+    """Return facts about a volume, a transfer function, a view set, a `.ply` or an index; the first is "kind".
 
-    Of Gaussians that carry values what they are under ``function``, where one is given.
+    With ``function``, live Gaussians are described as they are under it.
 
     Raises:
-        DataError, UsageError: as the reader of that kind.
+        DataError: a file that is not valid, or not of a known kind.
+        UsageError: no such file, or options that do not fit it.
     """
     if function is not None:
         return {"kind": "gaussians", "name": Path(file).name, **_shown(file, function)}
@@ -96,8 +97,8 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
 
 def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
-    tf, options = placed_function(file, header, function)
-    found = under_function(gaussians, header, tf, options)
+    tf, options = resolve_look(file, header, function)
+    found = apply_function(gaussians, header, tf, options)
     stream = io.BytesIO()
     write_ply(stream, found, options)
     stream.seek(0)
@@ -105,7 +106,7 @@ def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
 
 
 def _head_of_stdin() -> bytes:
-    """First bytes of standard input, left to be read."""
+    """Return the first bytes of standard input without consuming them."""
     stream = sys.stdin.buffer
     return stream.peek(4) if isinstance(stream, io.BufferedReader) else b""
 
@@ -155,7 +156,7 @@ def _entries(table: LabelTable) -> list[dict[str, Any]]:
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
-    """A volume; of a file that holds several the list of them, of time steps the first."""
+    """Describe a volume; if the file holds several, list them; of time steps, describe the first."""
     try:
         return _one(file, read)
     except SeveralSteps as error:
@@ -181,7 +182,7 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
 
 
 def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, Any]:
-    """One of several volumes of a file: size, type, range where few values have to be read for it."""
+    """Describe one of several volumes of a file: size, type, and the range if that is quick to find."""
     from vvgt_cli.field.layered import open_content
     from vvgt_cli.volume import statistics
 
@@ -209,7 +210,7 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
 
 
 def _channels(content: Content) -> list[dict[str, Any]]:
-    """Each channel of a volume: what chooses it, its name, colour and range."""
+    """Describe each channel of a volume: the option that selects it, its name, colour and range."""
     from vvgt_cli.field.layered import channel_color
     from vvgt_cli.volume import statistics
 

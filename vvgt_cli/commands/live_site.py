@@ -1,4 +1,4 @@
-"""What the page of live Gaussians asks of the server: itself, files to save, conversions for a function."""
+"""Requests of the page of live Gaussians: the page itself, files to save, conversions for a function."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said, Scored
-from vvgt_cli.commands.server import Part
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Converter, Failed, Job, Message, Progress, Scored
+from vvgt_cli.commands.server import Resource
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
@@ -39,7 +39,7 @@ NODES = 4096  # of a function that a page sends
 
 
 def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
-    """A `.ply` as the page's viewer wants it."""
+    """Return a `.ply` as the page's viewer reads it."""
     stream = io.BytesIO()
     write_ply(stream, replace(gaussians, live=None), replace(upright(options), live=None))
     return stream.getvalue()
@@ -47,13 +47,13 @@ def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
 
 @dataclass(frozen=True)
 class Cloud:
-    """What is shown.
+    """Gaussians that a page shows.
 
     Attributes:
         gaussians: in the unit frame.
-        options: how a file of them is laid out.
+        options: how they are written.
         name: of files to save, without ending.
-        ply: the file that they were read of; None where they have changed since.
+        ply: bytes of the file that they were read from; None if they have changed since.
     """
 
     gaussians: Gaussians
@@ -63,34 +63,34 @@ class Cloud:
 
     @classmethod
     def of(cls, ply: bytes, name: str) -> Cloud:
-        """What a `.ply` holds."""
+        """Read a `.ply`."""
         gaussians, header = open_gaussians(io.BytesIO(ply))
         return cls(gaussians, layout_of(header), name, ply)
 
     @property
     def live(self) -> bool:
-        """Whether they can be shown under any function."""
+        """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str) -> Part:
-        """As it is saved."""
+    def file(self, suffix: str) -> Resource:
+        """Return the file to save, in the format of an ending."""
         if (other := format_of(f"x.{suffix}")) is not None:
-            return Part(BYTES, lambda: encoded(other, self.gaussians, self.options, f"{self.name}.{suffix}"))
+            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, f"{self.name}.{suffix}"))
         if self.ply is not None:
-            return Part(BYTES, lambda: self.ply or b"")
+            return Resource(BYTES, lambda: self.ply or b"")
         stream = io.BytesIO()
         write_ply(stream, self.gaussians, self.options)
-        return Part(BYTES, stream.getvalue)
+        return Resource(BYTES, stream.getvalue)
 
-    def under(self, tf: TransferFunction, light: Any = None) -> Cloud:
-        """The same with the colours of another function, on data values, with an opacity_unit_distance.
+    def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
+        """Return the cloud under another function, which is on data values and has an opacity_unit_distance.
 
         Args:
             tf: the function.
             light: as the page sends it; None: the file's own.
 
         Raises:
-            DataError, UsageError: it is no light, or the Gaussians carry labels.
+            DataError, UsageError: the light is not valid, or the Gaussians carry labels.
         """
         facts = self._alone("a function")
         table, facts = self._function(facts, tf)
@@ -101,44 +101,44 @@ class Cloud:
         return self._shown(table, light, options)
 
     def _alone(self, what: str) -> LiveFacts:
-        """What is said of the values, of one layer."""
+        """Return the facts about the values of the only layer; refuse several."""
         facts = self.options.live
         if facts is None or facts.others:
-            raise DataError(f"what is shown has several layers; expected a look of each in the place of {what}")
+            raise DataError(f"the cloud has several layers; expected a look for each instead of {what}")
         return facts
 
     def _function(self, facts: LiveFacts, tf: TransferFunction, several: int = 1) -> tuple[Table, LiveFacts]:
-        """Of a layer its table and what is said of it, under a function."""
+        """Return a layer's table and facts under a function."""
         if facts.labels:
-            raise DataError("what is shown carries labels; expected no function")
+            raise DataError("the cloud carries labels; expected labels, not a function")
         assert tf.opacity_unit_distance is not None
         distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
         table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
         return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
 
     def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
-        """Of a layer of labels the same, of what a page sends."""
-        entries = {label.number: label for label in labels_sent(sent).labels}
+        """Return a layer's palette and facts under labels that a page sends."""
+        entries = {label.number: label for label in parse_labels(sent).labels}
         if sorted(entries) != sorted(label.number for label in facts.labels):
-            raise DataError("the page's labels: other ones than what is shown; expected all of it")
+            raise DataError("the page's labels differ from the cloud's; expected all of these")
         labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
         return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
 
-    def labelled(self, sent: Any, light: Any = None) -> Cloud:
-        """The same with other colours and opacities of its labels; ``sent`` as `labels_sent`, ``light`` as of `under`.
+    def with_labels(self, sent: Any, light: Any = None) -> Cloud:
+        """Return the cloud with other colours and opacities of its labels (``sent`` as in `parse_labels`).
 
         Raises:
-            DataError, UsageError: they are none, or not of these labels.
+            DataError, UsageError: labels or a light that are not valid, or labels of another cloud.
         """
         palette, facts = self._labels(self._alone("labels"), sent, self.options.unit_distance or 1.0)
         check_labels([LabelTable("the page's labels", facts.labels)])
         return self._shown(palette, light, replace(self.options, live=facts))
 
-    def layered(self, sent: Any, light: Any = None) -> Cloud:
-        """The same with other looks of its layers; ``sent``: of each a function or labels, ``light`` as of `under`.
+    def with_layers(self, sent: Any, light: Any = None) -> Cloud:
+        """Return the cloud with other looks of its layers; ``sent`` has a function or labels for each.
 
         Raises:
-            DataError, UsageError: they are none, or not of these layers.
+            DataError, UsageError: looks or a light that are not valid, or looks of other layers.
         """
         layers = () if self.options.live is None else self.options.live.layers
         if not isinstance(sent, list) or len(sent) != len(layers) or not all(isinstance(one, dict) for one in sent):
@@ -150,7 +150,7 @@ class Cloud:
                 tables.append(palette)
                 facts.append(own)
                 continue
-            tf = function_sent(one.get("function"))
+            tf = parse_function(one.get("function"))
             table, own = self._function(layer, tf, len(layers))
             tables.append(table)
             facts.append(replace(own, distance=tf.opacity_unit_distance))
@@ -161,21 +161,21 @@ class Cloud:
         return self._shown(LayerTables(tuple(tables)), light, options)
 
     def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
-        """Baked under a light that the page sends, or the file's."""
-        from vvgt_cli.conversion.live import lit
+        """Return the cloud baked under looks and a light: the page's, or else the file's."""
+        from vvgt_cli.conversion.live import apply_light
 
         lighting = self.options.light if light is None else parse_light(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
-        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
+        found = as_stored(apply_light(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
         return replace(self, gaussians=found, options=options, ply=None)
 
 
-def labels_sent(sent: Any) -> LabelTable:
-    """The labels that a page has sent: a list of number, color (RGB in [0, 1]) and opacity.
+def parse_labels(sent: Any) -> LabelTable:
+    """Return the labels of a page: a list of number, color (RGB in [0, 1]) and opacity.
 
     Raises:
-        DataError: they are none.
+        DataError: labels that are not valid.
     """
     what = "the page's labels"
     if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
@@ -191,11 +191,11 @@ def labels_sent(sent: Any) -> LabelTable:
     return LabelTable(what, tuple(sorted(found, key=lambda label: label.number)))
 
 
-def function_sent(sent: Any) -> TransferFunction:
-    """The function that a page has sent.
+def parse_function(sent: Any) -> TransferFunction:
+    """Return the function of a page.
 
     Raises:
-        DataError: none, or one without the distance that its opacity is per.
+        DataError: no function, or one without an opacity unit distance.
     """
     what = "the page's function"
     if not isinstance(sent, dict) or not isinstance(sent.get("points"), list) or len(sent["points"]) > NODES:
@@ -208,15 +208,15 @@ def function_sent(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
-    """The text of a page, named "", and the file that it asks for.
+def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
+    """Return the text of a page, named "", and the file that it loads.
 
     Args:
-        cloud: what it shows, live where that can be.
-        converts: the volume is at hand, to be converted for a function, where it has one layer.
+        cloud: what it shows, live if possible.
+        converts: whether the volume can be converted for a function, which needs a single layer.
 
     Raises:
-        DataError: a library is missing that pages of live Gaussians need.
+        DataError: a library that pages of live Gaussians need is missing.
     """
     if not cloud.live:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"
@@ -232,114 +232,115 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
     return {"": text.encode("utf-8"), name: file}
 
 
-class Desk:
-    """What the server has for the page, as it comes: progress, the live form, better ones.
+class PageController:
+    """State of the page, and answers to its requests: progress, the live form, better conversions.
 
     Args:
-        parts, posts: of the site; filled in here.
+        resources, posts: of the site; filled in here.
         name: of what is shown, without ending.
         console: for messages.
     """
 
     def __init__(
-        self, parts: dict[str, Part], posts: dict[str, Callable[[Any], Part]], name: str, console: Console
+        self, resources: dict[str, Resource], posts: dict[str, Callable[[Any], Resource]], name: str, console: Console
     ) -> None:  # fmt: skip
-        self.parts, self.posts, self.name, self.console = parts, posts, name, console
+        """Create the state of a page without Gaussians."""
+        self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
         self.first: Callable[[], Cloud] | None = None
         self.better: bytes | None = None
         self.converter: Converter | None = None
-        self.begun = threading.Event()  # the volume has been read, or cannot be
-        self.there = threading.Event()  # the first page, or an error
+        self.ready = threading.Event()  # the volume has been read, or cannot be
+        self.shown = threading.Event()  # the first page, or an error
         self.waited_for = False  # by a page, for the first one
         self.state: dict[str, Any] = {"number": 0, "state": "first", "said": "starting"}
 
     def await_volume(self, converter: Converter) -> None:
-        """Begin with the live form of a volume; a page that asks meanwhile waits for it."""
+        """Start the live form of a volume; pages opened meanwhile wait for it."""
         self.converter = converter
         text = waiting_page(self.name, SCRIPT).encode("utf-8")
-        self.parts[""] = Part(HTML, lambda: text)
-        self.parts["state"] = Part(JSON, self._told)
+        self.resources[""] = Resource(HTML, lambda: text)
+        self.resources["state"] = Resource(JSON, self._state_json)
         with converter.lock:
-            converter.ask(None)
+            converter.submit(None)
 
     def show(self, cloud: Cloud) -> None:
-        """Show the Gaussians of a file, live where they can be."""
+        """Show the Gaussians of a file, live if possible."""
         self.first = lambda: cloud
         try:
-            parts = page_of(cloud, converts=False)
+            files = page_files(cloud, converts=False)
         except DataError as error:
-            self.console.say(f"{error}; shown under the file's own function")
-            parts = page_of(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
-        self._show(parts, cloud.live)
+            self.console.message(f"{error}; shown under the file's own function")
+            files = page_files(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
+        self._show(files, cloud.live)
 
-    def _show(self, parts: dict[str, bytes], live: bool) -> None:
+    def _show(self, files: dict[str, bytes], live: bool) -> None:
         if live:
             self.posts["save"] = self.save
         if live and self.converter is not None:
             self.posts["function"] = self.function
-        for name, content in parts.items():
-            self.parts[name] = _part(content, BYTES if name else HTML)
-        self.there.set()
+        for name, content in files.items():
+            self.resources[name] = _resource(content, BYTES if name else HTML)
+        self.shown.set()
 
-    def _told(self) -> bytes:
-        self.waited_for = self.waited_for or not self.there.is_set()
+    def _state_json(self) -> bytes:
+        self.waited_for = self.waited_for or not self.shown.is_set()
         return json.dumps(self.state).encode()
 
-    def function(self, sent: Any) -> Part:
-        """Convert the volume for a function, or labels, that the page sends, or for none: what is being done ends.
+    def function(self, sent: Any) -> Resource:
+        """Convert the volume for a function or labels that the page sends; None ends the running conversion.
 
         Raises:
-            DataError: it is neither.
+            DataError: neither a function nor labels.
         """
         assert self.converter is not None
         tf: Job = None
         if sent is not None:
-            tf = labels_sent(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else function_sent(sent)
+            tf = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
             check_labels([tf])
         with self.converter.lock:
-            self.parts.pop(f"{self.state['number']}.ply", None)
+            self.resources.pop(f"{self.state['number']}.ply", None)
             self.better = None
             if tf is None:
                 self.converter.cancel()
                 self.state = {"number": -1, "state": "none", "said": ""}
             else:
-                number = self.converter.ask(tf)
+                number = self.converter.submit(tf)
                 self.state = {"number": number, "state": "working", "said": "beginning"}
             answer = json.dumps({"number": self.state["number"]}).encode()
-        return Part(JSON, lambda: answer)
+        return Resource(JSON, lambda: answer)
 
-    def save(self, sent: Any) -> Part:
-        """A file of what is shown: a better form by its number, else the first one, under a function if one is sent.
+    def save(self, sent: Any) -> Resource:
+        """Return a file of what is shown: a conversion by its number, else the first cloud under the look that is sent.
 
         Raises:
-            DataError: something else is asked for, or what was shown is not there any more.
+            DataError: an invalid request, or a conversion that was replaced.
         """
         keys = {"file", "number", "function", "labels", "layers", "light"}
         if not isinstance(sent, dict) or sent.get("file") not in ("ply", "html") or not set(sent) <= keys:
             raise DataError(
-                "what to save: expected file, ply or html, and a number, or a function, labels or layers, and a light"
+                "save: expected file (ply or html), and optionally number, or function, labels or layers, and light"
             )
         better, number = self.better, sent.get("number")
         if number is not None and (better is None or number != self.state["number"]):
-            raise DataError("what was shown is not there any more; try again")
+            raise DataError("that conversion was replaced by another; try again")
         assert self.first is not None
         cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
         if sent.get("function") is not None and cloud.live:
-            cloud = cloud.under(function_sent(sent["function"]), sent.get("light"))
+            cloud = cloud.with_function(parse_function(sent["function"]), sent.get("light"))
         if sent.get("labels") is not None and cloud.live:
-            cloud = cloud.labelled(sent["labels"], sent.get("light"))
+            cloud = cloud.with_labels(sent["labels"], sent.get("light"))
         if sent.get("layers") is not None and cloud.live:
-            cloud = cloud.layered(sent["layers"], sent.get("light"))
+            cloud = cloud.with_layers(sent["layers"], sent.get("light"))
         return cloud.file(sent["file"])
 
-    def hear(self, number: int, message: Message) -> None:
-        """What the converter has to say of a job, in its thread."""
-        first = not self.there.is_set()
-        if isinstance(message, Said):
+    def on_message(self, number: int, message: Message) -> None:
+        """Handle a message of the converter, on its thread."""
+        first = not self.shown.is_set()
+        if isinstance(message, ConsoleLine):
             if first:
-                self.console.say(message.line)
-                self.begun.set()
+                self.console.message(message.line)
+                self.ready.set()
         elif isinstance(message, Progress):
             if self.state["state"] in ("first", "working"):
                 self.state = {**self.state, "said": message.text}
@@ -352,42 +353,42 @@ class Desk:
         else:
             self._better(number, message)
 
-    def _first(self, made: Made) -> None:
+    def _first(self, made: Converted) -> None:
         self.first = cache(lambda: Cloud.of(made.ply, self.name))
-        self._show(made.parts, made.live)
+        self._show(made.files, made.live)
         self.state = {"number": 0, "state": "none", "said": ""}
 
-    def _better(self, number: int, made: Made) -> None:
+    def _better(self, number: int, made: Converted) -> None:
         self.better = made.ply
-        self.parts[f"{number}.ply"] = _part(made.parts["ply"], BYTES)
+        self.resources[f"{number}.ply"] = _resource(made.files["ply"], BYTES)
         self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
-        self.console.say("converted for the function of the page")
+        self.console.message("converted for the page's function")
 
     def _failed(self, number: int, error: VvgtError) -> None:
         if self.state["state"] in ("first", "working"):
-            if not self.there.is_set():
+            if not self.shown.is_set():
                 self.error = error
             self.state = {"number": number, "state": "failed", "said": str(error)}
-            self.there.set()
-            self.begun.set()
+            self.shown.set()
+            self.ready.set()
             return
         if self.state["state"] == "done":
             self.state = {**self.state, "said": f"converted, not scored: {error}", "scored": True}
-        self.console.say(f"not scored: {error}")
+        self.console.message(f"not scored: {error}")
 
     def _scored(self, scored: Scored) -> None:
         if self.better is not None:
             self.better = scored.ply
             self.state = {**self.state, "said": f"converted, {scored.psnr:.1f} dB", "scored": True}
-        self.console.say(f"{scored.psnr:.1f} dB on the test views")
+        self.console.message(f"{scored.psnr:.1f} dB on the test views")
 
 
-def _part(content: bytes, kind: str) -> Part:
-    return Part(kind, lambda: content)
+def _resource(content: bytes, kind: str) -> Resource:
+    return Resource(kind, lambda: content)
 
 
 def plain_name(path: str) -> str:
-    """A name to save under, of a file's: letters, digits and a few signs."""
+    """Return a file's name to save under: letters, digits, dot, underscore, blank and dash."""
     known = next((suffix for suffix in reversed(SUFFIXES) if path.lower().endswith(suffix)), "")
     name = volume_name(Path(path.removeprefix("example:")[: len(path) - len(known)]))
     found = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")

@@ -1,4 +1,4 @@
-"""`optimize`: Gaussians refined by gradient descent on views, and the stage of `convert` that does it."""
+"""`optimize`: refinement of Gaussians by gradient descent on views."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HOLD_OUT = 8  # of so many training views one decides, where the folder has no c
 
 @dataclass(frozen=True)
 class OptimizeRequest:
-    """A whole refinement.
+    """A refinement.
 
     Attributes:
         ply: Gaussians to start from, "-" for standard input, or a stream of them.
@@ -39,8 +39,8 @@ class OptimizeRequest:
         output: `.ply` to write, "-" for standard output, None for none.
         options: how to descend, and when to stop.
         size: pixels along the edge of the screen that the file is made for; None: the file's, or the views'.
-        rule: of `vvgt_cli.gaussians.rules` to fit to; None: the file's, or inria.
-        sh_degree: of the harmonics that are refined and written, 0 to 3; None: the file's.
+        rule: one of `vvgt_cli.gaussians.rules` to fit to; None: the file's, or inria.
+        sh_degree: degree of the harmonics that are refined and written, 0 to 3; None: the file's.
         report: JSON to write, "-" for standard output, None for none.
         overwrite: replace files that exist.
     """
@@ -56,21 +56,21 @@ class OptimizeRequest:
     overwrite: bool = False
 
     def outputs(self) -> list[Output]:
-        """Everything that will be written."""
+        """Return all files that will be written."""
         report = [Output("--report", self.report, (".json",), binary=False)] if self.report else []
         return [*([Output("-o", self.output, (".ply",))] if self.output else []), *report]
 
     def inputs(self) -> list[str]:
-        """Files that are read."""
+        """Return the files that are read."""
         return [self.ply] if isinstance(self.ply, str) else []
 
 
 def optimize_file(request: OptimizeRequest, console: Console | None = None) -> ConversionReport:
-    """Refine a `.ply`: fitted to the training views, decided by the check views, reported on the test views.
+    """Refine a `.ply` and write it: fitted to training views, selected by check views, scored on test views.
 
     Raises:
-        UsageError: an output that may not be written; found before anything is read.
-        DataError: a `.ply` or a folder of views that is not one.
+        UsageError: an output that may not be written; raised before anything is read.
+        DataError: a `.ply` or a folder of views that is not valid.
     """
     if request.options.checkpoint:
         check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], request.inputs(), True)
@@ -86,10 +86,10 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
 
 
 def optimized(run: Run, request: OptimizeRequest) -> Result:
-    """The refinement, with nothing written but its checkpoint.
+    """Refine Gaussians without writing anything but the checkpoint.
 
     Raises:
-        DataError: a `.ply` or a folder of views that is not one.
+        DataError: a `.ply` or a folder of views that is not valid.
     """
     with run.stage("read") as stage:
         start, header = open_gaussians(request.ply)
@@ -98,7 +98,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
     with run.stage("views") as stage:
         train, check, held_out = load_sets(request.views)
         test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
-        stage.note = f"{len(train)} to fit to, {len(check)} to check by{held_out}"
+        stage.note = f"{len(train)} training views, {len(check)} check views{held_out}"
     run.compile(for_degree(OPTIMIZE, start.degree))
     edge = train.cameras[0].width
     size, asked = request.size or header.made_for or edge, file_rule(header, request.rule)
@@ -119,7 +119,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
 
 
 def load_sets(folder: str) -> tuple[Views, Views, str]:
-    """Training and check views, and a remark where the check views were taken from the training views.
+    """Return training views, check views, and a remark if the check views were taken from the training views.
 
     Raises:
         DataError: not a folder of views.
@@ -129,7 +129,7 @@ def load_sets(folder: str) -> tuple[Views, Views, str]:
         return train, Views(*load_views(folder, "check")), ""
     count = len(train)
     if count < 2:
-        raise DataError(f"{folder}: {count} training view; expected two or more: one of them decides what is kept")
+        raise DataError(f"{folder}: {count} training view; expected two or more, one of them to select the result")
     held = np.arange(min(HOLD_OUT, count) - 1, count, HOLD_OUT)
     rest = np.setdiff1d(np.arange(count), held)
     return train.take(rest), train.take(held), f" (every {HOLD_OUT}th training view, held out)"
@@ -153,11 +153,11 @@ def _mean(test: Views, gaussians: Gaussians, rule: Rule, perceptual: bool) -> Sc
 
 
 def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:
-    """Options of the budget, of which there is one.
+    """Return the options of the budget: either steps or seconds.
 
     Raises:
-        UsageError: both, or none.
+        UsageError: both, or neither.
     """
     if (steps is None) == (seconds is None):
-        raise UsageError("give --steps N or --time-budget SECONDS, one of the two")
+        raise UsageError("give either --steps N or --time-budget SECONDS")
     return {"steps": steps, "time_budget": seconds}

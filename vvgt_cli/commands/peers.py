@@ -1,4 +1,4 @@
-"""Other trainers in a report: outside commands that read our views and leave a file of Gaussians (docs/peers.md)."""
+"""Other trainers in a report: outside commands that read our views and write a file of Gaussians (docs/peers.md)."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Peer:
 
     @classmethod
     def of(cls, text: str) -> Peer:
-        """``NAME=COMMAND``.
+        """Parse ``NAME=COMMAND``.
 
         Raises:
-            UsageError: no name, or a command that names no views or no output.
+            UsageError: no name, or a command without a place for the views or the output.
         """
         name, _, command = text.partition("=")
         try:
@@ -52,18 +52,18 @@ class Peer:
         return cls(name.strip(), words)
 
     def words(self, views: Path, out: Path) -> list[str]:
-        """The command with its places filled in."""
+        """Return the command with its places filled in."""
         return [word.replace(VIEWS, str(views)).replace(OUT, str(out)) for word in self.command]
 
 
 @dataclass(frozen=True)
 class PeerViews:
-    """What every peer reads.
+    """Views that every peer reads.
 
     Attributes:
-        folder: that `vvgt render-views` wrote.
+        folder: written by `vvgt render-views`.
         count: training views.
-        stage: how long they took.
+        stage: time that they took.
     """
 
     folder: Path
@@ -74,7 +74,7 @@ class PeerViews:
     def render(
         cls, source: SourceRequest, folder: Path, count: int, size: int, blocks: BlockOptions | None
     ) -> PeerViews:
-        """``count`` training views of ``size`` px, as PNG, transforms.json and COLMAP with points to start from.
+        """Render ``count`` training views of ``size`` px as PNG, with transforms.json, COLMAP and points to start from.
 
         Raises:
             DataError, UsageError: as `vvgt render-views`.
@@ -90,11 +90,11 @@ class PeerViews:
 
 
 def train(peer: Peer, views: PeerViews) -> tuple[ConversionReport, Gaussians]:
-    """Run a peer: its report, with the seconds of its views and its own, and its Gaussians in the unit frame.
+    """Run a peer; return its report, timed with its views, and its Gaussians in the unit frame.
 
     Raises:
         UsageError: no such program.
-        DataError: it fails, or leaves no file of Gaussians.
+        DataError: it fails, or writes no file of Gaussians.
     """
     folder = views.folder.parent
     out = folder / "peer.ply"
@@ -110,10 +110,10 @@ def train(peer: Peer, views: PeerViews) -> tuple[ConversionReport, Gaussians]:
             raise UsageError(f"--peer {peer.name}: {peer.command[0]}: {error.strerror}; expected a program") from None
         stage.note = shlex.join(peer.command)
     if done.returncode or not out.is_file():
-        said = (done.stderr.strip() or done.stdout.strip()).decode("utf-8", "replace").splitlines()
+        output = (done.stderr.strip() or done.stdout.strip()).decode("utf-8", "replace").splitlines()
         why = f"exit status {done.returncode}" if done.returncode else f"left no {OUT}"
-        last = f": {said[-1][-TAIL:]}" if said else ""
-        raise DataError(f"--peer {peer.name}: {why}{last}; expected a .ply of Gaussians; try the command by itself")
+        last = f": {output[-1][-TAIL:]}" if output else ""
+        raise DataError(f"--peer {peer.name}: {why}{last}; expected a .ply of Gaussians; run it alone to see why")
     gaussians, _ = open_gaussians(str(out))
     run.report.gaussians, run.report.bytes = len(gaussians), out.stat().st_size
     return run.finish(), gaussians

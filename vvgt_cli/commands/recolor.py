@@ -1,4 +1,4 @@
-"""`recolor`: a file whose Gaussians carry values, shown under another function, without the volume."""
+"""`recolor`: live Gaussians shown under another function, without the volume."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
-from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look, placed_function, under_function
+from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, parse_layer_look, resolve_look
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.look.lighting import LightOptions
@@ -17,11 +17,11 @@ from vvgt_cli.score.record import ConversionReport, Run
 
 @dataclass(frozen=True)
 class RecolorRequest:
-    """What to show, and where.
+    """Live Gaussians, and the look to write.
 
     Attributes:
-        ply: a file whose Gaussians carry values, "-" for standard input.
-        function: by which.
+        ply: a live file, "-" for standard input.
+        function: look to show it under.
         output: file to write, of any format; "-" for a `.ply` on standard output.
         overwrite: replace it if it exists.
     """
@@ -33,10 +33,10 @@ class RecolorRequest:
 
 
 def recolor(request: RecolorRequest, console: Console | None = None) -> None:
-    """Write an ordinary file of the function's look.
+    """Write an ordinary file of live Gaussians under a function.
 
     Raises:
-        DataError: a file without values, or a function that shows nothing of them.
+        DataError: a file without values, or a function that hides them all.
         UsageError: an output that may not be written.
     """
     run = Run(console or Console(), ConversionReport("recolor"))
@@ -47,8 +47,8 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
             gaussians, header = open_gaussians(request.ply)
             stage.note = f"{len(gaussians)} Gaussians"
         with run.stage("recolor") as stage:
-            tf, options = placed_function(request.ply, header, function)
-            found = under_function(gaussians, header, tf, options)
+            tf, options = resolve_look(request.ply, header, function)
+            found = apply_function(gaussians, header, tf, options)
             stage.note = f"{len(found)} of them visible under {tf.name}"
         write_gaussians(run, request.output, found, options, request.overwrite)
     run.finish()
@@ -62,10 +62,10 @@ def function_of(
     light: Mapping[str, Any] | None = None,
     layers: Sequence[str] = (),
 ) -> FunctionRequest | None:
-    """What options of a command add up to; None where none is given.
+    """Return the request that a command's options make, None if no option is given.
 
     Raises:
-        UsageError: a layer's look that is none.
+        UsageError: an invalid look of a layer.
     """
     looks = tuple(map(parse_layer_look, layers))
     found = FunctionRequest(tf, tf_range, unit_distance, labels, LightOptions(**(light or {})), looks)

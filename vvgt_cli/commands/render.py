@@ -1,4 +1,4 @@
-"""`render`: pictures of Gaussians with the view set that they were made with, or a movie."""
+"""`render`: pictures or a movie of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
-from vvgt_cli.conversion.recolored import FunctionRequest, shown
+from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
@@ -34,20 +34,20 @@ Seen = Callable[[Camera], Gaussians]  # what a camera is shown
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """Pictures to make.
+    """Pictures to draw.
 
     Attributes:
-        ply: Gaussians, "-" for standard input; of levels those that a name asks for
+        ply: Gaussians, "-" for standard input; of streamed levels those that the name selects
             (`vvgt_cli.gaussians.formats.levels`).
-        output: directory for the images, or a movie by its name (`vvgt_cli.images.movies.SUFFIXES`).
+        output: directory for the images, or a movie by its ending (`vvgt_cli.images.movies.SUFFIXES`).
         camera: view-set file, or None.
-        orbit: number of views on a circle around the file's way up, or None; one of the two is given.
+        orbit: number of views on a circle around the file's up axis, or None; one of the two is given.
         size: image height in pixels; None: the view set's own, or what the file is made for.
-        rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
+        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
         exr: write EXR too.
-        background: RGB in [0, 1] that pictures stand on, None for transparent PNGs and black movies.
+        background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
         overwrite: replace images that exist.
-        function: that Gaussians which carry values are shown under; None: the look of the file.
+        function: look to show live Gaussians under; None: the look of the file.
     """
 
     ply: str
@@ -63,11 +63,11 @@ class RenderRequest:
 
     @property
     def movie(self) -> bool:
-        """Whether the output is one file of moving pictures."""
+        """Return whether the output is a movie."""
         return Path(self.output).suffix.lower() in SUFFIXES
 
     def cameras(self, size: int | None = None, up: str = "none") -> list[Camera]:
-        """The views asked for; of an orbit, ``size``: pixels where none are, ``up``: axis that it circles."""
+        """Return the views; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults."""
         if self.camera is not None:
             return read_cameras(self.camera, self.size)
         cameras = orbit_views(self.orbit or 0, size=self.size or size or SIZE)
@@ -88,18 +88,18 @@ def _check_directory(request: RenderRequest, names: list[str]) -> None:
 
 
 def render_file(request: RenderRequest, console: Console | None = None) -> int:
-    """Write one PNG (and EXR) a view and `transforms.json`, or a movie of the views; returns their number.
+    """Write one PNG (and EXR) per view and `transforms.json`, or a movie of the views; return their number.
 
     Raises:
-        UsageError: an image exists, or the directory cannot be.
-        DataError: Gaussians or a view set that are none, a library for movies that is not installed.
+        UsageError: an image exists, or the directory cannot be made.
+        DataError: Gaussians or a view set that are not valid, or a missing library for movies.
     """
     console = console or Console()
     run = Run(console, ConversionReport("render"))
     cameras = request.cameras()
     if request.movie:
         if request.exr:
-            raise UsageError(f"--exr is of single pictures, -o {request.output} is a movie; leave one of them out")
+            raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
         check_outputs([Output("-o", request.output)], [request.ply], request.overwrite)
         movie_ready(request.output)
     else:
@@ -117,11 +117,11 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
 
 
 def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
-    """What a camera is shown, what all are or the coarsest level of it, and the header."""
+    """Return the Gaussians for a camera, those for all cameras or the coarsest level, and the header."""
     manifest = by_view(request.ply)
     if manifest is None:
         gaussians, header = open_gaussians(request.ply)
-        gaussians = shown(request.ply, gaussians, header, request.function)
+        gaussians = recolored(request.ply, gaussians, header, request.function)
         return lambda camera: gaussians, gaussians, header
     levels = StreamedLevels(manifest)
     coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
@@ -131,11 +131,11 @@ def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
         field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
         return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), request.ply))
 
-    return seen, shown(request.ply, coarsest, header, request.function), header
+    return seen, recolored(request.ply, coarsest, header, request.function), header
 
 
 def _pictures(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
-    """PNG, EXR and `transforms.json`; where they are."""
+    """Write PNG, EXR and `transforms.json`; return the directory."""
     from vvgt_cli.images import over, write_exr, write_png
     from vvgt_cli.splat import render
 
@@ -155,7 +155,7 @@ def _pictures(request: RenderRequest, console: Console, seen: Seen, cameras: lis
 
 
 def _movie(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
-    """One file; its name and what it holds.
+    """Write one movie; return its name and what it holds.
 
     Raises:
         UsageError: views of several sizes.

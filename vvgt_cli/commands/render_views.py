@@ -1,4 +1,4 @@
-"""`render-views`: calibrated views of a volume that trainers can use, resumable and in parts."""
+"""`render-views`: calibrated views of a volume for trainers, resumable and divisible into shards."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ SPHERE, ORBIT = "sphere", "orbit"
 
 @dataclass(frozen=True)
 class CameraRequest:
-    """Which views.
+    """Views to render.
 
     Attributes:
         kind: ``sphere``, ``orbit`` or the path of a `transforms.json`.
-        views, test_views: their numbers; None: 24 and 10. With a file both come from it.
+        views, test_views: their numbers; None: 24 and 10. A file decides both.
         size: image height in pixels; None: the file's, or 400.
         fov: vertical field of view in degrees, None: 40.
         radius: distance from the centre, unit frame, None: 3.
@@ -64,11 +64,11 @@ class CameraRequest:
     radius: float | None = None
 
     def make(self) -> list[View]:
-        """The views, those for training first.
+        """Return the views, training views first.
 
         Raises:
             UsageError: options that a file of cameras decides, or no such file.
-            DataError: a file that is none, or views of one name.
+            DataError: an invalid file, or views of one name.
         """
         if self.kind not in (SPHERE, ORBIT):
             return self._read()
@@ -88,7 +88,7 @@ class CameraRequest:
         }  # fmt: skip
         for option, value in given.items():
             if value is not None:
-                raise UsageError(f"{option} {value}: with --cameras FILE the file says that; leave it out")
+                raise UsageError(f"{option} {value}: the file of --cameras decides this; omit it")
         if not Path(self.kind).is_file():
             raise UsageError(f"--cameras {self.kind}: no such file; expected sphere, orbit or a transforms.json")
         views: dict[str, View] = {}
@@ -102,26 +102,26 @@ class CameraRequest:
                 )
             views[name] = View("test" if frame.test else "train", replace(frame.camera, name=name))
         if all(frame.test for frame in frames):
-            raise DataError(f"{self.kind}: every view is one for testing; expected some to train on")
+            raise DataError(f"{self.kind}: all views are test views; expected some training views")
         return list(views.values())
 
 
 @dataclass(frozen=True)
 class ViewsRequest:
-    """A set of views for each of some functions.
+    """A set of views for each function.
 
     Attributes:
-        source: what to read; its ``tf`` is not used.
-        tfs: transfer functions; none: one made from the histogram.
-        output: directory; with several functions each gets a directory of its name in it.
-        cameras: which views.
-        layout: which files.
+        source: volume to read; its ``tf`` is not used.
+        tfs: transfer functions; empty: one made from the histogram.
+        output: directory; several functions get a subdirectory each, by name.
+        cameras: views to render.
+        layout: files to write.
         renderer: ``vvgt`` or ``vtk``.
         samples: rays along a pixel's edge everywhere, None: 5 or 13 where neighbours differ, else 1.
         step: sampling distance in voxels.
-        shard: which part of the views to render.
-        overwrite: start afresh where another run's views are.
-        blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
+        shard: part of the views to render.
+        overwrite: replace the views of another run.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
         device: "cpu" or "cuda", where our own renderer casts the rays of a volume in memory.
     """
 
@@ -139,7 +139,7 @@ class ViewsRequest:
     device: str = "cpu"
 
     def folders(self) -> list[Path]:
-        """A folder a function.
+        """Return one folder per function.
 
         Raises:
             UsageError: two functions of one name, or a folder that cannot be made.
@@ -161,7 +161,7 @@ class ViewsRequest:
 
 
 def function_name(tf: str) -> str:
-    """Folder of a function: its file's stem, `#Preset` and colour-map ranges with it, as plain characters."""
+    """Return the folder name of a function: its file's stem, `#Preset` and colour-map range in plain characters."""
     path, _, pick = tf.partition("#")
     name = re.sub(r"\.json$", "", path.replace("\\", "/").rpartition("/")[2], flags=re.I)
     return re.sub(r"[^\w.-]+", "_", f"{name}-{pick}" if pick else name).strip(".") or "function"
@@ -169,7 +169,7 @@ def function_name(tf: str) -> str:
 
 @dataclass
 class _Job:
-    """One function's folder and what is to be done in it."""
+    """One function's folder and the views to render there."""
 
     source: Source
     manifest: Manifest
@@ -184,18 +184,18 @@ class _Job:
 
 
 def render_view_sets(request: ViewsRequest, console: Console | None = None) -> int:
-    """Render what is missing; returns the number of views rendered.
+    """Render the missing views and return their number.
 
     Raises:
         UsageError: a folder with another run's views or unknown files, or options that do not fit.
-        DataError: input that is not what it must be, or a function that shows nothing.
+        DataError: invalid input, or a function that shows nothing.
     """
     if request.overwrite and request.shard.count > 1:
         raise UsageError(
-            "--overwrite with --shard: parts would remove each other's files; remove the directory instead"
+            "--overwrite with --shard: shards would remove each other's files; remove the directory instead"
         )
     if request.renderer == "vtk" and request.samples not in (None, 1):
-        raise UsageError(f"--samples {request.samples}: VTK shoots one ray a pixel; leave it out")
+        raise UsageError(f"--samples {request.samples}: VTK casts one ray per pixel; omit it")
     run = Run(console or Console(), ConversionReport("render-views"))
     views, folders = request.cameras.make(), request.folders()
     with ExitStack() as stack:
@@ -212,7 +212,7 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
         if volume.sheared:
             raise DataError(
                 f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
-                "volume; resample it first ('vvgt convert' takes it)"
+                "volume; resample it first ('vvgt convert' accepts it)"
             )
         lit = [source for source in sources if source.lighting is not None]
         lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
@@ -230,7 +230,7 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
 
 
 def _settings(request: ViewsRequest, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
-    """Everything that the files depend on; named as the command line names it."""
+    """Return everything that the files depend on, named as on the command line."""
     cameras = {split: [view.camera for view in views if view.split == split] for split in ("train", "test")}
     sizes = dict.fromkeys(f"{view.camera.width} x {view.camera.height}" for view in views)
     return {
@@ -257,7 +257,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
 def _plan(
     request: ViewsRequest, views: list[View], folders: list[Path], sources: list[Source], fields: list[Blocked] | None
 ) -> list[_Job]:
-    """See in every folder what is there, before anything is written."""
+    """Find what is missing in every folder, before anything is written."""
     content, layout = volume_digest(sources[0].volume), request.layout
     first = request.shard.index == 1  # the first part describes the set
     jobs = []
@@ -274,7 +274,7 @@ def _plan(
 
 
 def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None:
-    """Whatever is missing of one function's folder; nothing is written before all that may fail early has not."""
+    """Make what is missing in one function's folder; whatever may fail early runs before the first write."""
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.dvr.backends import view_renderer
 
@@ -289,7 +289,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         points = partial(field_points, job.field)
     elif job.pending or models:
         with run.stage("scene") as stage:
-            scene = on_device(job.source.scene(), request.device, run.console.say)
+            scene = on_device(job.source.scene(), request.device, run.console.message)
             stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
         inside = view_renderer(request.renderer, scene, settings) if job.pending else None
         draw = None if inside is None else render_in_box(inside, scene.volume.axes)
@@ -334,26 +334,26 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
 
 
 def _keep(job: _Job, layout: Layout, view: View, image: np.ndarray) -> list[str]:
-    """Write a view's images, and keep its thumbnail where it is that of what was written; their relative paths."""
+    """Write a view's images, keep its thumbnail if no pixel is rounded, and return the relative paths."""
     if layout.exact:
         job.small[view.stem] = thumbnail(image, view.camera)
     return layout.write(job.folder, view, image)
 
 
 def _remove_leftovers(job: _Job, layout: Layout) -> None:
-    """Remove the temporary files of this part's views that a run killed outright has left."""
+    """Remove temporary files of this shard's views that a killed run left."""
     for path in (job.folder / name for view in job.pending for name in layout.files(view)):
         for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):
             left.unlink(missing_ok=True)
 
 
 def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
-    """The contact sheet, once every part's views are there: whoever finds them all writes it."""
+    """Write the contact sheet once all shards' views exist; the run that completes them does it."""
     manifest = job.manifest
     manifest.refresh()
     names = [name for view in views for name in layout.files(view)]
     if not all(manifest.complete(name, content=False) for name in names):
-        run.console.say(f"{job.folder}: other parts' views are missing; the part that completes them writes {CONTACT}")
+        run.console.message(f"{job.folder}: views of other shards are missing; the last shard writes {CONTACT}")
         return
     if job.pending or not manifest.complete(CONTACT):
         with run.stage("contact sheet"):

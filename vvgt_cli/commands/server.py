@@ -1,7 +1,7 @@
-"""The server of `vvgt view`: on this machine's own address, one page and its files, for the browser that has its name.
+"""Server of `vvgt view`: one page and its files, on this machine's own address, for the browser that has the URL.
 
-Other users of the machine, and other pages in the browser, can reach the port too. So the page's path has a random
-part, and what does not name this host, comes from another page, or asks for anything else gets nothing.
+Other users of the machine and other pages in the browser can reach the port too. So the page's path has a random word,
+and requests that name another host, come from another page, or ask for anything else are refused.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _HEADERS = {
 
 
 @dataclass(frozen=True)
-class Part:
-    """What stands at a path.
+class Resource:
+    """Content at a path.
 
     Attributes:
         kind: media type.
         content: called for each request.
-        packed: by gzip, as browsers unpack it.
+        packed: whether the content is compressed by gzip.
     """
 
     kind: str
@@ -51,23 +51,23 @@ class Part:
 
 @dataclass(frozen=True)
 class Site:
-    """Parts by name; "" is the page.
+    """Resources by name; "" is the page.
 
     Attributes:
-        parts: what there is; may change.
-        failed: is told what went wrong with a part.
-        posts: what takes JSON that the page sends to a name, and gives the answer's part; a `VvgtError` is an answer
-            with its reason (400).
+        resources: what can be fetched; may change.
+        failed: called with the reason when a resource cannot be read.
+        posts: functions that take the JSON sent to a name and return the answer; a `VvgtError` becomes an answer with
+            its reason (400).
         word: random part of the paths.
     """
 
-    parts: dict[str, Part]
+    resources: dict[str, Resource]
     failed: Callable[[str], None]
-    posts: dict[str, Callable[[Any], Part]] = field(default_factory=dict)
+    posts: dict[str, Callable[[Any], Resource]] = field(default_factory=dict)
     word: str = field(default_factory=lambda: secrets.token_urlsafe(12))
 
     def name(self, path: str) -> str | None:
-        """What a path of a request names, to the letter; None where it is another's."""
+        """Return the exact name in a request's path; None if the path lacks the word."""
         return path.removeprefix(f"/{self.word}/") if path.startswith(f"/{self.word}/") else None
 
 
@@ -77,7 +77,7 @@ def served(site: Site, port: int = 0) -> Iterator[str]:
 
     Args:
         site: the page and its files.
-        port: 0 takes one that is free.
+        port: 0 takes a free one.
 
     Yields:
         URL of the page.
@@ -89,7 +89,7 @@ def served(site: Site, port: int = 0) -> Iterator[str]:
     try:
         server = _Server((ADDRESS, port), handler)
     except OSError as error:
-        raise UsageError(f"--port {port}: {error.strerror or error}; try another, or leave it out") from None
+        raise UsageError(f"--port {port}: {error.strerror or error}; try another port, or omit --port") from None
     thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()
     try:
@@ -104,7 +104,7 @@ class _Server(ThreadingHTTPServer):
     block_on_close = False
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A browser that goes away in the middle is none."""
+        """Ignore a browser that closes the connection."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -114,17 +114,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         name = self.site.name(self.path) if self._ours() else None
-        part = None if name is None else self.site.parts.get(name)
-        if part is None:
+        resource = None if name is None else self.site.resources.get(name)
+        if resource is None:
             self.send_error(404 if self._ours() else 403)
             return
         try:
-            content = part.content()
+            content = resource.content()
         except (VvgtError, OSError) as error:
             self.site.failed(str(error))
             self.send_error(500)
             return
-        self._answer(200, part, content)
+        self._answer(200, resource, content)
 
     do_HEAD = do_GET
 
@@ -142,19 +142,19 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(413)
             return
         try:
-            part = taken(_parsed(self.rfile.read(int(length))))
-            content = part.content()
+            resource = taken(_parsed(self.rfile.read(int(length))))
+            content = resource.content()
         except VvgtError as error:
-            part = Part("text/plain; charset=utf-8", lambda: b"")
-            self._answer(400, part, " ".join(str(error).split()).encode())
+            resource = Resource("text/plain; charset=utf-8", lambda: b"")
+            self._answer(400, resource, " ".join(str(error).split()).encode())
             return
-        self._answer(200, part, content)
+        self._answer(200, resource, content)
 
-    def _answer(self, status: int, part: Part, content: bytes) -> None:
+    def _answer(self, status: int, resource: Resource, content: bytes) -> None:
         self.send_response_only(status)
-        self.send_header("Content-Type", part.kind)
+        self.send_header("Content-Type", resource.kind)
         self.send_header("Content-Length", str(len(content)))
-        if part.packed:
+        if resource.packed:
             self.send_header("Content-Encoding", "gzip")
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -163,7 +163,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def _ours(self) -> bool:
-        """Whether a request names this machine, and comes from the page itself or from nowhere."""
+        """Return whether a request names this machine and comes from the page itself or from no page."""
         host = self.headers.get("Host", "")
         origin = self.headers.get("Origin")
         if _name(f"http://{host}") not in NAMES or self.headers.get("Sec-Fetch-Site", "none") not in (
@@ -174,26 +174,26 @@ class _Handler(BaseHTTPRequestHandler):
         return origin is None or origin == f"http://{host}"
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """A status and nothing else; what was sent along is not read."""
+        """Send a status and nothing else; the request's body is not read."""
         self.send_response_only(405 if code == 501 else code)  # of a method that there is not
         self.send_header("Content-Length", "0")
         self.send_header("Connection", "close")
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Requests are not talked about."""
+        """Log nothing."""
 
 
 def _parsed(content: bytes) -> Any:
-    """JSON that was sent.
+    """Parse JSON that was sent.
 
     Raises:
-        DataError: it is none.
+        DataError: not JSON.
     """
     try:
         return json.loads(content.decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"what was sent is no JSON ({error}); expected an object") from None
+        raise DataError(f"the request is not JSON ({error}); expected an object") from None
 
 
 def _no_number(text: str) -> None:

@@ -22,7 +22,7 @@ def show_transfer_function(
     if output == STDOUT:
         raise UsageError("-o -: a picture goes to a file; expected a name ending in .png")
     if volume is None and (tf_range != "data" or read != ReadOptions()):
-        raise UsageError("--tf-range and the options that say how to read a volume need --volume")
+        raise UsageError("--tf-range and reading options need --volume")
     check_outputs([Output("-o", output, (".png",))], [tf, volume], overwrite)
     function = read_transfer_function(tf)
     numbers = None

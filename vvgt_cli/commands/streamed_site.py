@@ -1,4 +1,4 @@
-"""What the server of `vvgt view` has of streamed SOG: the page, the manifest, and the files that it names."""
+"""Files that the server of `vvgt view` offers for streamed SOG: the page, the manifest, and what that names."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.commands.live_site import HTML, JSON, SCRIPT
-from vvgt_cli.commands.server import Part
+from vvgt_cli.commands.server import Resource
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.page_file import camera, page
 from vvgt_cli.gaussians.formats.sog_images import IMAGES, META
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, placed, read_manifest
 
 
-def streamed_parts(file: str) -> dict[str, Part]:
-    """By name; "" is the page.
+def streamed_resources(file: str) -> dict[str, Resource]:
+    """Return the resources by name; "" is the page.
 
     Raises:
-        DataError: not a manifest, or a file of it is missing.
+        DataError: not a manifest, or a file that it names is missing.
     """
     manifest, folder = read_manifest(file), Path(file).parent
-    parts = {MANIFEST: Part(JSON, Path(file).read_bytes)}
+    resources = {MANIFEST: Resource(JSON, Path(file).read_bytes)}
     for name in manifest["filenames"]:
         if not (folder / name).is_file():
             raise DataError(f"{file}: {folder / name} is missing; expected the whole folder")
-        parts[name] = Part(JSON, (folder / name).read_bytes)
+        resources[name] = Resource(JSON, (folder / name).read_bytes)
         for image in IMAGES:
             path = (folder / name).with_name(f"{image}.webp")
-            parts[f"{name.removesuffix(META)}{path.name}"] = Part("image/webp", partial(path.read_bytes))
+            resources[f"{name.removesuffix(META)}{path.name}"] = Resource("image/webp", partial(path.read_bytes))
     splats, scale = placed(manifest)
     more: dict[str, Any] = {"streamed": True, "camera": _larger(camera(splats), scale), "outermost": []}
     name = Path(file).absolute().parent.name
     text = page(f"{name} - vvgt", splats, [{"name": name, "file": MANIFEST}], SCRIPT, more)
-    return parts | {"": Part(HTML, lambda: text.encode("utf-8"))}
+    return resources | {"": Resource(HTML, lambda: text.encode("utf-8"))}
 
 
 def _larger(view: dict[str, Any], scale: float) -> dict[str, Any]:

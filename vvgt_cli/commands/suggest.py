@@ -14,11 +14,11 @@ from vvgt_cli.volume import ReadOptions
 def suggest_transfer_functions(
     volume: str, count: int, output: str, read: ReadOptions, overwrite: bool, console: Console | None = None
 ) -> list[Path]:
-    """Write ``count`` minimal-JSON functions into the folder ``output``, made if it is not there; returns their paths.
+    """Write ``count`` minimal-JSON functions into the folder ``output``, made if missing; return their paths.
 
     Raises:
-        UsageError: a file that exists, or a folder that cannot be.
-        DataError: input that is not what it must be, or data of a single value.
+        UsageError: a file that exists, or a folder that cannot be made.
+        DataError: invalid input, or data of a single value.
     """
     from vvgt_cli.look.suggest import suggest
     from vvgt_cli.synth.sources import open_volume
@@ -45,5 +45,5 @@ def suggest_transfer_functions(
             write_text(str(path), suggestion.to_json(), overwrite)
         stage.note = f"{count} functions in {folder}"
     for path, suggestion in zip(paths, suggestions, strict=True):
-        run.console.say(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
+        run.console.message(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
     return paths

@@ -1,4 +1,4 @@
-"""`synth`: a volume made from nothing, written as NRRD."""
+"""`synth`: a synthetic volume, written as NRRD."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class SynthRequest:
     Attributes:
         kind: "isotropic", "stratified", or a name of `vvgt_cli.synth.shapes.SHAPES`.
         output: .nrrd to write.
-        size: voxels a side; None for the kind's own.
-        seed: which of its volumes.
-        field, turnovers: of turbulence; None for the kind's own.
+        size: voxels along an edge; None for the kind's default.
+        seed: random seed.
+        field, turnovers: of turbulence; None for the kind's default.
         overwrite: replace a file that exists.
     """
 
@@ -39,16 +39,16 @@ def synthesise(request: SynthRequest, console: Console | None = None) -> Convers
     """Make the volume and write it.
 
     Raises:
-        UsageError: options that the kind does not have, an output that may not be written.
-        DataError: a volume that memory does not hold.
+        UsageError: options that the kind does not have, or an output that may not be written.
+        DataError: a volume too large for memory.
     """
     from vvgt_cli.synth.shapes import SHAPES
 
     shape = request.kind in SHAPES
     if shape and (request.field or request.turnovers is not None):
-        raise UsageError(f"synth {request.kind}: --field and --turnovers are of isotropic and stratified turbulence")
+        raise UsageError(f"synth {request.kind}: --field and --turnovers apply only to turbulence")
     if request.field == "temperature" and request.kind != "stratified":
-        raise UsageError(f"synth {request.kind}: --field temperature is of stratified turbulence alone")
+        raise UsageError(f"synth {request.kind}: --field temperature applies only to stratified turbulence")
     with claimed([Output("-o", request.output, (".nrrd",))], [], request.overwrite):
         return _make(request, Run(console or Console(), ConversionReport("synth")), shape)
 
@@ -69,7 +69,7 @@ def _make(request: SynthRequest, run: Run, shape: bool) -> ConversionReport:
 
 
 def _turbulence(request: SynthRequest, console: Console) -> tuple[Volume, str]:
-    """The volume, and what there is to say about the flow."""
+    """Return the volume, and a note about the flow."""
     from vvgt_cli.synth import turbulence
     from vvgt_cli.synth.analytic import volume_of
 

@@ -1,4 +1,4 @@
-"""`vvgt tf convert`: a transfer function from any format that is read to one that is written."""
+"""`vvgt tf convert`: a transfer function in another format."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ def convert_transfer_function(
         form: "minimal" or "paraview".
         tf_range: "data", or "LO,HI" to stretch the nodes to.
         overwrite: replace a file that exists.
+        console: for messages.
 
     Raises:
-        UsageError: an output that may not be written, ``rescale`` (there are no data), fractions and no LO,HI.
-        DataError: a file that is no function, or one that the format cannot hold.
+        UsageError: an output that may not be written, ``rescale`` (there are no data), or fractions without LO,HI.
+        DataError: not a function, or one that the format cannot store.
     """
     from vvgt_cli.look import read_transfer_function
     from vvgt_cli.look.convert import placed, to_text
@@ -36,10 +37,10 @@ def convert_transfer_function(
     text = to_text(function, form)
     distance = PER_VOXEL if function.opacity_unit_label == PER_VOXEL else f"{function.opacity_unit_distance or 0:g}"
     if form == "paraview" and distance != "0":
-        (console or Console()).say(
-            f"{output}: a ParaView preset holds no unit distance: set it to {distance} there, or give "
+        (console or Console()).message(
+            f"{output}: a ParaView preset stores no unit distance: set it to {distance} there, or give "
             f"--opacity-unit-distance {distance} here"
         )
     if form == "paraview" and function.lighting is not None:
-        (console or Console()).say(f"{output}: a ParaView preset holds no shading: it is left out (--light headlight)")
+        (console or Console()).message(f"{output}: a ParaView preset stores no shading; use --light headlight with it")
     write_text(output, text, overwrite)

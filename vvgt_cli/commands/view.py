@@ -1,4 +1,4 @@
-"""`view`: Gaussians in a browser, from a server on this machine, or written as what others can open."""
+"""`view`: Gaussians shown in a browser by a local server, or written in another format."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from functools import partial
 from pathlib import Path
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, Desk, plain_name, stored
-from vvgt_cli.commands.server import Part, Site, served
-from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, PageController, plain_name, stored
+from vvgt_cli.commands.server import Resource, Site, served
+from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
-from vvgt_cli.conversion.readback import tell_agreement
+from vvgt_cli.conversion.readback import report_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -33,20 +33,20 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.tiff.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
-SOON = 10.0  # seconds of reading after which a page is shown that waits; what fails sooner is told without one
+SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
 LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What to show.
+    """Gaussians or a volume to show.
 
     Attributes:
         files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume.
-        source: how to read the volume, and its function; of files of Gaussians as it is by default.
-        output: file to write in place of showing, None for none.
+        source: how to read the volume, and its function; left at its defaults for files of Gaussians.
+        output: file to write instead of showing, None for none.
         port: of the server; 0 takes a free one.
-        browser: open one, where there is a display.
+        browser: open one, if there is a display.
         overwrite: replace the file if it exists.
     """
 
@@ -62,13 +62,14 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
     """Show Gaussians until an interrupt, or write them.
 
     Args:
-        request: what and how.
-        announce: is told the page's URL, once it can be opened.
-        console: for talk.
+        request: files and options.
+        announce: called with the page's URL once it can be opened.
+        console: for messages.
 
     Raises:
-        UsageError: several volumes, options of volumes with files of Gaussians, a port or an output that cannot be.
-        DataError: a file that is not what it must be.
+        UsageError: several volumes, options of volumes with files of Gaussians, or a port or an output that cannot be
+            used.
+        DataError: a file that is not valid.
     """
     run = Run(console or Console(), ConversionReport("view"))
     clouds = named_files(request.files)
@@ -83,17 +84,17 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
-        tell_agreement(run, request.output, gaussians, options)
+        report_agreement(run, request.output, gaussians, options)
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
-    """Several files into one page."""
+    """Write several files into one page."""
     files = [file for _, file in clouds]
     _only_gaussians(files)
     _refuse_reading(request.source, files[0])
     if request.output is None or not is_page(request.output):
         raise UsageError(
-            f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
+            f"-o {request.output}: holds one file, got {len(files)}; expected a page (.html), which holds several"
         )
     with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
         names = [name for name, _ in clouds]
@@ -103,27 +104,27 @@ def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> 
 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
-    """Options that are of volumes, with a file of Gaussians."""
+    """Refuse options for volumes with a file of Gaussians."""
     plain = SourceRequest(given.volume)
     if replace(given, volume=plain.volume, light=plain.light) != plain:
         raise UsageError(
-            f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
+            f"{name} holds Gaussians; --tf, --labels, --layer and reading options are for volumes only: omit them"
         )
 
 
 def _only_gaussians(files: Sequence[str]) -> None:
-    """Of several files."""
+    """Refuse several files that are not all ordinary files of Gaussians."""
     if any(map(is_streamed, files)):
-        raise UsageError(f"{next(filter(is_streamed, files))}: is shown by itself; expected no other file")
+        raise UsageError(f"{next(filter(is_streamed, files))}: streamed levels are shown alone; expected no other file")
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(
-            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
+            f"{(volumes or [STDIN])[0]}: not Gaussians; a series needs files of Gaussians: convert it first"
         )
 
 
 def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Name and file of what files, globs and indexes of `vvgt convert` hold.
+    """Return name and path of the files that names, globs and indexes of `vvgt convert` stand for.
 
     Raises:
         UsageError: as `expanded`.
@@ -137,7 +138,7 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def expanded(names: Sequence[str]) -> list[str]:
-    """Files of names and globs; those of a glob by the numbers in their names.
+    """Return the files that names and globs stand for; those of a glob sorted by the numbers in their names.
 
     Raises:
         UsageError: a glob that matches nothing.
@@ -152,7 +153,7 @@ def expanded(names: Sequence[str]) -> list[str]:
 
 
 def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions]:
-    """Gaussians in the unit frame and how a file of them is laid out; a volume is converted."""
+    """Return Gaussians in the unit frame and how to write them; a volume is converted."""
     given = request.source
     if name == STDIN or is_splats(name):
         _refuse_reading(given, name)
@@ -171,39 +172,39 @@ def _serve(
     files = [file for _, file in clouds]
     if len(files) > 1:
         _only_gaussians(files)
-    parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
-    site = Site(parts, run.console.say)
-    desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
+    resources = {"viewer.js": Resource("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
+    site = Site(resources, run.console.message)
+    controller = PageController(site.resources, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
         if is_streamed(files[0]):
             _refuse_reading(request.source, files[0])
-            parts |= streamed_parts(files[0])
+            resources |= streamed_resources(files[0])
         elif len(files) > 1:
             _refuse_reading(request.source, files[0])
-            parts |= _series(clouds)
+            resources |= _series(clouds)
         elif files[0] == STDIN or is_splats(files[0]):
             _refuse_reading(request.source, files[0])
             gaussians, header = open_gaussians(files[0])
-            desk.show(Cloud(gaussians, layout_of(header), desk.name))
+            controller.show(Cloud(gaussians, layout_of(header), controller.name))
         url = stack.enter_context(served(site, request.port))
-        if not parts.get(""):
+        if not resources.get(""):
             source = replace(request.source, volume=files[0])
-            desk.await_volume(stack.enter_context(Converter(source, desk.name, desk.hear)))
-            desk.begun.wait(SOON)
-        if desk.error is None:
+            controller.await_volume(stack.enter_context(Converter(source, controller.name, controller.on_message)))
+            controller.ready.wait(SOON)
+        if controller.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)
-            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
-        while desk.error is None:
+            run.console.message(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C stops")
+        while controller.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
-        if desk.waited_for:
+        if controller.waited_for:
             time.sleep(LINGER)
-        raise desk.error
+        raise controller.error
 
 
-def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
-    """The page of several files, and each as it is asked for."""
+def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
+    """Return the page of several files, and each file, read when it is requested."""
 
     def content(k: int) -> bytes:
         gaussians, header = open_gaussians(clouds[k][1])
@@ -211,10 +212,10 @@ def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
 
     first, frames = content(0), [{"name": name, "file": f"{k}.ply"} for k, (name, _) in enumerate(clouds)]
     text = page(f"{clouds[0][0]} - vvgt", columns_of(first, clouds[0][1]), frames, SCRIPT)
-    parts = {f"{k}.ply": Part(BYTES, partial(content, k)) for k in range(len(clouds))}
-    return parts | {"": Part(HTML, lambda: text.encode("utf-8")), "0.ply": Part(BYTES, lambda: first)}
+    resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
+    return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
 
 
 def display() -> bool:
-    """Whether a browser would have a screen: else `webbrowser` may start one of those for terminals."""
+    """Return whether a browser would have a screen; without one `webbrowser` may start a text browser."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -39,19 +39,19 @@ class View:
 
     @property
     def stem(self) -> str:
-        """Relative path of its images without suffix."""
+        """Return the relative path of its images without suffix."""
         return f"{self.split}/{self.camera.name}"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which files a view becomes.
+    """Files that a view is written to.
 
     Attributes:
         format: ``exr``, ``png`` or ``both``.
         half: EXR in 16 bits.
-        background: RGB that the opaque images for COLMAP and the contact sheet stand on.
-        points: with a cloud to start from.
+        background: RGB behind the opaque images for COLMAP and the contact sheet.
+        points: include an initial point cloud.
     """
 
     format: str = "both"
@@ -61,16 +61,16 @@ class Layout:
 
     @property
     def suffix(self) -> str:
-        """Of the images that `transforms.json` names."""
+        """Return the suffix of the images that `transforms.json` names."""
         return ".exr" if self.format == "exr" else ".png"
 
     @property
     def exact(self) -> bool:
-        """Whether a view's pixels are on disk as they were rendered."""
+        """Return whether a view's pixels are stored as they were rendered."""
         return self.format != "png" and not self.half
 
     def files(self, view: View) -> list[str]:
-        """Relative paths of a view's images."""
+        """Return the relative paths of a view's images."""
         stem, names = view.stem, []
         if self.format != "png":
             names.append(f"{stem}.exr")
@@ -81,14 +81,16 @@ class Layout:
         return names
 
     def folders(self, views: Sequence[View]) -> list[str]:
-        """Relative paths of the folders that hold the images and the COLMAP model."""
+        """Return the relative paths of the folders that hold the images and the COLMAP model."""
         names = [name for view in views for name in self.files(view)]
         return sorted({name.rpartition("/")[0] for name in names} | ({"sparse/0"} if self.format != "exr" else set()))
 
     def write(self, folder: Path, view: View, image: np.ndarray) -> list[str]:
-        """Write a view's images, replacing what is there; returns their relative paths.
+        """Write a view's images, replacing existing ones, and return their relative paths.
 
         Args:
+            folder: of the set.
+            view: camera and split.
             image: (h, w, 4) float32 premultiplied RGBA.
         """
         for name in (files := self.files(view)):
@@ -101,7 +103,7 @@ class Layout:
         return files
 
     def descriptions(self, views: Sequence[View]) -> dict[str, bytes]:
-        """The `transforms` files by relative path; the splits share no view."""
+        """Return the `transforms` files by relative path; the splits share no view."""
         train = [view for view in views if view.split == "train"]
         test = [view for view in views if view.split == "test"]
         names = {split: [view.stem + self.suffix for view in of] for split, of in (("train", train), ("test", test))}
@@ -116,11 +118,12 @@ class Layout:
         return {name: text.encode() for name, text in files.items()}
 
     def models(self, views: Sequence[View], points: np.ndarray, colors: np.ndarray) -> dict[str, bytes]:
-        """The point cloud, and with PNG the COLMAP model of the training views, by relative path.
+        """Return the point cloud, and with PNG the COLMAP model of the training views, by relative path.
 
         Args:
-            views: all of them.
-            points, colors: (n, 3) each; none where the layout is without.
+            views: of both splits.
+            points: (n, 3); empty if the layout has no points.
+            colors: (n, 3).
         """
         files = {POINTS_FILE: point_cloud_ply(points, colors)} if self.points else {}
         if self.format != "exr":
@@ -130,15 +133,15 @@ class Layout:
         return files
 
     def model_names(self) -> list[str]:
-        """Relative paths of what `models` gives."""
+        """Return the relative paths of the files of `models`."""
         colmap = [f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")]
         return [*([POINTS_FILE] if self.points else []), *(colmap if self.format != "exr" else [])]
 
 
 def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none where no view sees anything.
+    """Return centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none if nothing is visible.
 
-    Of a large volume every second voxel along each axis is enough, or every third, ...: points lie as far apart.
+    Large volumes are subsampled along each axis: the points lie much farther apart than voxels.
 
     Args:
         scene: the volume under its function.
@@ -159,7 +162,7 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """`start_points` of a volume in blocks."""
+    """Return the `start_points` of a volume in blocks."""
     from vvgt_cli.closed_form import VbmOptions
 
     found = field.pyramid(VbmOptions(POINTS, size)).gaussians
@@ -169,7 +172,7 @@ def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _thinned(scene: Scene, every: np.ndarray) -> Scene:
-    """The scene of the middle one of every so many voxels (x, y, z), from the same corner on."""
+    """Return the scene of every ``every``-th voxel (x, y, z), the middle one of each group."""
     if every.max() == 1:
         return scene
     volume, data = scene.volume, scene.volume.data if scene.grid is None else scene.grid
@@ -184,7 +187,7 @@ def _thinned(scene: Scene, every: np.ndarray) -> Scene:
 
 
 def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """A camera's ``image`` (h, w, 4) float32, at most `THUMBNAIL` pixels wide and high."""
+    """Return a camera's ``image`` (h, w, 4) float32, averaged down to at most `THUMBNAIL` pixels a side."""
     factor = _factor(camera)
     h, w = image.shape[0] // factor, image.shape[1] // factor
     small: np.ndarray = image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
@@ -194,7 +197,7 @@ def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
 def thumbnails(
     folder: Path, views: Sequence[View], background: Sequence[float], known: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """The contact sheet of the views on disk: (H, W, 3) float32 in [0, 1], training views first.
+    """Return the contact sheet of the views on disk, (H, W, 3) float32 in [0, 1], training views first.
 
     ``known``: some views' thumbnails, by stem.
     """

@@ -1,4 +1,4 @@
-"""Views for trainers of a volume of which only blocks are in memory."""
+"""Views for trainers of a volume that is processed in blocks."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ def fields_of(
     renderer: str,
     stack: ExitStack,
 ) -> list[Blocked] | None:
-    """A field in blocks for each function, None where the volume is read as a whole.
+    """Open a field in blocks for each function, None if the volume is read as a whole.
 
     Args:
-        run: tells the console.
+        run: reports to the console.
         source: the volume; its ``tf`` is not used.
-        options: of blocks, None: as is better.
-        functions: of each folder.
+        options: of blocks, None: automatic.
+        functions: by folder.
         size: pixels of a view's height.
-        renderer: that is asked for.
-        stack: what the fields are closed with.
+        renderer: requested ray caster.
+        stack: closes the fields.
 
     Raises:
         UsageError: a renderer that needs the volume in memory.
@@ -67,7 +67,7 @@ def fields_of(
 def draw_in_blocks(
     field: Blocked, settings: RenderSettings, cameras: Sequence[Camera]
 ) -> Callable[[Camera], np.ndarray]:
-    """What draws a volume in blocks, as many of the ``cameras`` to come at once as `TOGETHER` allows."""
+    """Return a function that draws a volume in blocks; at most `TOGETHER` pixels of coming views at once."""
     axes = field.source.volume.axes
     left = list(cameras)
 

@@ -1,7 +1,7 @@
-"""A batch: several clouds of one run, as files with an index, as one page, or in memory.
+"""Batches: several clouds of one run, as files with an index, as one page, or in memory.
 
 A batch is the frames of a series (`frames`), several functions, or the labels of a map (`labels`): it yields an `Item`
-for each cloud, and `convert_batch` converts them. `CANNOT` says which options do not go with which kind.
+for each cloud, and `convert_batch` converts them. `CANNOT` lists the options that each kind of batch does not take.
 """
 
 from __future__ import annotations
@@ -13,11 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.index import (
-    FRAMES,
-    FUNCTIONS,
-    LABELS,
-)
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import NONE, content_of, open_content
@@ -32,45 +28,45 @@ if TYPE_CHECKING:
 ONE, LIVE, LEVELS, PAGE = "one volume", "--live", "streamed levels", "a page of several clouds"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
-CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and what to do
-    ONE: {"--shard": "a volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
+CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
+    ONE: {"--shard": "one volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
     FRAMES: {
-        "--checkpoint": "a series resumes from its manifest; leave it out",
+        "--checkpoint": "a series resumes from its manifest; remove it",
         "--dry-run": "a plan is for one volume; try it on one of the frames",
-        "after": "a series starts from its own frames; leave it out",
+        "after": "a series starts from its own frames; remove it",
     },
     FUNCTIONS: {
         "--checkpoint": "it is for one conversion; run the functions one by one",
         "--dry-run": "a plan is for one function; try it on one of them",
         "--shard": "shards are for series; run the functions one by one",
-        "--live": "one live file can be shown under any function ('vvgt recolor'); give one --tf",
+        "--live": "one live file can be shown under any function by 'vvgt recolor'; give one --tf",
         "--split-labels": "labels have a table of their own; give one or the other",
-        "after": "one conversion starts from one; give one function",
+        "after": "only one conversion can start from another; give one function",
     },
     LABELS: {
-        "--tf": "the colours of labels come from --labels; leave it out",
-        "--layer": "only the label map is divided; leave it out",
-        "--labels none": "there are no labels then; leave it out",
-        "--dry-run": "a plan is for one file; leave it out",
-        "--shard": "shards are for series; leave it out",
-        "--checkpoint": "it is for one conversion; leave it out",
+        "--tf": "the colours of labels come from --labels; remove it",
+        "--layer": "only the label map is divided; remove it",
+        "--labels none": "it needs labels; remove it",
+        "--dry-run": "a plan is for one file; remove it",
+        "--shard": "shards are for series; remove it",
+        "--checkpoint": "it is for one conversion; remove it",
         "--max-size": WHOLE,
-        "--time-budget": "several conversions share the work; try --steps",
-        "--live": "a live file of the whole map can show each label alone; leave one of them out",
-        "after": "one conversion starts from one; leave it out",
+        "--time-budget": "it is for one conversion, and there are several; try --steps",
+        "--live": "a live file of the whole map can show each label alone; remove one of them",
+        "after": "only one conversion can start from another; remove it",
     },
-    LIVE: {"--dry-run": "live files are made in one way; leave it out", "after": "live files are quick; leave it out"},
+    LIVE: {"--dry-run": "live files need no plan; remove it", "after": "live files need no earlier one; remove it"},
     LEVELS: dict.fromkeys(
         (
             *("several --tf", "--steps", "--model", "--rule", "--target-psnr", "--time-budget", "--max-size", "--live"),
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
-        "levels are those of one closed form; leave it out",
+        "levels are made by one closed form alone; remove it",
     ),
     PAGE: {
-        "--report": "reports are for one cloud each; give -o a place for the name, as out_{}.ply",
-        "--preview": "previews are of one cloud each; give -o a place for the name, as out_{}.ply",
-        "--checkpoint": "it is for one conversion; give -o a place for the name, as out_{}.ply",
+        "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
+        "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
+        "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
         "--max-size": WHOLE,
     },
 }
@@ -81,11 +77,11 @@ class Item:
     """One cloud of a batch.
 
     Attributes:
-        name: in the index, on pages and as a key.
-        stem: in file names: a frame's number, a function's name, a label's number and name.
-        request: of its conversion, without outputs.
-        facts: for the index.
-        gaussians: box frame, where they are made already and need only scores.
+        name: name in the index, on pages and as a key.
+        stem: part of file names: a frame's number, a function's name, a label's number and name.
+        request: request of its conversion, without outputs.
+        facts: further entries of its row in the index.
+        gaussians: finished Gaussians, box frame, that only need scores; None where they are yet to be made.
     """
 
     name: str
@@ -100,12 +96,12 @@ class Batch(ABC):
 
     Attributes:
         kind: `FRAMES`, `FUNCTIONS` or `LABELS`.
-        request: what all share; its outputs have a place for the name.
+        request: request that all share; its outputs have a place for the name.
         volume: name of the source.
-        stems: of all items; `prepare` may have to find them out first.
-        facts: for the index as a whole.
-        resumes: a later run of the same command takes up where this one ends, by a manifest of `settings`.
-        previous: what each item starts from, where items resemble each other.
+        stems: stems of all items; `prepare` may have to find them first.
+        facts: entries of the index as a whole.
+        resumes: whether a later run of the same command continues where this one ends, by a manifest of `settings`.
+        previous: warm start of each item, where items resemble each other.
     """
 
     kind: str
@@ -113,6 +109,7 @@ class Batch(ABC):
     previous: WarmStart | None = None
 
     def __init__(self, request: ConvertRequest, volume: str, stems: Sequence[str] = ()) -> None:
+        """Store what all items share."""
         self.request, self.volume, self.stems = request, volume, list(stems)
         self.facts: dict[str, Any] = {}
 
@@ -122,15 +119,15 @@ class Batch(ABC):
 
     @abstractmethod
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """Yield the items whose stems are ``wanted``, those that show nothing skipped with a message."""
+        """Yield the items with a stem that is ``wanted``; skip those that show nothing, with a message."""
 
     def settings(self) -> dict[str, Any]:
-        """Return all that the files of a batch that ``resumes`` depend on, once it is prepared."""
+        """Return everything that the files depend on, for a batch that ``resumes`` and is prepared."""
         return {}
 
 
 class Functions(Batch):
-    """One volume under several functions or looks; it is read and laid out once.
+    """One volume under several functions or looks, read and laid out once.
 
     Args:
         requests: name, conversion and, for the index, source of each function.
@@ -139,6 +136,7 @@ class Functions(Batch):
     kind = FUNCTIONS
 
     def __init__(self, requests: Sequence[tuple[str, ConvertRequest, str]]) -> None:
+        """Store the requests, with file names made of their names."""
         request = requests[0][1]
         given = request.source.volume
         volume = Path(given).name if isinstance(given, str) else content_of(given).volumes[0].name
@@ -165,7 +163,7 @@ class Functions(Batch):
         """Yield an item for each function."""
         for number, ((name, request, fact), stem) in enumerate(zip(self._requests, self.stems, strict=True), 1):
             if wanted(stem):
-                run.console.say(f"{fact}: function {number} of {len(self._requests)}")
+                run.console.message(f"{fact}: function {number} of {len(self._requests)}")
                 yield Item(name, stem, request, {"function": fact})
 
 
@@ -186,7 +184,7 @@ def check_options(kind: str, used: Iterable[str]) -> None:
     """Refuse options that a kind of batch or output does not take.
 
     Raises:
-        UsageError: the first of them, and what to do.
+        UsageError: names the first of them, and a remedy.
     """
     for option, why in CANNOT[kind].items():
         if option in used:

@@ -1,4 +1,4 @@
-"""The certificate that a conversion writes into its file, and whether a file's still holds (docs/certificate.md)."""
+"""The certificate that a conversion writes into its file, and its verification (docs/certificate.md)."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views
 
-WITHIN = 0.1  # dB that a file may have lost, by its format
+WITHIN = 0.1  # dB that the file format may cost
 
 
-def certified(
+def with_certificate(
     ply: PlyOptions, run: Run, field: Field, fit: FitOptions, gaussians: Gaussians, command: str | None,
     live_psnr: float | None = None,
 ) -> PlyOptions:  # fmt: skip
-    """Options of a file with the certificate of what the run has measured.
+    """Return the layout of a file with the certificate of the measurements of a run.
 
     Args:
-        ply: the file's options, with its place.
-        run: whose report has the scores.
+        ply: layout of the file, with its place.
+        run: the run; its report has the scores.
         field: the volume under its look.
-        fit: what the Gaussians were made for.
+        fit: options that the Gaussians were made for.
         gaussians: as they are written, unit frame.
-        command: as `Certificate.command`; ``live_psnr``: as of it, not rounded.
+        command: see `Certificate.command`.
+        live_psnr: see `Certificate.live_psnr`; not rounded.
     """
-    scores, seats = run.report.scores, [ViewingCondition(**seat) for seat in run.report.seats or ()]
+    scores, conditions = run.report.scores, [ViewingCondition(**condition) for condition in run.report.conditions or ()]
     if not ply.comments or scores is None:
         return ply
     found = Certificate(
@@ -43,11 +44,11 @@ def certified(
         look=field.source.shown_as(),
         size=fit.size,
         rule=fit.rule,
-        psnr=round(first_views(scores), 2),
+        psnr=round(preview_psnr(scores), 2),
         views=len(PREVIEW_VIEWS),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
-        seats=tuple((seat.name(), round(seat.psnr, 2)) for seat in seats),
-        texture=_texture(run.report.texture),
+        conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
+        texture=_rounded_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
         seconds=round(run.elapsed(), 1) if epoch() is None else None,
         command=command,
@@ -55,14 +56,14 @@ def certified(
     return replace(ply, certificate=found)
 
 
-def _texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
+def _rounded_texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
     if found is None or found["ours"] is None:
         return None
     return round(found["ours"], 3), round(found["reference"], 3)
 
 
-def first_views(scores: dict[str, Any]) -> float:
-    """PSNR, dB, of the test views that every conversion draws, whether others were drawn or not."""
+def preview_psnr(scores: dict[str, Any]) -> float:
+    """Return the mean PSNR (dB) of the test views that every conversion draws."""
     views = scores["per_view"]
     seen = views if len(views) <= len(PREVIEW_VIEWS) else [views[n] for n in PREVIEW_VIEWS]
     shown = [view["psnr"] for view in seen if view["psnr_foreground"] is not None]
@@ -70,8 +71,8 @@ def first_views(scores: dict[str, Any]) -> float:
 
 
 def position_error(gaussians: Gaussians, ply: PlyOptions) -> float:
-    """Greatest distance of a centre as the file rounds it from the centre itself, in units of the world."""
-    if ply.scale is None or ply.centre is None or ply.frame == "unit":  # as they are computed
+    """Return the greatest distance of a centre, as rounded by the file, from its exact position, in world units."""
+    if ply.scale is None or ply.centre is None or ply.frame == "unit":  # the file holds the computed positions
         return 0.0
     exact = gaussians.means.astype(np.float64) / ply.scale + np.array(ply.centre)
     return float(f"{np.linalg.norm(exact.astype(np.float32) - exact, axis=1).max(initial=0):.3g}")
@@ -79,13 +80,13 @@ def position_error(gaussians: Gaussians, ply: PlyOptions) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a certificate still holds.
+    """The result of the verification of a certificate.
 
     Attributes:
-        same_volume: whether the values are those that it was made of; None where it does not say.
-        same_look: whether functions, tables, distances and light are.
-        psnr: dB, of the same views, now.
-        recorded: dB that it says.
+        same_volume: whether the values are those of the certificate; None where it has no digest.
+        same_look: whether functions, tables, distances and light are those of the certificate.
+        psnr: dB of the same views, now.
+        recorded: dB in the certificate.
     """
 
     same_volume: bool | None
@@ -95,34 +96,34 @@ class Verdict:
 
     @property
     def holds(self) -> bool:
-        """All of it."""
+        """Return whether nothing failed."""
         return not list(self.failures())
 
     def failures(self) -> Iterator[str]:
-        """What does not hold, a remark each."""
+        """Yield a message for each failure."""
         if self.same_volume is False:
-            yield "the volume's values are not those that it was made of"
+            yield "the values differ from those of the volume that it was made of"
         if not self.same_look:
             yield "made under another function, other labels, opacity distances or light"
         if not self.psnr >= self.recorded - WITHIN:
             yield f"{self.psnr:.2f} dB, {self.recorded:.2f} dB recorded"
 
     def text(self) -> str:
-        """One line."""
+        """Return the verdict as one line."""
         if not self.holds:
             return f"does not hold: {'; '.join(self.failures())}"
         volume = "the volume was not compared (too large)" if self.same_volume is None else "the same volume"
         return f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
 
 
-def checked(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
-    """A file's certificate against the volume: its digests, and its views drawn and scored again.
+def verify(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
+    """Verify a certificate against the volume: compare digests, and score its views again.
 
     Args:
-        certificate: the file's.
+        certificate: certificate of the file.
         field: the volume under its look.
-        gaussians: the file's, box frame.
-        looked_up: of a live file, they are as `vvgt recolor` shows them, not as they are stored.
+        gaussians: Gaussians of the file, box frame.
+        looked_up: the Gaussians of a live file are as `vvgt recolor` shows them, not as stored.
     """
     from vvgt_cli.dvr import RenderSettings
 

@@ -1,4 +1,4 @@
-"""Where two frames of a series show something else: blocks of voxels, and the Gaussians and pixels that meet them."""
+"""Differences between two frames of a series: blocks of voxels, and the Gaussians and pixels that meet them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from vvgt_cli.splat.reference import rotations
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import read_block
 
-EDGE = 4  # voxels along a block
+EDGE = 4  # voxels along the edge of a block
 AT_ONCE = 1 << 23  # voxels that are compared at once, or `EDGE` slices: about 80 bytes each
-SAME = 1e-5  # of the range of values: less than half a level of 255 after hundreds of frames
-BINS = 4096  # of the range of values, each visible or not
-REACH = 2.0  # standard deviations that a Gaussian meets a block within
+SAME = 1e-5  # share of the range of values: less than half a level of 255 after hundreds of frames
+BINS = 4096  # bins of the range of values, each visible or not
+REACH = 2.0  # standard deviations within which a Gaussian meets a block
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Blocks of `EDGE` voxels along each edge, from the box's corner.
+    """Blocks of `EDGE` voxels along each edge that differ between two frames, from the box's corner.
 
     Attributes:
-        blocks: (nz, ny, nx) bool, whether what is shown there may differ.
-        half: (3,) half extents of the box, box frame; ``edge`` (3,) of a block.
+        blocks: (nz, ny, nx) bool, whether a block may look different.
+        half, edge: (3,) half extents of the box, and edges of a block, box frame.
     """
 
     blocks: np.ndarray
@@ -38,7 +38,7 @@ class Changes:
     edge: np.ndarray
 
     def meet(self, gaussians: Gaussians) -> np.ndarray:
-        """(K,) bool: whether Gaussians of the box frame reach into a block that differs, as boxes around them."""
+        """Return (K,) bool, whether the bounding boxes of Gaussians (box frame) reach into a block that differs."""
         factors = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
         reach = REACH * np.sqrt((factors**2).sum(axis=2))
         most = np.array(self.blocks.shape[::-1])
@@ -54,7 +54,7 @@ class Changes:
         return found > 0
 
     def seen_by(self, camera: Camera) -> np.ndarray:
-        """(rows, columns) bool: the blocks of pixels, from the upper left corner, that show a block that differs."""
+        """Return (rows, columns) bool, the blocks of pixels, from the upper left corner, that show a difference."""
         shown = np.zeros((-(-camera.height // BLOCK), -(-camera.width // BLOCK)), bool)
         if not self.blocks.any():
             return shown
@@ -76,7 +76,7 @@ class Changes:
 
 
 def changes(before: Source, after: Source) -> Changes:
-    """What differs between two frames on one grid, under one function; a slab of each is read at a time."""
+    """Compare two frames on one grid under one function, slab by slab."""
     volume = after.volume
     dims = np.array(volume.dims)
     blocks = np.zeros(tuple(-(-dims[::-1] // EDGE)), bool)
@@ -91,7 +91,7 @@ def changes(before: Source, after: Source) -> Changes:
 
 
 def _slabs(before: Source, after: Source, reach: int) -> Iterator[tuple[int, int, np.ndarray]]:
-    """First and last slice of each slab, and which of its voxels (z, y, x) are near a difference."""
+    """Yield the first and last slice of each slab, and (z, y, x) bool, the voxels near a difference."""
     dims = after.volume.dims
     slab = max(AT_ONCE // (dims[0] * dims[1]) // EDGE, 1) * EDGE
     for z0 in range(0, dims[2], slab):
@@ -107,7 +107,7 @@ def _slabs(before: Source, after: Source, reach: int) -> Iterator[tuple[int, int
 
 
 def _differ(old: Layer, new: Layer, source: Source, low: int, high: int) -> np.ndarray:
-    """Voxels of slices ``low`` to ``high`` at which a layer shows something else, or what is between them does."""
+    """Return (z, y, x) bool of slices ``low`` to ``high``: whether a layer looks different at or around a voxel."""
     if new.colors is not None:
         assert old.colors is not None
         pairs = zip((old.volume, *old.colors), (new.volume, *new.colors), strict=True)
@@ -135,7 +135,7 @@ def _differ(old: Layer, new: Layer, source: Source, low: int, high: int) -> np.n
 
 
 def _visible(tf: TransferFunction, lo: float, hi: float, least: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Whether a function shows anything between ``least`` and ``most``, in steps of the range of values."""
+    """Return bool per voxel, whether a function shows anything between ``least`` and ``most``."""
     scale = BINS / (hi - lo) if hi > lo else 0.0
     marks = np.zeros(BINS + 2, np.int64)
     for begin, end in tf.support(lo, hi):
@@ -157,7 +157,7 @@ def _data(volume: Volume, stored: np.ndarray) -> np.ndarray:
 
 
 def _around(values: np.ndarray, take: np.ufunc) -> np.ndarray:
-    """The largest or smallest of each voxel and its 26 neighbours."""
+    """Apply ``take``, a maximum or minimum, to each voxel and its 26 neighbours."""
     for axis in range(3):
         out = values.copy()
         view, old = np.moveaxis(out, axis, 0), np.moveaxis(values, axis, 0)

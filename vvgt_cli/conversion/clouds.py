@@ -1,4 +1,4 @@
-"""Several clouds of one run in memory: the frames of a series, one volume under several looks, the labels of a map."""
+"""Several clouds of one run in memory: frames of a series, one volume under several looks, or labels of a map."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(repr=False)
 class Cloud(Result):
-    """One of several, without its volume.
+    """One of several clouds, without its volume.
 
     Attributes:
-        name: among the others.
-        stem: in a file's name: a frame's number, a function's name, a label's number and name.
-        facts: as an index has them.
-        directions: normals (K, 3) of a `.ply`, unit frame; None for zeros.
+        name: name among the others.
+        stem: part of file names: a frame's number, a function's name, a label's number and name.
+        facts: entries of the index.
+        directions: normals (K, 3) for a `.ply`, unit frame; None for zeros.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Cloud(Result):
     directions: np.ndarray | None
 
     def normals(self) -> np.ndarray | None:
-        """See `Result.normals`."""
+        """Implement `Result.normals`."""
         return self.directions
 
 
@@ -49,9 +49,9 @@ class Clouds(Mapping[str, Result]):
 
     Attributes:
         kind: "frames", "functions" or "labels".
-        volume: its name.
+        volume: name of the volume.
         clouds: the results.
-        facts: as an index has them.
+        facts: entries of the index.
     """
 
     kind: str
@@ -60,34 +60,38 @@ class Clouds(Mapping[str, Result]):
     facts: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Result:
+        """Return the result of a name."""
         for cloud in self.clouds:
             if cloud.name == name:
                 return cloud
         raise KeyError(f"{name}: expected one of {', '.join(self)}")
 
     def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
         return iter(cloud.name for cloud in self.clouds)
 
     def __len__(self) -> int:
+        """Return the number of clouds."""
         return len(self.clouds)
 
     def __repr__(self) -> str:
+        """Return kind, volume and names."""
         return f"<{len(self)} {self.kind} of {self.volume}: {', '.join(self)}>"
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = True, **how: Any) -> int:
-        """Write a page of all, or a file of each and their index.
+        """Write one page of all clouds, or a file of each with an index.
 
         Args:
-            path: a page (``.html``); or a name with a place for each one's (``{}``, of frames ``{:04d}``, too), which
-                without one comes behind it: ``x_{}.ply`` of ``x.ply``. The index is then ``x_index.json``.
+            path: a page (``.html``), or a pattern with a place for the name (``{}``, for frames also ``{:04d}``);
+                without one, ``x.ply`` means ``x_{}.ply``. The index is ``x_index.json``.
             overwrite: replace files that exist.
-            **how: frame, up, sh_degree and comments of the files, as of `Result.save`.
+            **how: frame, up, sh_degree and comments of the files; see `Result.save`.
 
         Returns:
-            Bytes written, without the index.
+            Number of bytes written, without the index.
 
         Raises:
-            UsageError: a file that exists, two of one name, a value that is none of these; before anything is written.
+            UsageError: a file exists, two share a name, or a value is invalid; raised before anything is written.
             DataError: a library that the format needs is not installed.
         """
         name = os.fspath(path)
@@ -110,14 +114,14 @@ class Clouds(Mapping[str, Result]):
         return total
 
     def recolor(self, look: str | TransferFunction | None = None, **how: Any) -> Clouds:
-        """All of them under one other function, of clouds that carry values: `Result.recolor` of each.
+        """Return all live clouds under another function: `Result.recolor` of each.
 
         Args:
-            look: file, colour map's name, or a function; None: that which they have.
-            **how: range, unit_distance, labels and light, as of `Result.recolor`.
+            look: file, colour map's name, or a function; None: their own.
+            **how: range, unit_distance, labels and light; see `Result.recolor`.
 
         Raises:
-            DataError, UsageError: as `Result.recolor`.
+            DataError, UsageError: see `Result.recolor`.
         """
         found = []
         for cloud in self.clouds:
@@ -126,20 +130,20 @@ class Clouds(Mapping[str, Result]):
         return replace(self, clouds=found)
 
     def _page(self, path: str, overwrite: bool, how: dict[str, Any]) -> int:
-        """All in one file."""
+        """Write one page of all clouds."""
         if how:
-            raise UsageError(f"{path}: a page shows the unit frame as it is; leave out {', '.join(how)}")
+            raise UsageError(f"{path}: a page shows the unit frame unchanged; remove {', '.join(how)}")
         with atomic_write(path, overwrite) as temporary:
             return temporary.write_bytes(self._html(path))
 
     def _html(self, name: str) -> bytes:
-        """The page of all."""
+        """Return one page of all clouds."""
         from vvgt_cli.gaussians.formats.page_live import page_of_several
 
         return page_of_several([(cloud.name, cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
 
     def _repr_html_(self) -> str | None:
-        """What notebooks show; see `Result`."""
+        """Return the page for a notebook; None where a library is missing."""
         from vvgt_cli.gaussians.formats.page_file import iframe
 
         try:

@@ -1,4 +1,4 @@
-"""Convert one volume under a transfer function, stage by stage: `convert` to a file, `convert_in_memory` without."""
+"""The conversion of one volume under a transfer function, stage by stage, to a file or in memory."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from vvgt_cli.conversion.certify import certified
+from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.gaussian_files import write_gaussians
-from vvgt_cli.conversion.live import check_live, live_conversion
-from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
+from vvgt_cli.conversion.live import check_live, convert_live
+from vvgt_cli.conversion.place import placement_warnings, to_unit_frame, up_axis, with_place
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
-from vvgt_cli.conversion.readback import tell_cost
+from vvgt_cli.conversion.readback import report_format_cost
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
-from vvgt_cli.conversion.stages.views import wide
+from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
@@ -27,7 +27,7 @@ from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
-from vvgt_cli.files import check_room
+from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.legend import legend_text
@@ -38,33 +38,33 @@ from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
-QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
-VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: abs(n . v) is even
-SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
+QUICKEST = 0.5  # least pace, where the closed form took less time than estimated
+VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
+SMALLER = (8, 4, 2)  # divisors of the budget that a target is tried with first
 
 
 def convert(
     request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None,
     start: WarmStart | None = None,
 ) -> ConversionReport:  # fmt: skip
-    """Convert a volume to a file, and return the report; arguments as of `run_conversion`.
+    """Convert a volume to a file, and return the report; see `run_conversion` for the arguments.
 
     Raises:
-        UsageError: an output that may not be written; found before anything is read.
-        DataError: invalid input, or a scene that shows nothing.
+        UsageError: an output may not be written; raised before anything is read.
+        DataError: the input is invalid, or nothing is visible.
     """
     request.budget()
     if request.live:
         check_live(request)  # before anything is read
     if request.checkpoint is not None and request.limits.time_budget is not None:
-        raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
+        raise UsageError("--checkpoint needs runs that are repeatable, which --time-budget prevents; give one of them")
     run = Run(console or Console(), ConversionReport("convert"))
     with (
         claimed(request.outputs(), request.inputs(), request.overwrite),
         checkpoint_folder(request.checkpoint),
-        opened(run, request) as field,
+        open_field(run, request) as field,
     ):
-        early = _early(run, request)
+        early = _early_writer(run, request)
         report = _write(run, request, run_conversion(run, request, field, made, start, early), early is not None)
         if request.checkpoint is not None and not report.interrupted:
             Checkpoint(Path(request.checkpoint)).finish()
@@ -75,14 +75,14 @@ def convert_in_memory(
     request: ConvertRequest, console: Console | None = None, start: WarmStart | None = None,
     unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """Convert a volume without writing anything; arguments as of `run_conversion`.
+    """Convert a volume without writing anything; see `run_conversion` for the arguments.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        field = stack.enter_context(opened(run, request))
+        field = stack.enter_context(open_field(run, request))
         conversion = run_conversion(run, request, field, start=start, unscored=unscored)
         weakref.finalize(conversion, stack.pop_all().close)  # the conversion draws the field's blocks
     run.finish()
@@ -93,34 +93,34 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     """Convert a volume to a file by the closed form alone, without rendering anything.
 
     Raises:
-        UsageError, DataError: as `convert`.
+        UsageError, DataError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite), opened(run, request, INIT) as field:
+    with claimed(request.outputs(), request.inputs(), request.overwrite), open_field(run, request, INIT) as field:
         work = Work(run, field, request.fit, degree=degree_of(request, field.source))
         ClosedFormStage().run(work)
         return _write(run, request, _conversion(request, work, as_stored(work.made())))
 
 
-def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
+def plan_conversion(request: ConvertRequest, console: Console | None = None) -> Plan:
     """Return the plan of `convert`: the volume is read and laid out, and a small view is timed.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
-    with opened(run, replace(request, output=None)) as field:
+    with open_field(run, replace(request, output=None)) as field:
         return _planned(run, request, field)[-1]
 
 
-def fitted(run: Run, request: ConvertRequest) -> Gaussians:
+def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
     """Return the Gaussians of a conversion in the box frame, neither scored nor written.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
-    with opened(run, request) as field:
+    with open_field(run, request) as field:
         work, planner, plan = _planned(run, request, field)
         check_memory(plan)
         _fit(work, request, planner, plan)
@@ -137,24 +137,24 @@ def run_conversion(
 
     Args:
         run: times the stages.
-        request: what is asked for.
+        request: the request.
         field: the volume under its look.
-        made: Gaussians in the box frame that only need scores.
-        start: an earlier conversion that is tried before the closed form.
+        made: finished Gaussians, box frame, that only need scores.
+        start: warm start that is tried before the closed form.
         unscored: called with the conversion before it has scores and a certificate.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     if request.live:
         check_live(request)
-        return live_conversion(run, request, field, ply_options(request, field.source), unscored=unscored)
+        return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
     if start is not None:
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None)
     if made is not None:
-        plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
-        plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
+        plan.stages, plan.skipped = [stage for stage in plan.stages if stage.scores], []
+        plan.gaussians, plan.workload = len(made), replace(plan.workload, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
@@ -164,7 +164,7 @@ def run_conversion(
         work.gaussians = as_stored(made)
     elif kept:
         work.gaussians = kept[0]
-        run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
+        run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only scoring remains")
     elif start is None or not start.try_start(work, plan, request):
         if start is not None:
             field.views.expect(_pictures(plan, work.fit))
@@ -177,29 +177,29 @@ def run_conversion(
     for stage in plan.stages:
         if stage.scores:
             stage.run(work)
-    conversion.ply = certified(conversion.ply, run, work.field, work.fit, conversion.gaussians, request.command)
+    conversion.ply = with_certificate(conversion.ply, run, work.field, work.fit, conversion.gaussians, request.command)
     return conversion
 
 
 def _pictures(plan: Plan, fit: FitOptions) -> list[Picture]:
-    """Return the pictures that a plan's stages will ask for."""
+    """List the pictures that the stages of a plan will request."""
     return [view for stage in plan.stages for view in stage.views(fit)]
 
 
 def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = True) -> tuple[Work, Planner, Plan]:
-    """Return all that the first stage needs; with ``expected`` the field is told which pictures it will draw."""
+    """Return work, planner and plan before the first stage; ``expected`` announces the plan's pictures to the field."""
     fit = replace(request.fit, max_gaussians=request.budget())
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
     degree = degree_of(request, field.source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
-    case = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
+    workload = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit, sh_degree=request.ply.sh_degree or degree, wide=guess, whole=request.scored_whole,
         writes=request.writes,
     )  # fmt: skip
-    plan = planner.plan(case, run.elapsed())
+    plan = planner.plan(workload, run.elapsed())
     run.report.plan = plan.record()
     if expected:
         field.views.expect(_pictures(plan, fit))
@@ -212,12 +212,12 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     first.run(work)
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_room(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
-    # halfway between its pace and that of drawing: steps follow neither alone on every machine
-    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST) ** 0.5
-    planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
-    case = replace(plan.case.at(pace), gaussians=len(work.made()), degree=work.made().degree)
-    plan = planner.plan(case, work.run.elapsed(), begun=True)
+        check_disk_space(request.output, 2 * file_bytes(len(work.made()), degree))  # a second time with its certificate
+    # the mean of its pace and that of drawing, since steps follow neither alone on every machine
+    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
+    planner = replace(planner, wide=suits_small_views(work.made(), work.fit.size), sh_degree=degree)
+    workload = replace(plan.workload.at(pace), gaussians=len(work.made()), degree=work.made().degree)
+    plan = planner.plan(workload, work.run.elapsed(), begun=True)
     check_memory(plan)
     improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds
@@ -233,34 +233,34 @@ def improve(work: Work, plan: Plan) -> None:
         DataError, UsageError: as the stages.
     """
     ahead = [stage for stage in plan.stages if not stage.scores]
-    told = improved = False
+    listed = improved = False
     for n, stage in enumerate([*ahead, None]):
         if not (stage is None and improved) and work.target_reached():
             for name in (other.name for other in ahead[n:] if other.improves):
-                work.run.leave_out(name, f"the check views have {work.limits.target_psnr:g} dB without it")
+                work.run.skip(name, f"the check views have {work.limits.target_psnr:g} dB without it")
             if not improved:
-                _fewer(work)
+                _take_fewest(work)
             return
-        if not told and not isinstance(stage, CheckViews):
-            told = True
-            for name, why in plan.left_out:
-                work.run.leave_out(name, why)
+        if not listed and not isinstance(stage, CheckViews):
+            listed = True
+            for name, why in plan.skipped:
+                work.run.skip(name, why)
         if stage is not None:
             work.ending = plan.after(stage)
             stage.run(work)
             improved = improved or stage.improves
 
 
-def _fewer(work: Work) -> None:
-    """Take the fewest Gaussians that reach the target: a part of the budget, or all of it."""
+def _take_fewest(work: Work) -> None:
+    """Take the fewest Gaussians that reach the target, among fractions of the budget."""
     start = work.start
     if start is None or start.form is None:
         return
     count = len(start.gaussians)
-    for part in SMALLER:
-        work.gaussians = replace(start.form, budget=max(count // part, 1)).gaussians()
+    for divisor in SMALLER:
+        work.gaussians = replace(start.form, budget=max(count // divisor, 1)).gaussians()
         if len(work.gaussians) < count and work.target_reached():
-            work.run.leave_out(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
+            work.run.skip(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
             return
     work.gaussians = start.gaussians
 
@@ -268,17 +268,19 @@ def _fewer(work: Work) -> None:
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
     """Return a conversion without scores."""
     source = work.field.source
-    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
+    return Conversion(
+        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field
+    )
 
 
 @contextmanager
-def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
+def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
     """Open a request's volume under its look, in memory or in blocks, and compile ``kernels``.
 
-    Blocks lie beside the output until it is written: after an interruption the same command reads those that are there.
+    Blocks are stored beside the output until it is written: after an interruption the same command reuses them.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.field.source.load`.
+        DataError, UsageError: see `vvgt_cli.field.source.load`.
     """
     if request.fit.device != "cpu":
         load_ahead()
@@ -287,26 +289,26 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
         with run.stage("read") as stage:
             source = load(request.source)
             stage.note = describe_source(source)
-        _tell(run, request, source)
+        _report_source(run, request, source)
         run.compile(_kernels(kernels, request, source), source.kernel_type())
         with run.stage("scene"):
-            field = Resident.of(source, request.fit.device, run.console.say)
+            field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
-    wanted = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
-    with store_beside(request.output) as store, blocked(run, request.source, options, store, wanted) as found:
-        _tell(run, request, found.source)
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
+    with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
+        _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
         yield found
         store.remove()
 
 
-def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
+def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
-    flattened = _flattened(degree_of(request, source), source)
-    for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
-        run.console.say(remark)
+    flattened = _harmonics_warning(degree_of(request, source), source)
+    for warning in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
+        run.console.message(warning)
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     run.report.options = asdict(request.fit) | asdict(request.limits) | {
@@ -321,27 +323,27 @@ def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) ->
 
 
 def degree_of(request: ConvertRequest, source: Source) -> int:
-    """Return the degree of spherical harmonics: 0 where the light does not depend on the view, else as asked, or 2."""
+    """Return the degree of harmonics: 0 where the light does not depend on the view, else as requested or 2."""
     if source.lighting is None or not source.lighting.depends_on_view:
         return 0
     return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
 
 
-def _flattened(degree: int, source: Source) -> str | None:
-    """Return a message where the degree asked for cannot hold the light."""
+def _harmonics_warning(degree: int, source: Source) -> str | None:
+    """Return a message where the requested degree cannot represent the light."""
     if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
         return None
     return (
-        f"--sh-degree {degree}: what the headlight and highlights show changes with the view; the file has their mean "
-        f"over directions (--sh-degree {VIEW_DEGREE} holds them)"
+        f"--sh-degree {degree}: headlight and highlights change with the view; the file has their mean "
+        f"over directions (--sh-degree {VIEW_DEGREE} represents them)"
     )
 
 
 def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
-    """Return how the file is written, with all that follows from the source."""
+    """Return the layout of the file, with everything that follows from the source."""
     ply = replace(
         request.ply,
-        up=way_up(request.up, request.ply.frame, source.volume.space),
+        up=up_axis(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
         made_for=request.fit.size,
@@ -351,7 +353,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         optics=source.optics(),
         legend=_legend(source),
     )
-    return placed(ply, source.volume)
+    return with_place(ply, source.volume)
 
 
 def _legend(source: Source) -> str | None:
@@ -364,14 +366,14 @@ def _legend(source: Source) -> str | None:
     return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
-def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
-    """Return what writes the file before its scores are known, where it is written twice."""
+def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
+    """Return a function that writes the file before its scores are known; None where it is written once."""
     output = request.output
     if output is None or request.writes < 2:
         return None
 
     def write(found: Conversion) -> None:
-        more = "; it is whole, scores follow"
+        more = "; complete; scoring next"
         write_gaussians(run, output, found.gaussians, found.ply, request.overwrite, found.normals(), more=more)
 
     return write
@@ -389,7 +391,9 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())
-        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.field.views, source.volume)
+        report_format_cost(
+            run, request.output, conversion.gaussians, conversion.ply, conversion.field.views, source.volume
+        )
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

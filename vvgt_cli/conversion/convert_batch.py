@@ -9,19 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.batch import (
-    LEVELS,
-    LIVE,
-    ONE,
-    PAGE,
-    Batch,
-    Functions,
-    Item,
-    check_options,
-    options_in,
-)
+from vvgt_cli.conversion.batch import LEVELS, LIVE, ONE, PAGE, Batch, Functions, Item, check_options, options_in
 from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.conversion.convert import convert, convert_in_memory, opened, planned, run_conversion
+from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
 from vvgt_cli.conversion.frames import Series, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
@@ -59,13 +49,14 @@ class Files:
     """The sink that writes a file for each item, and their index; a series keeps a manifest, by which it resumes."""
 
     def __init__(self, request: ConvertRequest, shard: Shard) -> None:
+        """Take the output names of ``request``."""
         self._request, self._shard = request, shard
         self._manifest: Manifest | None = None
         self._rows: dict[str, dict[str, Any]] = {}
         self._stack = ExitStack()
 
     def names(self, kind: str, stem: str) -> list[str]:
-        """Return output, report and preview of an item.
+        """Return the names of output, report and preview of an item.
 
         Raises:
             UsageError: a pattern without one place for the name.
@@ -91,7 +82,7 @@ class Files:
         """
         request, overwrite = self._request, self._request.overwrite
         if request.overwrite and self._shard.count > 1:
-            raise UsageError("--overwrite with --shard: parts would remove each other's files; remove them instead")
+            raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
         first = self.names(batch.kind, batch.stems[0] if batch.stems else INDEX)
         index = index_output(str(request.output))
         check_outputs([*self._named(request, first).outputs(), index], request.inputs(), overwrite or batch.resumes)
@@ -105,37 +96,37 @@ class Files:
             return
         folders = {str(Path(name).parent) for name in first}
         if len(folders) > 1:
-            raise UsageError(f"the frames, reports and previews of a series go to one folder; got {', '.join(folders)}")
+            raise UsageError(f"-o, --report and --preview of a series: expected one folder; got {', '.join(folders)}")
         self._manifest = Manifest(Path(folders.pop()), batch.settings(), self._shard, what="frames")
         self._stack.enter_context(claim(self._manifest.folder / self._shard.manifest))
         self._manifest.open([Path(name).name for name in (*(n for row in rows for n in row), index.path)], overwrite)
         self._manifest.record()
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         self._stack.close()
 
     @staticmethod
     def _check_stems(batch: Batch) -> None:
         if len(set(batch.stems)) < len(batch.stems):
             stated = ", ".join(dict.fromkeys(batch.stems))
-            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would have one name; rename one")
+            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would share a name; rename one")
 
     def wants(self, batch: Batch, stem: str) -> bool:
-        """Tell whether an item is this part's, and not there yet."""
+        """Return whether an item belongs to this shard and is not complete yet."""
         if self._manifest is None:
             return True
         own = [Path(name).name for name in self.names(batch.kind, stem)]
         return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item to its files."""
+        """Convert an item to its files, and return the report."""
         return convert(
             self._named(item.request, self.names(batch.kind, item.stem)), console, item.gaussians, batch.previous
         )
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
-        """Record an item that is whole."""
+        """Record a complete item."""
         names = [Path(name) for name in self.names(batch.kind, item.stem)]
         row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
         folder = Path(index_output(str(self._request.output)).path).parent
@@ -145,7 +136,7 @@ class Files:
             self._manifest.record([name.name for name in names], {names[0].name: {"row": row}})
 
     def finish(self, batch: Batch, console: Console) -> dict[str, Any]:
-        """Write the index: of a series in parts, what all parts have recorded; the part that ends last finds all."""
+        """Write and return the index; for shards, of the items recorded so far, so that the last shard lists all."""
         path, manifest, known = index_output(str(self._request.output)).path, self._manifest, -1
         rows = list(self._rows.values())
         while manifest is None or len(manifest.files) > known:
@@ -157,8 +148,8 @@ class Files:
             write_index(path, found, self._request.overwrite or manifest is not None)
             if manifest is None:
                 break
-            manifest.refresh()  # another part may have recorded its last item meanwhile
-        console.say(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted now")
+            manifest.refresh()  # another shard may have recorded its last item meanwhile
+        console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted in this run")
         return found
 
 
@@ -166,6 +157,7 @@ class Memory:
     """The sink that keeps Gaussians, scores and layouts."""
 
     def __init__(self) -> None:
+        """Start without clouds."""
         self._clouds: list[Cloud] = []
         self._made: Cloud | None = None
 
@@ -174,13 +166,13 @@ class Memory:
         batch.prepare(run)
 
     def wants(self, batch: Batch, stem: str) -> bool:
-        """Take every item."""
+        """Return True: every item is kept."""
         return True
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item, whose volume is let go of."""
+        """Convert an item, release its volume, and return the report."""
         run = Run(console, ConversionReport("convert"))
-        with opened(run, item.request) as volume:
+        with open_field(run, item.request) as volume:
             found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
             normals = found.normals()
         run.finish()
@@ -193,18 +185,18 @@ class Memory:
         self._clouds.append(replace(self._made, facts={**self._made.facts, **facts}))
 
     def finish(self, batch: Batch, console: Console) -> Clouds:
-        """Return all items."""
+        """Return all items as clouds."""
         return Clouds(batch.kind, batch.volume, self._clouds, batch.facts)
 
     def close(self) -> None:
-        """Do nothing: what is kept is the caller's."""
+        """Do nothing."""
 
 
 def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
-    """Convert what a sink wants of a batch, one item after the other, and finish the sink.
+    """Convert the items of a batch that a sink wants, one after the other, and finish the sink.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command makes it again.
+        KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command converts it again.
     """
     run = Run(console, ConversionReport("convert"))
     try:
@@ -226,19 +218,19 @@ def convert_files(
     """Convert one volume, the frames of a series, several functions or the labels of a map to files or a page.
 
     Args:
-        request: of all of it; ``output`` says by a place for a number or name (``{}``) that there are several files.
-        functions: of ``--tf``; one of them is the request's own.
-        split_labels: a cloud for each label.
+        request: the request; an ``output`` with a place for a number or name (``{}``) asks for several files.
+        functions: all values of ``--tf``, the request's own included.
+        split_labels: make a cloud of each label.
         dry_run: plan one volume, and write nothing.
-        shard: ``I/N``, the part of a series to convert.
-        console: for messages.
+        shard: ``I/N``, the share of a series to convert.
+        console: destination of messages.
 
     Returns:
         The plan of a dry run.
 
     Raises:
-        UsageError: options that do not go together, found before anything is read.
-        DataError: as `convert`; files that are whole stay.
+        UsageError: contradictory options; raised before anything is read.
+        DataError: see `convert`; complete files stay.
     """
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
@@ -250,14 +242,14 @@ def convert_files(
     for one in [*kinds, *([PAGE] if page else [])]:
         check_options(one, used)
     if is_streamed(output):
-        from vvgt_cli.conversion.shards.run import init_in_blocks, streams
+        from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
 
         request = replace(request, blocks=request.blocks or automatic(request.source, console))
-        if streams(request):
+        if writes_streaming(request):
             init_in_blocks(request, console)
         return None
     if dry_run:
-        return planned(request, console).text()
+        return plan_conversion(request, console).text()
     if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
         try:
             convert(request, console)
@@ -268,13 +260,13 @@ def convert_files(
     if kind == ONE:
         kind, page = FRAMES, True
         check_options(PAGE, used)
-    part = WHOLE_RUN if shard is None else parse_shard(shard)
-    under = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, under, part, page)
+    share = WHOLE_RUN if shard is None else parse_shard(shard)
+    looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
+    batch = _batch(kind, request, looks, share, page)
     if page:
         _save_page(batch, request, output, console)
     else:
-        _run(batch, Files(request, part), console)
+        _run(batch, Files(request, share), console)
     return None
 
 
@@ -288,7 +280,7 @@ def _save_page(batch: Batch, request: ConvertRequest, output: str, console: Cons
     with claimed(request.outputs(), request.inputs(), request.overwrite):
         clouds = _run(batch, Memory(), console)
         if not clouds:
-            raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
+            raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
         with run.stage("write") as stage:
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
@@ -302,14 +294,14 @@ def convert_to_memory(
     """Convert one volume, the frames of a series, several looks or the labels of a map, without files.
 
     Args:
-        requests: by the names of looks.
-        several: a cloud for each look, even where there is one.
-        split_labels: a cloud for each label.
+        requests: request of each look, by name.
+        several: return `Clouds` even for a single look.
+        split_labels: make a cloud of each label.
         after: an earlier conversion of the same volume to start from.
-        console: for messages.
+        console: destination of messages.
 
     Raises:
-        UsageError, DataError: as `convert_files`.
+        UsageError, DataError: see `convert_files`.
     """
     from vvgt_cli.conversion.previous_look import PreviousLook
 

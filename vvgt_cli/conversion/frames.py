@@ -1,4 +1,4 @@
-"""The frames of a time series as a batch: which there are, and the grid, range and function that all of them share."""
+"""The frames of a time series as a batch, with the grid, range and function that all of them share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.index import FRAMES
 from vvgt_cli.conversion.manifest import Shard
-from vvgt_cli.conversion.place import way_up
+from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.previous_frame import previous_frame
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
@@ -44,10 +44,10 @@ class Step:
     """A frame of a series: a file, or a time step of one.
 
     Attributes:
-        name: for messages and the index.
-        volume: as `SourceRequest.volume`.
+        name: name in messages and the index.
+        volume: see `SourceRequest.volume`.
         read: how to read it.
-        time: of a step of a file that states it, with its unit, which may be "".
+        time: time of the step and its unit, which may be ""; None where the file has none.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Step:
         return f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
 
     def facts(self) -> dict[str, Any]:
-        """Return its time as an index has it."""
+        """Return its time as entries of an index."""
         if self.time is None:
             return {}
         value, unit = self.time
@@ -71,15 +71,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Survey:
-    """Findings of the first pass over a series.
+    """The result of the first pass over a series.
 
     Attributes:
         count: number of frames.
-        own: range (lo, hi) of each frame's components, as `Content.classified` has them.
-        whole: statistics of all frames together, of each component.
+        own: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
+        whole: statistics of each component over all frames.
         first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
-        labels: of all frames, where they are label maps.
+        labels: labels of all frames, where they are label maps.
     """
 
     count: int
@@ -91,7 +91,7 @@ class Survey:
 
     @property
     def grid(self) -> Volume:
-        """The volume whose grid all frames share."""
+        """Return the volume whose grid all frames share."""
         return self.first.volumes[0]
 
 
@@ -102,14 +102,15 @@ class Series(Batch):
     frames together. Frames in which the function shows nothing are skipped, with a message.
 
     Raises:
-        UsageError: no such files.
-        DataError: a file that cannot be read.
+        UsageError: no file matches.
+        DataError: a file cannot be read.
     """
 
     kind, resumes = FRAMES, True
 
     def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
-        self._steps: Sequence[Step] = steps_of(request.source)
+        """List the frames; ``page`` limits the Gaussians of live frames."""
+        self._steps: Sequence[Step] = list_steps(request.source)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
@@ -120,12 +121,12 @@ class Series(Batch):
         """Read all frames once, for what they share.
 
         Raises:
-            DataError: as `survey`; a function that shows nothing in any frame.
-            UsageError: as `survey`.
+            DataError: see `survey`; the function shows nothing in any frame.
+            UsageError: see `survey`.
         """
         request, steps, console = self.request, self._steps, run.console
         if self._most < request.fit.max_gaussians:
-            console.say(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
+            console.message(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
             request = replace(request, fit=replace(request.fit, max_gaussians=self._most))
         if request.blocks is None:
             first = replace(request.source, volume=steps[0].volume, read=steps[0].read)
@@ -134,12 +135,12 @@ class Series(Batch):
         with run.stage("frames") as stage:
             found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
             source = replace(source, statistics=found.whole)
-            if found.first.components_message:  # said once, not for every frame
+            if found.first.components_message:  # reported once, not for every frame
                 steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
             shown, distance = _functions(source, found)
-            self._dark = [not source.layers and _dark(shown, own) for own in found.own]
+            self._dark = [not source.layers and _invisible(shown, own) for own in found.own]
             lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
             stage.note = (
                 f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
@@ -160,13 +161,13 @@ class Series(Batch):
             if not wanted(stem):
                 continue
             if self._dark[k]:
-                console.say(f"{step.name}: nothing of it is visible; it is skipped")
+                console.message(f"skipped: {step.name} (nothing of it is visible)")
                 continue
-            console.say(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
+            console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             source = replace(self.request.source, volume=step.volume, read=step.read)
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
-        console.say(f"{done} frames converted, {mine - done} were done before")
+        console.message(f"{done} frames converted, {mine - done} were complete before")
 
     def settings(self) -> dict[str, Any]:
         """Return everything that the files depend on, named as the command line names it."""
@@ -189,14 +190,14 @@ class Series(Batch):
             **asdict(request.limits),
             "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
             **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
-            "up": way_up(request.up, request.ply.frame, grid.space),
+            "up": up_axis(request.up, request.ply.frame, grid.space),
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
         }
 
 
 def is_glob_of_volumes(path: str) -> bool:
-    """Tell whether a path is a glob of files that are volumes of their own, and not slices of one."""
+    """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False
     files = matching(path)
@@ -206,7 +207,7 @@ def is_glob_of_volumes(path: str) -> bool:
 
 
 def _pages(path: Path) -> int:
-    """Return the number of pages of a TIFF; 1 where it cannot be read, which reading it reports."""
+    """Return the number of pages of a TIFF; 1 where it cannot be read, which is reported later."""
     import tifffile
 
     try:
@@ -223,13 +224,14 @@ def survey(
 
     Args:
         steps: the frames.
-        labels, tf: as they are asked for.
-        console: for progress.
-        stored: values stay in their files, of which slabs are read.
+        labels: requested label table.
+        tf: requested function.
+        console: draws progress.
+        stored: read values from their files slab by slab.
 
     Raises:
-        DataError: a frame that cannot be read, or on another grid than the first.
-        UsageError: frames of segments that overlap.
+        DataError: a frame cannot be read, or is on another grid than the first.
+        UsageError: the segments of a frame overlap.
     """
     first: Content | None = None
     numbers, digests = [], []
@@ -238,8 +240,8 @@ def survey(
     for k, step in enumerate(steps):
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
-            raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
-        first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
+            raise UsageError(f"{step.name}: its segments overlap; convert such frames one by one")
+        first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.single_volume:
             mapped = holds_table(content.path) or recognised(content.volumes[0])
@@ -250,19 +252,19 @@ def survey(
         if bar:
             bar(k + 1, len(steps))
     if first is None:
-        raise UsageError("a series without frames")
-    whole = tuple(merge_statistics(parts) for parts in zip(*numbers, strict=True))
-    own = [[(n.lo, n.hi) for n in parts] for parts in numbers]
+        raise UsageError("the series has no frames; expected one or more")
+    whole = tuple(merge_statistics(rows) for rows in zip(*numbers, strict=True))
+    own = [[(n.lo, n.hi) for n in rows] for rows in numbers]
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 
-def _hollow(volume: Volume) -> Volume:
-    """The same without its values."""
+def _without_values(volume: Volume) -> Volume:
+    """Return the volume with zeros that take no memory as its values."""
     return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
 
 
 def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
-    """Refuse frames of another grid, or of other components."""
+    """Check that a frame has the grid and the components of the first."""
     volume, grid = content.volumes[0], first.volumes[0]
     if _grid(volume) != _grid(grid):
         raise DataError(
@@ -281,36 +283,36 @@ def _grid(volume: Volume) -> tuple[Any, ...]:
 
 
 def _grid_text(volume: Volume) -> str:
-    parts = (volume.spacing, volume.origin, volume.direction)
-    numbers = (" ".join(f"{value:g}" for value in values) for values in parts)
+    vectors = (volume.spacing, volume.origin, volume.direction)
+    numbers = (" ".join(f"{value:g}" for value in values) for values in vectors)
     return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
-def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """The statistics of several volumes as one; counts are spread evenly within each one's bins."""
-    lo, hi = min(p.lo for p in parts), max(p.hi for p in parts)
-    widest = max(parts, key=lambda p: p.edges[-1] - p.edges[0])
+def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
+    """Merge the statistics of several volumes; counts are spread evenly within the bins of each."""
+    lo, hi = min(p.lo for p in volumes), max(p.hi for p in volumes)
+    widest = max(volumes, key=lambda p: p.edges[-1] - p.edges[0])
     ends = (lo, hi) if lo < hi else (widest.edges[0], widest.edges[-1])
     steps = np.arange(len(widest.edges)) / (len(widest.edges) - 1)
     edges = ends[0] * (1 - steps) + ends[1] * steps
     edges[0], edges[-1] = ends
     below = np.zeros(len(edges))
-    for part in parts:
-        below += np.interp(edges, part.edges, np.concatenate([[0], np.cumsum(part.histogram)]))
-    below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in parts)
+    for one in volumes:
+        below += np.interp(edges, one.edges, np.concatenate([[0], np.cumsum(one.histogram)]))
+    below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in volumes)
     histogram = np.diff(np.round(below)).astype(np.int64)
-    return Statistics(lo, hi, sum(p.nan_count for p in parts), sum(p.inf_count for p in parts), histogram, edges)
+    return Statistics(lo, hi, sum(p.nan_count for p in volumes), sum(p.inf_count for p in volumes), histogram, edges)
 
 
-def _dark(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
-    """Whether nothing of a frame is visible."""
+def _invisible(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
+    """Return whether nothing of a frame is visible."""
     return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
 
 
 def _functions(
     source: SourceRequest, frames: Survey
 ) -> tuple[Sequence[TransferFunction | LabelTable], tuple[float, str]]:
-    """The function of each component, on data values, and the first one's unit distance with how it was chosen.
+    """Return the functions of all components on data values, and the unit distance with how it was chosen.
 
     They are the same for every frame.
     """
@@ -326,24 +328,24 @@ def _functions(
 
 
 def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
-    """Of a series of label maps; colours that are made depend on a label's number alone."""
+    """Return the table of a series of label maps; automatic colours depend on the label's number alone."""
     if isinstance(labels, str) and labels != AUTO:
         return read_labels(labels).warned(found, "the series")
     return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
-def steps_of(source: SourceRequest) -> list[Step]:
-    """The files of a glob, or the time steps of the one file that is named.
+def list_steps(source: SourceRequest) -> list[Step]:
+    """List the files of a glob, or the time steps of a single file.
 
     Raises:
-        UsageError: a glob that matches nothing.
-        DataError: a file that cannot be read.
+        UsageError: the glob matches nothing.
+        DataError: a file cannot be read.
     """
     files = [] if os.path.exists(source.path) else matching(source.path)
     if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
         raise UsageError(
-            f"{source.path}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
-            "a file of several time steps"
+            f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
+            "a file with several time steps"
         )
     if len(files) > 1:
         return [Step(file.name, str(file), source.read) for file in files]
@@ -356,7 +358,7 @@ def steps_of(source: SourceRequest) -> list[Step]:
 
 
 def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
-    """Time of each step of a file, None where it says none, whatever its components are."""
+    """List the time of each step of a file, None where it has none, whatever its components are."""
     from vvgt_cli.volume.registry import time_steps
 
     if read.component in (COLOR, ALL):

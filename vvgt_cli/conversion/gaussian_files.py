@@ -1,4 +1,4 @@
-"""Gaussians in and out of a run: read into the unit frame, written by a stage, kept elsewhere where writing fails."""
+"""Reading of Gaussians into the unit frame, and writing by a stage, to another place where writing fails."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ STDIN = STDOUT
 
 
 def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
-    """The rule to draw by: that asked for, else the file's, else the usual one.
+    """Return the drawing rule: the requested one, else the file's, else the default.
 
     Raises:
-        UsageError: no such rule.
+        UsageError: the rule is unknown.
     """
     return rule_of(asked or header.rule or INRIA)
 
@@ -37,7 +37,7 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
     """Read Gaussians (a path, "-" for a `.ply` on standard input, or a stream of one) into the unit frame.
 
     Raises:
-        DataError: not a file of Gaussians, or one without any.
+        DataError: not a file of Gaussians, or an empty one.
     """
     if isinstance(source, str) and source != STDIN:
         gaussians, header = read_splats(source)
@@ -49,9 +49,9 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 
 def layout_of(header: PlyHeader) -> PlyOptions:
-    """What makes a file laid out, placed and commented as the one read was."""
-    told = header.facts() | {"date": None}  # of what was written then
-    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **told)
+    """Return the layout, place and comments of a file that was read, for writing another."""
+    facts = header.facts() | {"date": None}  # the other file has its own date
+    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **facts)
 
 
 def write_gaussians(
@@ -64,9 +64,17 @@ def write_gaussians(
     stage: str = "write",
     more: str = "",
 ) -> None:
-    """The stage that writes Gaussians in the format of the name, to standard output as a `.ply`; records the size.
+    """Write Gaussians in the format of the name, or as a `.ply` to standard output, and record the size.
 
-    ``normals`` (K, 3) are of a `.ply`. The stage is called ``stage``, and there may be ``more`` to say of it.
+    Args:
+        run: gets the stage and the size.
+        output: file, or "-".
+        gaussians: Gaussians, unit frame.
+        options: layout of the file.
+        overwrite: replace an existing file.
+        normals: (K, 3), for a `.ply`.
+        stage: name of the stage.
+        more: end of its message.
     """
     report = run.report
     with run.stage(stage) as record:
@@ -80,25 +88,25 @@ def write_gaussians(
 
 
 def is_page(output: str | None) -> bool:
-    """Whether an output is a page, which takes several clouds."""
+    """Return whether an output is a page, which can hold several clouds."""
     known = None if output in (None, STDOUT) else format_of(str(output))
     return known is not None and known.suffix == ".html"
 
 
 def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
-    """The stage that writes several files of Gaussians as one page.
+    """Write several files of Gaussians as one page.
 
     Args:
         run: gets the stage and the size.
         output: the page.
-        clouds: (name in the page's list, file) of each.
-        overwrite: replace it if it exists.
+        clouds: (name in the page's list, file) of each cloud.
+        overwrite: replace an existing page.
 
     Raises:
-        DataError: a file that is none of Gaussians, or no file.
+        DataError: a file does not hold Gaussians, or there is no file.
     """
     if not clouds:
-        raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
+        raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
     with run.stage("write") as stage:
         shown: list[tuple[str, Gaussians, PlyOptions]] = []
         rules = set[str]()
@@ -110,7 +118,9 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
         with atomic_write(output, overwrite) as temporary:
             run.report.bytes = temporary.write_bytes(page_of_several(shown, output))
         if len(rules) > 1:
-            run.console.say(f"{output}: made for {', '.join(sorted(rules))}; the page draws all as it draws the first")
+            run.console.message(
+                f"{output}: made for {', '.join(sorted(rules))}; the page draws all by the rule of the first"
+            )
         stage.note = (
             f"{output}: {len(clouds)} clouds, {run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
         )
@@ -119,7 +129,7 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
 def _write_file(
     output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None
 ) -> int:
-    """Write a file; where that fails, put a `.ply` elsewhere and say so: it may have taken hours."""
+    """Write a file and return its bytes; if that fails, save a `.ply` elsewhere, since the run may have taken hours."""
     if is_stream(output):
         with open(output, "ab") as stream:
             return write_ply(stream, gaussians, options, normals)
@@ -132,14 +142,14 @@ def _write_file(
     except VvgtError as error:
         if known is None and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere
-        place = _elsewhere(Path(output), gaussians, options, normals)
+        place = _rescue(Path(output), gaussians, options, normals)
         if place is None:
             raise
-        raise type(error)(f"{error}; what was computed lies in {place}") from error
+        raise type(error)(f"{error}; the Gaussians were saved to {place}") from error
 
 
-def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None) -> Path | None:
-    """Write a `.ply` to the temporary folder, else to the working folder; where it is, None where neither takes it."""
+def _rescue(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None) -> Path | None:
+    """Write a `.ply` to the temporary or the working folder, and return its path; None if both fail."""
     name = f"{output.stem[:80]}.{secrets.token_hex(4)}.ply"
     for find in (tempfile.gettempdir, os.getcwd):
         try:

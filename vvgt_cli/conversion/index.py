@@ -1,4 +1,4 @@
-"""The index of several clouds of one run (frames, functions, labels): which file is what (docs/report.md)."""
+"""The index of several clouds of one run (frames, functions, labels) and their files (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from vvgt_cli.gaussians.outputs import Output, write_text
 from vvgt_cli.score.record import SCHEMA, ConversionReport, plain
 
 FORMAT = "vvgt-clouds"
-FRAMES, FUNCTIONS, LABELS = "frames", "functions", "labels"  # what the clouds are of one volume
-INDEX = "index"  # in the place of a name
+FRAMES, FUNCTIONS, LABELS = "frames", "functions", "labels"  # kinds of batches
+INDEX = "index"  # stem of the index
 FIELD = re.compile(r"\{(?::0?\d{0,2}d)?\}")
 _HEAD = 256  # characters that tell an index from another JSON file
 
 
 def is_pattern(output: str) -> bool:
-    """Whether an output's name has a place for a frame's number or a name, as ``out_{:04d}.ply``."""
+    """Return whether an output has a place for a frame's number or a name, as ``out_{:04d}.ply``."""
     return FIELD.search(output) is not None
 
 
 def function_name(tf: str) -> str:
-    """Return the name of a function: its file's without folder and endings; of FILE#NAME the latter."""
+    """Return the name of a function: that of its file without folder and endings, or NAME of FILE#NAME."""
     return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]
 
 
@@ -35,13 +35,13 @@ def put_name(option: str, pattern: str, kind: str, stem: str) -> str:
     """Return a pattern with a frame's number, or the name of a function or label, in its place.
 
     Args:
-        option: whose value the pattern is, for the message.
-        pattern: such as ``out_{:04d}.ply`` or ``out_{}.ply``; a format of numbers is for `FRAMES` alone.
+        option: option with the pattern, for the message.
+        pattern: pattern such as ``out_{:04d}.ply`` or ``out_{}.ply``; number formats are for `FRAMES` alone.
         kind: `FRAMES`, `FUNCTIONS` or `LABELS`.
-        stem: the number or name; `INDEX` too.
+        stem: number, name or `INDEX`.
 
     Raises:
-        UsageError: not one such place.
+        UsageError: the pattern has no such place, or several.
     """
     places = FIELD.findall(pattern)
     if len(places) != 1 or set(FIELD.sub("", pattern)) & set("{}") or (places[0] != "{}" and kind != FRAMES):
@@ -51,7 +51,7 @@ def put_name(option: str, pattern: str, kind: str, stem: str) -> str:
 
 
 def index_path(pattern: str) -> str:
-    """The index of the files of a pattern: ``out_index.json`` of ``out_{}.ply``, ``index.json`` of ``{}/out.ply``."""
+    """Return the path of the index: ``out_index.json`` for ``out_{}.ply``, ``index.json`` for ``{}/out.ply``."""
     parts = Path(pattern).parts
     first = next(k for k, part in enumerate(parts) if is_pattern(part))
     name = FIELD.sub(INDEX, parts[first])
@@ -62,23 +62,23 @@ def index_path(pattern: str) -> str:
 
 
 def index_output(pattern: str) -> Output:
-    """The index among the outputs of a run."""
+    """Return the index as an output of a run."""
     return Output("-o", index_path(pattern), (".json",), binary=False)
 
 
 def entry(name: str, gaussians: int | None, size: int, psnr: float | None, **facts: Any) -> dict[str, Any]:
-    """A cloud in an index, without its file."""
+    """Return the row of a cloud in an index, without its file."""
     scored = {} if psnr is None else {"psnr": psnr}
     return {"name": name, "gaussians": gaussians, "bytes": size, **scored, **facts}
 
 
 def psnr_of(report: ConversionReport) -> float | None:
-    """Mean over the test views, dB; None where none was drawn."""
+    """Return the mean PSNR (dB) over the test views; None where none were drawn."""
     return None if report.scores is None else report.scores["psnr"]
 
 
 def index_of(kind: str, volume: str, files: Sequence[dict[str, Any]], **facts: Any) -> dict[str, Any]:
-    """The index as its JSON has it; each entry of ``files`` has its ``file`` beside the index."""
+    """Return the document of an index; the paths of ``files`` are relative to it."""
     found: dict[str, Any] = plain(
         {"format": FORMAT, "schema": SCHEMA, "kind": kind, "volume": volume, **facts, "files": list(files)}
     )
@@ -86,12 +86,12 @@ def index_of(kind: str, volume: str, files: Sequence[dict[str, Any]], **facts: A
 
 
 def write_index(path: str, index: dict[str, Any], overwrite: bool) -> None:
-    """Write it, whole or not at all."""
+    """Write an index atomically."""
     write_text(path, json.dumps(index, indent=1, allow_nan=False) + "\n", overwrite)
 
 
 def is_index(path: str | Path) -> bool:
-    """Whether a file is an index, by its beginning."""
+    """Return whether a file is an index, by its first characters."""
     if not str(path).lower().endswith(".json") or not Path(path).is_file():
         return False
     with open(path, encoding="utf-8", errors="replace") as stream:
@@ -99,10 +99,10 @@ def is_index(path: str | Path) -> bool:
 
 
 def read_index(path: str | Path) -> dict[str, Any]:
-    """An index's document.
+    """Read the document of an index.
 
     Raises:
-        DataError: not one, one that names files outside its folder, or without any.
+        DataError: not an index, or one without files or with files outside its folder.
     """
     try:
         index: dict[str, Any] = json.loads(read_text(Path(path)))
@@ -112,15 +112,15 @@ def read_index(path: str | Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         known, names = False, []
     if not known or not names or any(name.is_absolute() or ".." in name.parts for name in names):
-        raise DataError(f"{path}: not an index of 'vvgt convert' (schema {SCHEMA}) of one file or more")
+        raise DataError(f"{path}: not an index of 'vvgt convert' (schema {SCHEMA}) with one file or more")
     return index
 
 
 def files_of(path: str | Path) -> list[tuple[str, str]]:
-    """Name and file of each cloud of an index.
+    """List the name and file of each cloud of an index.
 
     Raises:
-        DataError: as `read_index`; a file that is not there.
+        DataError: see `read_index`; a file is missing.
     """
     folder = Path(path).parent
     found = [(row["name"], folder / row["file"]) for row in read_index(path)["files"]]

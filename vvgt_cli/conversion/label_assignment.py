@@ -1,4 +1,4 @@
-"""Assign each Gaussian of a label map to a label, and find what the others hide of a label; all in the box frame."""
+"""Assignment of the Gaussians of a label map to labels, and cells that no view sees; all in the box frame."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import planes, values_at
 
-OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis, where a Gaussian is asked whose it is
+OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """Where no view sees anything, nor one cell around.
+class HiddenCells:
+    """Cells that no view sees, nor any of their neighbours.
 
     Attributes:
         cells: (nz, ny, nx) bool.
-        edge: (3,) edges of a cell in voxels, (x, y, z).
-        half, step: (3,) of the scene, unit frame.
+        edge: (3,) edges (x, y, z) of a cell in voxels.
+        half, step: (3,) half extents and voxel edges of the scene, unit frame.
     """
 
     cells: np.ndarray
@@ -32,15 +32,15 @@ class Hidden:
     half: np.ndarray
     step: np.ndarray
 
-    def whether(self, gaussians: Gaussians) -> np.ndarray:
-        """(K,) whether the centre of each is hidden."""
+    def contain(self, gaussians: Gaussians) -> np.ndarray:
+        """Return (K,) bool, whether the centre of each Gaussian is hidden."""
         voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
         i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
         found: np.ndarray = self.cells[k, j, i]
         return found
 
-    def any_of(self, volume: Volume, number: int) -> bool:
-        """Whether some of a label's surface, where it touches another label or the box's end, is hidden."""
+    def meet_label(self, volume: Volume, number: int) -> bool:
+        """Return whether part of a label's surface, where it meets other labels or the box, is hidden."""
         middles = [np.arange(n) + 0.5 for n in volume.dims]
         x, y, z = (self._along(axis, middles[axis]) for axis in range(3))
         none = np.zeros(volume.data.shape[1:], bool)
@@ -60,18 +60,20 @@ class Hidden:
         return False
 
     def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
-        """Index of the cell along an axis of positions in voxels from the box's corner, (n,)."""
+        """Return (n,) int64, the cell along an axis of positions in voxels from the box's corner."""
         n = self.cells.shape[2 - axis]
         found: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
         return found
 
 
-def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> Hidden:
-    """What no training view sees.
+def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> HiddenCells:
+    """Return the cells that no training view sees.
 
     Args:
-        near: (nz, ny, nx) bool: the cells that one sees; ``edge`` (3,) their edges in voxels.
-        half, step: (3,) of the volume, unit frame.
+        near: (nz, ny, nx) bool, the cells that some view sees.
+        edge: see `HiddenCells`.
+        half: see `HiddenCells`.
+        step: see `HiddenCells`.
     """
     for axis in range(3):
         wider = near.copy()
@@ -80,7 +82,7 @@ def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.nda
         wider[tuple(ahead)] |= near[tuple(behind)]
         wider[tuple(behind)] |= near[tuple(ahead)]
         near = wider
-    return Hidden(~near, edge, half, step)
+    return HiddenCells(~near, edge, half, step)
 
 
 def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
@@ -88,7 +90,7 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
 
     Args:
         gaussians: box frame.
-        shown: labels, each with its map and table; all maps are on one grid.
+        shown: labels with their maps and tables; all maps are on one grid.
     """
     frame = shown[0][0].unit_frame()
     votes = np.zeros((len(gaussians), len(shown)), np.float32)

@@ -1,7 +1,7 @@
-"""The labels of a label map as a batch (`vvgt convert --split-labels`): together they are the whole.
+"""The labels of a label map as a batch (`vvgt convert --split-labels`), whose clouds add up to the whole.
 
-What some view sees of the whole is converted as one scene, and each Gaussian goes to the label that owns most of it;
-what the whole hides is converted label by label, and of that the hidden Gaussians are added.
+The whole map is converted as one scene, and each Gaussian is assigned to the label with most of it. Labels that others
+hide are also converted alone, and their hidden Gaussians added.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.convert import fitted, opened
+from vvgt_cli.conversion.convert import fit_gaussians, open_field
 from vvgt_cli.conversion.index import LABELS
-from vvgt_cli.conversion.label_assignment import assign_labels, hidden_in
+from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_content
@@ -35,7 +35,7 @@ from vvgt_cli.volume.label_maps import counts_of
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
 
-LONGEST = 80  # characters of a label's name in a file's
+LONGEST = 80  # characters of a label's name in a file name
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,14 @@ class MapLabel:
 class Labels(Batch):
     """The visible labels of a label map, converted as a whole and divided.
 
-    Their Gaussians are at most ``max_gaussians`` together. Those that the whole hides get a share by the labels'
-    surfaces (voxels to the power of 2/3), the rest is for what is seen.
+    They have at most ``max_gaussians`` Gaussians together. Hidden ones get a share by the labels' surfaces
+    (voxels to the power of 2/3), visible ones the rest.
     """
 
     kind = LABELS
 
     def __init__(self, request: ConvertRequest) -> None:
+        """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
         self._labels: list[MapLabel] = []
 
@@ -70,7 +71,7 @@ class Labels(Batch):
         """Read the map and its table.
 
         Raises:
-            DataError: as `convert`; no label is visible.
+            DataError: see `convert`; no label is visible.
         """
         source = self.request.source
         with run.stage("volume") as stage:
@@ -84,13 +85,13 @@ class Labels(Batch):
             stage.note = f"{self.volume}, {len(self._labels)} labels of {self.facts['table']}"
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """Yield an item with its Gaussians for each label of which something is visible."""
+        """Yield an item with its Gaussians for each label that is visible."""
         names = [one.label.name for one in self._labels]
         for one, gaussians in zip(self._labels, _gaussians(self.request, self._labels, run), strict=True):
             if gaussians is None:
-                run.console.say(f"{one.text()}: nothing visible; it is skipped")
+                run.console.message(f"skipped: {one.text()} (nothing of it is visible)")
                 continue
-            run.console.say(f"{one.text()}: {len(gaussians)} Gaussians")
+            run.console.message(f"{one.text()}: {len(gaussians)} Gaussians")
             label = one.label
             facts = {"label": label.number, "color": label.color, "opacity": label.opacity}
             name = label.name if names.count(label.name) == 1 else one.stem
@@ -98,7 +99,7 @@ class Labels(Batch):
 
 
 def _content(source: SourceRequest, stored: bool) -> Content:
-    """What the map's file holds, or the map itself."""
+    """Return the content of the map's file, or the map itself."""
     if not isinstance(source.volume, str):
         return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
@@ -106,7 +107,7 @@ def _content(source: SourceRequest, stored: bool) -> Content:
 
 
 def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[MapLabel]:
-    """Return the visible labels, each with a request of its own, whose budget is that of its share."""
+    """Return the visible labels, each with its own request and its share of the budget."""
     shown = [
         (layer.volume, layer.tf, label)
         for layer in maps
@@ -126,7 +127,7 @@ def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -
 
 
 def _source(request: ConvertRequest, content: Content, volume: Volume) -> SourceRequest:
-    """One label map of the file: as it was read, or in blocks where it is."""
+    """Return the source of one label map of the file, in memory or in blocks."""
     source = request.source
     if request.blocks is None:
         return replace(source, volume=volume)
@@ -136,62 +137,62 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
-    """Of every part, box frame: what the whole hides of it, and its share of the whole; None where nothing is seen."""
+def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
+    """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
-    if len(parts) == 1 or len({id(part.volume) for part in parts}) > 1:
-        return [_alone(part, console) for part in parts]  # of segments that overlap colours would mix in a Gaussian
-    whole = replace(request, source=replace(parts[0].request.source, labels=parts[0].table))
+    if len(labels) == 1 or len({id(label.volume) for label in labels}) > 1:
+        return [_alone(label, console) for label in labels]  # a Gaussian would mix colours of overlapping segments
+    whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions()))
-    with opened(run, plain) as field, run.stage("hidden"):
+    with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None
         from vvgt_cli.closed_form.tree import HIDDEN
 
-        hides = hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+        hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
-    for part in parts:
+    for label in labels:
         hidden.append([])
-        if not hides.any_of(part.volume, part.label.number):
+        if not hides.meet_label(label.volume, label.label.number):
             continue
-        console.say(f"{part.text()}: what the others hide of it")
-        alone = _alone(part, console)
+        console.message(f"{label.text()}: converting what others hide of it")
+        alone = _alone(label, console)
         if alone is not None:
-            hidden[-1].append(alone.take(hides.whether(alone)))
-    console.say("all labels together: what is seen of them")
-    left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
-    seen = _fitted(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
-    owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])
+            hidden[-1].append(alone.take(hides.contain(alone)))
+    console.message("all labels: converting what is visible")
+    remaining = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
+    seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=remaining)), console)
+    owner = assign_labels(seen, [(label.volume, label.table, label.label) for label in labels])
     both = [concatenate([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: MapLabel, console: Console) -> Gaussians | None:
-    """A label as though there were no other; None where nothing of it is seen."""
+def _alone(label: MapLabel, console: Console) -> Gaussians | None:
+    """Convert a label as if it were the only one; return None where nothing is visible."""
     try:
-        return _fitted(part.request, console)
+        return _fit(label.request, console)
     except NothingVisible:
         return None
 
 
-def _fitted(request: ConvertRequest, console: Console) -> Gaussians:
-    """Gaussians of a request, box frame; Ctrl-C ends the whole."""
+def _fit(request: ConvertRequest, console: Console) -> Gaussians:
+    """Return the fitted Gaussians of a request, box frame; Ctrl-C ends the batch."""
     run = Run(console, ConversionReport("convert"))
-    found = fitted(run, request)
+    found = fit_gaussians(run, request)
     if run.report.interrupted:
         raise KeyboardInterrupt
     return found
 
 
 def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:
-    """Gaussians of each label, at most ``budget`` in all but for one a label."""
+    """Return the number of Gaussians of each label, at least one, and otherwise at most ``budget`` together."""
     weight = np.array([max(count, 1) for count in _voxels(shown)], np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
 
 
 def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
-    """Voxels of each label in its map; every map is counted once."""
+    """Return the number of voxels of each label; every map is counted once."""
     counts: dict[int, dict[float, int]] = {}
     for volume, *_ in shown:
         if id(volume) not in counts:
@@ -200,5 +201,5 @@ def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
 
 
 def file_name(label: Label) -> str:
-    """Its number, which no other has, and its name in plain characters."""
+    """Return the unique number of a label and its name in plain characters."""
     return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name)[:LONGEST].strip('-')}".strip("-")

@@ -1,4 +1,4 @@
-"""`vvgt convert --live` of a label map: each Gaussian belongs to one label, whose look can be changed afterwards."""
+"""`vvgt convert --live` of a label map: each Gaussian belongs to one label, whose look can be changed later."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.volume.label_maps import counts_of
 
 
-def labels_of(source: Source) -> tuple[Label, ...]:
-    """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
+def live_labels(source: Source) -> tuple[Label, ...]:
+    """Return the labels that Gaussians can belong to, invisible ones included, which other tables may show.
 
     Raises:
-        DataError: too many.
+        DataError: there are more than `MOST_LABELS`.
     """
     table = source.tf
     assert isinstance(table, LabelTable)
@@ -37,13 +37,13 @@ def labels_of(source: Source) -> tuple[Label, ...]:
 
 
 def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
-    """What a file of these labels says."""
+    """Return the header of live Gaussians with these labels."""
     numbers = [float(label.number) for label in labels]
     return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
 
 
-def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
-    """The label map with these labels as one thin fog, told apart by their colours."""
+def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
+    """Return the field of a label map as one thin fog, whose labels differ in colour."""
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
@@ -51,8 +51,8 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     return field.with_look(field.source.with_tables([table]))
 
 
-def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
-    """Gaussians of the fog with the rows of their labels, without those that lie in none."""
+def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
+    """Return the Gaussians of the fog with the rows of their labels, without those outside all labels."""
     from vvgt_cli.closed_form.labelled import assign_labels
 
     assert start.leaves is not None

@@ -1,4 +1,4 @@
-"""The manifest of a folder of views or frames: which run it belongs to, and which of its files are complete."""
+"""The manifest of a folder of views or frames: its run, and the files that are complete."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write, read_text
 
 SCHEMA = 1
-COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by what a folder holds
+COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by content of the folder
 NAME = re.compile(r"manifest(-\d+-of-\d+)?\.json")
 DIGESTS = {"volume": "another volume", "function": "another transfer function", "cameras": "other cameras"}
-FRESH = "choose another directory, or pass --overwrite to start afresh"
+FRESH = "choose another folder, or give --overwrite to start again"
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``index`` (from 1) of ``count`` of a job array."""
+    """Shard ``index`` (from 1) of ``count`` of a job array."""
 
     index: int = 1
     count: int = 1
 
     def holds(self, number: int) -> bool:
-        """Whether view ``number`` (from 0) is this part's."""
+        """Return whether view ``number`` (from 0) belongs to this shard."""
         return number % self.count == self.index - 1
 
     @property
     def manifest(self) -> str:
-        """Name of this part's manifest: parts never write one file."""
+        """Return the name of this shard's manifest; each shard writes its own."""
         return "manifest.json" if self.count == 1 else f"manifest-{self.index}-of-{self.count}.json"
 
 
@@ -43,7 +43,7 @@ def parse_shard(text: str) -> Shard:
     """Parse ``I/N``, I from 1 to N.
 
     Raises:
-        UsageError: anything else.
+        UsageError: the text is invalid.
     """
     match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
@@ -52,22 +52,22 @@ def parse_shard(text: str) -> Shard:
 
 
 def file_digest(path: Path) -> str:
-    """sha256 of a file, hexadecimal."""
+    """Return the sha256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass
 class Manifest:
-    """What a run has written into ``folder``.
+    """A record of the files that a run has written into a folder.
 
     Attributes:
-        folder: of one function's views, or of a series' frames.
-        settings: everything that the files depend on, plain values; the hash is theirs.
-        shard: whose manifest this is.
-        files: relative path -> {"bytes", "sha256"} of each file that was written whole, other parts' included.
-        own: those of ``files`` that this part records.
-        what: the folder holds, a key of `COMMANDS`.
+        folder: folder of the views of one function, or of the frames of a series.
+        settings: everything that the files depend on, plain values.
+        shard: shard of this manifest.
+        files: relative path -> {"bytes", "sha256"} of each complete file, other shards' included.
+        own: those of ``files`` that this shard records.
+        what: content of the folder, a key of `COMMANDS`.
     """
 
     folder: Path
@@ -79,19 +79,19 @@ class Manifest:
 
     @property
     def hash(self) -> str:
-        """sha256 of the settings."""
+        """Return the sha256 of the settings."""
         return digest(json.dumps(self.settings, sort_keys=True))
 
     def open(self, planned: Iterable[str], overwrite: bool) -> None:
-        """Take up what an earlier run of the same settings left, or see that nothing is in the way.
+        """Read the manifests of an earlier run with the same settings, or check that no files are in the way.
 
         Args:
-            planned: relative paths of what will be written.
-            overwrite: remove what an earlier run wrote, whatever its settings.
+            planned: relative paths of the files that will be written.
+            overwrite: remove the files of an earlier run, whatever its settings.
 
         Raises:
-            UsageError: the folder holds another run's files, or files that no manifest knows.
-            DataError: a manifest that is none.
+            UsageError: the folder holds files of another run, or files that no manifest lists.
+            DataError: a manifest is invalid.
         """
         found = self._manifests()
         if overwrite:
@@ -112,7 +112,7 @@ class Manifest:
                     raise UsageError(f"{self.folder}: {name} exists, and no manifest; {FRESH}")
 
     def refresh(self) -> None:
-        """Take in what other parts have recorded meanwhile."""
+        """Read what other shards have recorded meanwhile."""
         for path in self._manifests():
             if path.name != self.shard.manifest:
                 self.files |= read_manifest(path, self.what)["files"]
@@ -126,21 +126,21 @@ class Manifest:
         for path in found:
             try:
                 written = read_manifest(path, self.what)["files"]
-            except DataError:  # not ours: it is replaced, nothing else is
+            except DataError:  # not our manifest: only this file is replaced
                 written = {}
             for name in written:
                 (self.folder / name).unlink(missing_ok=True)
             path.unlink()
 
     def complete(self, name: str, content: bool = True) -> bool:
-        """Whether a file is there as it was recorded; ``content``: by its hash, not by its size alone."""
+        """Return whether a file exists as recorded, by its size and, with ``content``, by its hash."""
         record, path = self.files.get(name), self.folder / name
         if record is None or not path.is_file() or path.stat().st_size != record["bytes"]:
             return False
         return not content or file_digest(path) == record["sha256"]
 
     def record(self, names: Iterable[str] = (), facts: Mapping[str, dict[str, Any]] = MappingProxyType({})) -> None:
-        """Note files as complete, with what else is known of some, and write the manifest."""
+        """Record files as complete, with further ``facts`` of some, and write the manifest."""
         for name in names:
             path = self.folder / name
             known = {"bytes": path.stat().st_size, "sha256": file_digest(path), **facts.get(name, {})}
@@ -154,10 +154,10 @@ class Manifest:
 
 
 def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
-    """A manifest's document, of a folder of ``what`` (a key of `COMMANDS`).
+    """Read the document of a manifest, for a folder of ``what`` (a key of `COMMANDS`).
 
     Raises:
-        DataError: not one, or one that names files outside its folder.
+        DataError: not a manifest, or one with files outside its folder.
     """
     try:
         document = json.loads(read_text(path))
@@ -173,13 +173,13 @@ def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
 
 
 def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:
-    """What two runs differ in, one line."""
-    parts = []
+    """Return a line with the differences between two runs."""
+    found = []
     for key in dict.fromkeys([*here, *there]):
         a, b = there.get(key), here.get(key)
         if a != b:
-            parts.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
-    return f"holds {what} of another run: " + (", ".join(parts) or "its manifest was edited")
+            found.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
+    return f"holds {what} of another run: " + (", ".join(found) or "its manifest was edited")
 
 
 def _shown(value: Any) -> str:

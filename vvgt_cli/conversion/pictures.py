@@ -1,4 +1,4 @@
-"""Pictures of a series: only the parts of a frame that differ from the frame before are drawn again."""
+"""A cache of pictures for a series: only blocks of pixels that differ from the previous frame are drawn again."""
 
 from __future__ import annotations
 
@@ -17,56 +17,57 @@ if TYPE_CHECKING:
 
 
 class RememberedViews:
-    """The views of a frame, which take from the frame before what has not changed.
+    """Views of a frame that reuse unchanged blocks of pixels of the previous frame.
 
     Attributes:
-        largest: pixels along an edge; larger pictures are not kept.
-        views: of the frame that is being converted.
+        largest: pixels along an edge; larger pictures are not cached.
+        views: views of the frame that is being converted.
     """
 
     def __init__(self, largest: int, views: ViewRenderer | None = None) -> None:
+        """Start with an empty cache."""
         self.largest, self.views = largest, views
         self._kept: dict[bytes, tuple[Camera, np.ndarray, np.ndarray]] = {}  # camera, picture, (rows, columns) bool
 
     def expect(self, pictures: Sequence[Picture]) -> None:
-        """See `ViewRenderer.expect`."""
-        parts = [picture._replace(blocks=self.missing(picture)) for picture in pictures]
+        """Implement `ViewRenderer.expect`."""
+        missing = [picture._replace(blocks=self.missing(picture)) for picture in pictures]
         assert self.views is not None
-        self.views.expect([part for part in parts if part.blocks is None or len(part.blocks.numbers)])
+        self.views.expect([one for one in missing if one.blocks is None or len(one.blocks.numbers)])
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `ViewRenderer.view`."""
+        """Implement `ViewRenderer.view`."""
         picture = Picture(camera, settings, blocks)
-        part = self.missing(picture)
-        if part is not None and not len(part.numbers):
+        missing = self.missing(picture)
+        if missing is not None and not len(missing.numbers):
             image = np.zeros((camera.height, camera.width, 4), np.float32)
         else:
             assert self.views is not None
-            image = self.views.view(camera, settings, part)
-        return self.put(picture, part, image)
+            image = self.views.view(camera, settings, missing)
+        return self.put(picture, missing, image)
 
     def forget(self, picture: Picture) -> None:
-        """See `ViewRenderer.forget`: pictures are kept for the next frame."""
+        """Keep the picture, for the next frame."""
 
-    def outdate(self, changes: Changes | None) -> None:
-        """Let go of what shows something else now; None: of all."""
+    def invalidate(self, changes: Changes | None) -> None:
+        """Discard cached blocks that show a change; None discards all pictures."""
         if changes is None:
             self._kept.clear()
         for camera, _, known in self._kept.values():
             known &= ~changes.seen_by(camera) if changes else False
 
     def last(self, view: Picture) -> np.ndarray | None:
-        """A whole picture (h, w, 4) as it was drawn last, of whichever frames; None where it was not."""
+        """Return a cached picture (h, w, 4), whose blocks may be of different frames; None without one."""
         found = self._kept.get(_key(view))
         return None if found is None else found[1].copy()
 
-    def room(self, views: Sequence[Picture]) -> int:
-        """Bytes that will be kept of them beside what is kept."""
+    def new_bytes(self, views: Sequence[Picture]) -> int:
+        """Return the bytes that caching ``views`` would add."""
         sizes = {_key(view): (view.camera.width, view.camera.height) for view in views}
         return sum(16 * w * h for key, (w, h) in sizes.items() if key not in self._kept and max(w, h) <= self.largest)
 
     def missing(self, view: Picture) -> Blocks | None:
-        """What of a picture has to be drawn; None: all of it."""
+        """Return the blocks of a picture that have to be drawn; None for the whole."""
         found = self._kept.get(_key(view))
         if found is None:
             return view.blocks
@@ -74,7 +75,7 @@ class RememberedViews:
         return Blocks(view.camera.width, view.camera.height, numbers[~found[2].ravel()[numbers]])
 
     def put(self, view: Picture, drawn: Blocks | None, image: np.ndarray) -> np.ndarray:
-        """The picture, of which ``drawn`` is there as ``image`` (h, w, 4), and what was known."""
+        """Cache the blocks ``drawn`` in ``image`` (h, w, 4), and return the picture with the cached ones."""
         camera, key = view.camera, _key(view)
         if max(camera.width, camera.height) > self.largest:
             return image

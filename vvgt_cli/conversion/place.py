@@ -1,4 +1,4 @@
-"""Between the box frame, where a run's Gaussians are, and the unit frame of files: which way round and which way up."""
+"""Transforms between the box frame of a run and the unit frame of files, and the up axis of viewers."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 AUTO, NONE = "auto", "none"
 
 
-def way_up(up: str, frame: str, space: str | None) -> str:
-    """World axis that viewers show upwards: superior for `AUTO` in the unit frame of an anatomical space, else `NONE`.
+def up_axis(up: str, frame: str, space: str | None) -> str:
+    """Return the world axis that viewers show upwards; `AUTO` is superior in the unit frame of an anatomical space.
 
     Args:
         up: a world axis, an anatomical direction, `AUTO` or `NONE`.
-        frame: of the file: positions in "world" stay what they are beside other data, unless a turn is asked for.
-        space: of the volume, None where it is not anatomical.
+        frame: frame of the file; in "world", positions match other data, and `AUTO` is `NONE`.
+        space: anatomical space of the volume, or None.
 
     Raises:
         UsageError: an anatomical direction where the space is not.
@@ -40,20 +40,20 @@ def way_up(up: str, frame: str, space: str | None) -> str:
     return world_axis(up, space)
 
 
-def out_of_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
-    """Gaussians of the volume's box frame in its unit frame."""
+def to_unit_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
+    """Transform Gaussians from the box frame of the volume to its unit frame."""
     return transform(gaussians, volume.axes)
 
 
-def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
-    """Gaussians of the volume's unit frame in its box frame."""
+def to_box_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
+    """Transform Gaussians from the unit frame of the volume to its box frame."""
     axes = volume.axes
-    straight = np.array_equal(axes, np.eye(3))
-    return gaussians if straight else transform(gaussians, np.linalg.inv(axes))
+    aligned = np.array_equal(axes, np.eye(3))
+    return gaussians if aligned else transform(gaussians, np.linalg.inv(axes))
 
 
-def in_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
-    """Gaussians of a volume's unit frame in that of another; the lengths that they carry, too."""
+def to_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
+    """Transform Gaussians, and the lengths that they carry, from the unit frame of ``volume`` to that of ``other``."""
     own, its = volume.unit_frame(), other.unit_frame()
     before, factor = own.scale * (np.array(own.centre) - np.array(its.centre)), its.scale / own.scale
     moved = rescale(gaussians, factor, before, np.zeros(3))
@@ -64,8 +64,8 @@ def in_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussian
     return replace(moved, live=live)
 
 
-def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
-    """The layout of a file, with the records of where the volume is."""
+def with_place(ply: PlyOptions, volume: Volume) -> PlyOptions:
+    """Return the layout of a file with the place of the volume."""
     frame = volume.unit_frame()
     return replace(
         ply,
@@ -77,24 +77,24 @@ def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
     )
 
 
-def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
-    """What there is to say of a volume's place before the work: sheared axes, a turn that the file will not record."""
-    said = []
+def placement_warnings(volume: Volume, ply: PlyOptions) -> list[str]:
+    """Return warnings about the place of a volume: sheared axes, or a rotation that the file will not record."""
+    found = []
     if volume.sheared:
-        said.append(
+        found.append(
             f"{volume.name}: {shear_text(volume.axes)} (a tilted gantry?): Gaussians are sheared with them; opacity "
             "stays per length along the index axes, and pictures are of the volume unsheared"
         )
     if not ply.comments and (ply.up != NONE or ply.frame != "unit"):
-        said.append(
-            f"--no-comments: nothing in the file will say that it is in the {ply.frame} frame with up {ply.up}; "
-            "'vvgt evaluate' and 'vvgt render' will take it as the unit frame with up none"
+        found.append(
+            f"--no-comments: the file will not record that it is in the {ply.frame} frame with up {ply.up}; "
+            "'vvgt evaluate' and 'vvgt render' will assume the unit frame with up none"
         )
-    return said
+    return found
 
 
-def upright(volume: Volume, up: str) -> np.ndarray:
-    """(3, 3): box frame to a frame with world directions in which ``up`` is +z; what previews are seen in."""
+def upright_axes(volume: Volume, up: str) -> np.ndarray:
+    """Return the (3, 3) matrix from the box frame to the frame of previews: world directions with ``up`` along +z."""
     result: np.ndarray = upright_matrix(up) @ volume.axes
     return result
 
@@ -102,7 +102,7 @@ def upright(volume: Volume, up: str) -> np.ndarray:
 def preview(
     scene: Scene | Viewed, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
 ) -> np.ndarray:
-    """Reference, ours and their difference, a row a camera of the frame that ``axes`` (`upright`) leads to."""
+    """Draw reference, splats and their difference, one row per camera in the frame of ``axes`` (`upright_axes`)."""
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.images import side_by_side
     from vvgt_cli.splat import render

@@ -1,4 +1,4 @@
-"""What `convert` will do: a list of stages, chosen by what they cost and what a user allows."""
+"""The plan of a conversion: a list of stages, chosen by their costs and the user's limits."""
 
 from __future__ import annotations
 
@@ -19,95 +19,95 @@ from vvgt_cli.conversion.stages import (
     TrainingViews,
     ViewingConditions,
 )
-from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 
-MOST_STEPS = 400  # where a target or a time asks for as many as it takes
-FEWEST_STEPS = 8  # less is not worth the views
-ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
+MOST_STEPS = 400  # where a target or a time limit decides when to end
+FEWEST_STEPS = 8  # fewer are not worth rendering views for
+ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
-WRITE = 0.1  # seconds of the file, each time
-SURE = 0.8  # of an estimate of memory: as little has been enough
+WRITE = 0.1  # seconds of writing the file once
+SURE = 0.8  # share of the estimated memory that is certainly needed
 
 
 @dataclass
 class Plan:
-    """What is going to be done.
+    """The stages of a conversion, with their expected costs.
 
     Attributes:
-        case: what costs follow from.
-        gaussians: budget.
-        stages: in order.
-        spent: seconds before the first of them.
-        bytes: of the file.
-        left_out: (stage, why) of what is not done.
-        writes: how often the file is written.
+        workload: counts and machine pace that costs follow from.
+        gaussians: budget of Gaussians.
+        stages: stages in order.
+        spent: seconds before the first stage.
+        bytes: size of the file.
+        skipped: (stage, reason) of stages that are not run.
+        writes: number of times that the file is written.
     """
 
-    case: Workload
+    workload: Workload
     gaussians: int
     stages: list[Stage]
     spent: float = 0.0
     bytes: int = 0
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
     writes: int = 1
 
     @property
     def writing(self) -> float:
-        """Seconds of writing the file."""
-        return self.case.pace * WRITE * self.writes
+        """Return the seconds of writing the file."""
+        return self.workload.pace * WRITE * self.writes
 
     def seconds_of(self, stages: Sequence[Stage]) -> float:
-        """That they should take, and writing the file."""
-        return sum(stage.cost(self.case).seconds for stage in stages) + self.writing
+        """Return the expected seconds of some stages and of writing the file."""
+        return sum(stage.cost(self.workload).seconds for stage in stages) + self.writing
 
     @property
     def seconds(self) -> float:
-        """Of the whole run."""
+        """Return the expected seconds of the whole run."""
         return self.spent + self.seconds_of(self.stages)
 
     @property
     def working_memory(self) -> float:
-        """Bytes that stages take beside the program and the volume."""
-        return sum(stage.cost(self.case).memory for stage in self.stages)
+        """Return the bytes that stages need in addition to program and volume."""
+        return sum(stage.cost(self.workload).memory for stage in self.stages)
 
     @property
     def memory(self) -> float:
-        """Bytes of the whole process at its most."""
-        return self.case.base_bytes + self.working_memory
+        """Return the peak memory of the process in bytes."""
+        return self.workload.base_bytes + self.working_memory
 
     def after(self, stage: Stage) -> float:
-        """Seconds of what follows a stage."""
+        """Return the expected seconds after a stage."""
         return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
 
     def costs(self) -> list[tuple[str, float]]:
-        """(label, seconds) of every stage."""
-        stages = [(stage.label(), stage.cost(self.case).seconds) for stage in self.stages]
+        """List (label, seconds) of every stage."""
+        stages = [(stage.label(), stage.cost(self.workload).seconds) for stage in self.stages]
         return [("so far", self.spent), *stages, ("write", self.writing)]
 
     def record(self) -> dict[str, Any]:
-        """Plain values for the report."""
+        """Return plain values for the report."""
         return {
             "gaussians": self.gaussians,
             "seconds": self.seconds,
             "memory": self.memory,
             "bytes": self.bytes,
             "stages": [self._record(stage) for stage in self.stages],
-            "left_out": self.left_out,
+            "skipped": self.skipped,
         }
 
     def _record(self, stage: Stage) -> dict[str, Any]:
-        seconds, memory = stage.cost(self.case)
+        seconds, memory = stage.cost(self.workload)
         chosen = {entry.name: getattr(stage, entry.name) for entry in fields(stage)}
         return {"name": stage.name, "seconds": seconds, "memory": memory, **chosen}
 
     def text(self) -> str:
-        """The plan as `--dry-run` prints it."""
+        """Return the plan as `--dry-run` prints it."""
         lines = [f"{name:<24}{seconds:8.1f} s" for name, seconds in self.costs()]
-        lines += [f"{name:<24}{'-':>8}    {why}" for name, why in self.left_out]
+        lines += [f"{name:<24}{'-':>8}    {why}" for name, why in self.skipped]
         lines.append(
             f"{'whole':<24}{self.seconds:8.1f} s, {self.memory / 2**30:.1f} GiB of memory, "
             f"{self.bytes / 1e6:.1f} MB with {self.gaussians} Gaussians"
@@ -117,14 +117,14 @@ class Plan:
 
 @dataclass(frozen=True)
 class Planner:
-    """What decides.
+    """The choice of stages for a request.
 
     Attributes:
-        limits, fit: what the user asks for; ``fit.max_gaussians`` within the limits.
+        limits, fit: the user's limits and options; ``fit.max_gaussians`` is within the limits.
         sh_degree: degree of the spherical harmonics in the file.
-        wide: Gaussians are wide enough to be seen in small views.
-        whole: all ten test views are scored.
-        writes: how often the file is written.
+        wide: whether Gaussians are wide enough to be seen in small views.
+        whole: whether all ten test views are scored.
+        writes: number of times that the file is written.
     """
 
     limits: Limits
@@ -136,13 +136,13 @@ class Planner:
 
     @property
     def vbm(self) -> bool:
-        """Whether the closed form has cells, of which a tree can be cut again."""
+        """Return whether the closed form has a pyramid of cells, which can be cut again."""
         return self.fit.init == "vbm"
 
-    def plan(self, case: Workload, spent: float, begun: bool = False) -> Plan:
-        """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
+    def plan(self, workload: Workload, spent: float, begun: bool = False) -> Plan:
+        """Return the stages that fit after ``spent`` seconds; with ``begun`` the closed form is done."""
         count = self.fit.max_gaussians
-        plan = Plan(case, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
+        plan = Plan(workload, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
         last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
         left = None
@@ -150,108 +150,110 @@ class Planner:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
         between = self._improvements(plan, left)
         cut = any(isinstance(stage, CellsByError) for stage in between)
-        if self._anew() or any(isinstance(stage, BackProjection) for stage in between):
-            first = [ClosedFormStage(anew=True)]
+        if self._recuts() or any(isinstance(stage, BackProjection) for stage in between):
+            first = [ClosedFormStage(recut=True)]
         elif cut:
-            first = [ClosedFormStage(cut=True)]
+            first = [ClosedFormStage(recut_by_error=True)]
         plan.stages = [*([] if begun else first), *between, *last]
         return plan
 
     def _improvements(self, plan: Plan, left: float | None) -> list[Stage]:
-        """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
-        case = plan.case
+        """Return the stages that need views: gradient descent for the given steps or time, or as many as pay off."""
+        workload = plan.workload
         open_end = self.limits.target_psnr is not None or left is not None
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
         small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
         steps = wanted = self.fit.steps if self.fit.steps is not None else MOST_STEPS if open_end else STEPS
-        while left is not None and steps > 0 and self._seconds(case, steps, small) > left:
+        while left is not None and steps > 0 and self._seconds(workload, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):
-            plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
+            plan.skipped.append(("refinement", _time_left(left) if wanted else "no steps are requested"))
             return self._without_steps(plan, network, left)
         if self.fit.model is None:
-            plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
+            plan.skipped.append(("network", "gradient descent gains more in the same time; --model runs it"))
         if not few:
-            plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
+            plan.skipped.append(("back-projection", "gradient descent gains more in the same time"))
         *before, descent = self._descent(steps, small, wanted)
         return [*before, *([BackProjection()] if few else []), *network, descent]
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
-        """Gradient descent and its views; cells by error but before few steps, and before a network."""
+        """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
         enough = steps >= ENOUGH_STEPS
         return [
             CheckViews(),
-            TrainingViews(views_of(steps, small), view_edge(self.fit.size, small)),
-            *([CellsByError(small, keep=not self._anew())] if enough and self.vbm and self.fit.model is None else []),
+            TrainingViews(view_count(steps, small), view_edge(self.fit.size, small)),
+            *([CellsByError(small, keep=not self._recuts())] if enough and self.vbm and self.fit.model is None else []),
             Refinement(steps, most, small, overlap=enough and self.vbm),
         ]
 
-    def _anew(self) -> bool:
-        """Whether the cells may be cut for fewer Gaussians in the end."""
+    def _recuts(self) -> bool:
+        """Return whether the pyramid may be cut again, for fewer Gaussians."""
         return self.limits.target_psnr is not None
 
-    def _seconds(self, case: Workload, steps: int, small: bool) -> float:
-        """Of so many steps, with their views, ``small`` ones or not, and the check views."""
-        return sum(stage.cost(case).seconds for stage in self._descent(steps, small, steps))
+    def _seconds(self, workload: Workload, steps: int, small: bool) -> float:
+        """Return the expected seconds of descent with its views (``small`` or not) and the check views."""
+        return sum(stage.cost(workload).seconds for stage in self._descent(steps, small, steps))
 
     def _without_steps(self, plan: Plan, network: list[Stage], left: float | None) -> list[Stage]:
-        """Back-projection instead, if there is time; check views where there is a target and time for them."""
-        views = self._seconds(plan.case, 0, False)
-        whole = views + BackProjection().cost(plan.case).seconds
+        """Return back-projection instead, if there is time, or check views for a target."""
+        views = self._seconds(plan.workload, 0, False)
+        whole = views + BackProjection().cost(plan.workload).seconds
         projected = left is None or left >= whole
         if not projected:
-            plan.left_out.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
+            plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_time_left(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
-        train = TrainingViews(views_of(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
+        train = TrainingViews(view_count(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
         judge = self.limits.target_psnr is not None and (left is None or left >= views)
         return [check] if judge else []
 
     def _network(self, plan: Plan, left: float | None) -> tuple[list[Stage], float | None]:
-        """The network, where one is asked for and there is time; and what is left."""
+        """Return the network, if requested and in time, and the time that remains."""
         if self.fit.model is None:
             return [], left
         stage = Network(self.fit.model)
-        seconds = stage.cost(plan.case).seconds
-        if left is not None and left < seconds + self._seconds(plan.case, 0, False):
-            plan.left_out.append(("network", f"about {seconds:.1f} s, {_room(left)}"))
+        seconds = stage.cost(plan.workload).seconds
+        if left is not None and left < seconds + self._seconds(plan.workload, 0, False):
+            plan.skipped.append(("network", f"about {seconds:.1f} s, {_time_left(left)}"))
             return [], left
         return [stage], None if left is None else left - seconds
 
 
-def _room(left: float | None) -> str:
-    return f"{max(left or 0.0, 0.0):.1f} s are left"
+def _time_left(left: float | None) -> str:
+    return f"{max(left or 0.0, 0.0):.1f} s remain"
 
 
 def check_memory(plan: Plan, pictures: float = 0.0, beside: Callable[[Workload], float] = lambda _: 0.0) -> None:
-    """Refuse what would not fit, rather than have the system end it.
+    """Check that a plan fits into memory, before the system would end the process.
 
     Args:
-        plan: of the stages that are left.
-        pictures: bytes of them that are kept beside what the stages take.
-        beside: bytes that are kept of such a workload's Gaussians.
+        plan: plan of the remaining stages.
+        pictures: bytes of pictures that are kept in addition.
+        beside: bytes of Gaussians that are kept in addition, for a workload.
 
     Raises:
-        UsageError: with the size or the Gaussians that would fit.
+        UsageError: names the size or the number of Gaussians that would fit.
     """
-    free, size = free_memory(), plan.case.size
+    free, size = free_memory(), plan.workload.size
     if free is None:
         return
-    views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
+    views = sum(
+        stage.cost(plan.workload).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews)
+    )
     if (drawn := views + pictures) > free:
         raise UsageError(
             f"--size {size}: views need {drawn / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
-            f"{max(int(size * (free / drawn) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
+            f"{max(int(size * (free / drawn) ** 0.5), 1)} would fit, or try 'vvgt init', which renders none"
         )
-    need = SURE * plan.working_memory + pictures + beside(plan.case)
+    need = SURE * plan.working_memory + pictures + beside(plan.workload)
     form, fewer = plan.stages[0], plan.gaussians
     if not isinstance(form, ClosedFormStage) or need <= free:
         return
     while fewer > 1:
-        case = for_budget(plan.case, fewer)
-        if SURE * (form.cost(case).memory + views) + pictures + beside(case) <= free:
+        workload = for_budget(plan.workload, fewer)
+        if SURE * (form.cost(workload).memory + views) + pictures + beside(workload) <= free:
             break
         fewer //= 2
     raise UsageError(

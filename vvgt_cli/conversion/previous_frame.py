@@ -1,4 +1,4 @@
-"""Start a frame of a series from the one before: only Gaussians where the two frames differ move."""
+"""The warm start of a frame from the previous one: only Gaussians where the two frames differ move."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
-from vvgt_cli.conversion.stages.refinement import Refinement, refine, widened_small
+from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.field.field import Picture, ViewRenderer
@@ -30,26 +30,26 @@ from vvgt_cli.score.checks import Views
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
 
-WARM_START = "starting from the frame before"
+WARM_START = "starting from the previous frame"
 STEPS = 50  # of gradient descent at a time
-ROUNDS = 2  # of so many steps at most
-LEVEL = 0.25 / 255  # of a pixel, that is no change
-VIEWS = 18  # of the training views for them, others in every frame
-WORSE = 0.2  # dB on the check views below the last frame that was converted by itself: then the next is, too
-FAR = 6.0  # dB below it before any step
+ROUNDS = 2  # of `STEPS` at most
+LEVEL = 0.25 / 255  # difference of a pixel that counts as none
+VIEWS = 18  # training views per frame, which take turns
+WORSE = 0.2  # dB on the check views below the last cold frame, beyond which a frame starts cold
+FAR = 6.0  # the same before any step
 A_SET = 14 * 4  # bytes of a Gaussian without harmonics, which are 12 each
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """What a frame leaves to the next.
+    """The state that a frame passes to the next.
 
     Attributes:
-        source: its volume.
-        gaussians: box frame, as its file holds them.
-        psnr: on the check views, of the last frame that was converted by itself.
-        cameras, rule, settings: of the training views.
-        shown: of each turn of the views, what was there when they were drawn last.
+        source: source of the frame.
+        gaussians: Gaussians in the box frame, as the file holds them.
+        psnr: dB on the check views of the last frame that started cold.
+        cameras, rule, settings: cameras, drawing rule and settings of the training views.
+        shown: for each turn of the views, the Gaussians when they were drawn last.
     """
 
     source: Source
@@ -61,50 +61,51 @@ class _Frame:
     shown: tuple[Gaussians, ...]
 
 
-def previous_frame(request: ConvertRequest, parts: int = 1) -> PreviousFrame | None:
-    """Return the warm start of a series in ``parts`` shards; None where each frame is converted from scratch."""
+def previous_frame(request: ConvertRequest, shards: int = 1) -> PreviousFrame | None:
+    """Return the warm start of a series in ``shards`` shards; None where each frame is converted from scratch."""
     limited = request.limits.target_psnr is not None or request.limits.time_budget is not None
-    return None if request.live or request.checkpoint or limited or parts > 1 else PreviousFrame(request.fit.size)
+    return None if request.live or request.checkpoint or limited or shards > 1 else PreviousFrame(request.fit.size)
 
 
 class PreviousFrame(WarmStart):
-    """The Gaussians of the frame before, and pictures of it at ``size`` pixels along an edge."""
+    """The Gaussians of the previous frame, and its pictures, up to ``size`` pixels along an edge."""
 
     def __init__(self, size: int) -> None:
+        """Start without a previous frame."""
         self._last: _Frame | None = None
         self._pictures = RememberedViews(size)
         self._turn = 0
-        self._moved: int | None = None  # Gaussians that are not those of the frame before
+        self._moved: int | None = None  # number of Gaussians that differ from the previous frame
 
     def views(self, views: ViewRenderer) -> ViewRenderer:
-        """See `WarmStart.views`."""
+        """Implement `WarmStart.views`."""
         self._pictures.views = views
         return self._pictures
 
     def facts(self) -> dict[str, int]:
-        """Return how many Gaussians of the last frame are not those of the frame before."""
+        """Return the number of Gaussians of the last frame that differ from the previous one."""
         return {} if self._moved is None else {"moved": self._moved}
 
     def memory(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
-        """See `WarmStart.memory`."""
+        """Implement `WarmStart.memory`."""
         turns = max((max(s.count // VIEWS, 1) for s in plan.stages if isinstance(s, TrainingViews)), default=-1)
         there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
         sets = max(turns + 1 - len(there), 0)
-        pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
-        return pictures, lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1))
+        pictures = self._pictures.new_bytes([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
+        return pictures, lambda workload: sets * workload.gaussians * (A_SET + 12 * ((workload.degree + 1) ** 2 - 1))
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """See `WarmStart.try_start`."""
+        """Implement `WarmStart.try_start`."""
         self._moved = None
         last, self._last = self._last, None
         lighting = work.field.source.lighting
         if last is None or (lighting is not None and lighting.attenuated):  # shadows reach far
-            self._pictures.outdate(None)
+            self._pictures.invalidate(None)
             return False
         with work.run.stage("differences") as stage:
             found = changes(last.source, work.field.source)
             free = found.meet(last.gaussians)
-            self._pictures.outdate(found)
+            self._pictures.invalidate(found)
             stage.note = f"{found.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
         work.gaussians = last.gaussians
         if found.blocks.any() and not self._fitted(work, last, found, free):
@@ -116,12 +117,12 @@ class PreviousFrame(WarmStart):
             shown = (*shown[:turn], work.made(), *shown[turn + 1 :])
             self._turn += 1
         self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
-        self._moved = _differing(last.gaussians, work.made())
+        self._moved = _count_differing(last.gaussians, work.made())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         return True
 
     def keep(self, work: Work, plan: Plan) -> None:
-        """Remember a frame that was converted by itself, if it was fitted to views."""
+        """Store a frame that started cold, if it was fitted to views."""
         if not any(isinstance(stage, Refinement) for stage in plan.stages) or work.check is None:
             return
         if work.train is not None and work.train_rule is not None and work.train_settings is not None:
@@ -133,7 +134,7 @@ class PreviousFrame(WarmStart):
             )
 
     def _fitted(self, work: Work, last: _Frame, found: Changes, free: np.ndarray) -> bool:
-        """Gradient descent of what is ``free`` (K,) bool; whether the frame is near enough then."""
+        """Refine the Gaussians that are ``free`` (K,) bool, and return whether the result is good enough."""
         from vvgt_cli.dvr import render_views
 
         turn, turns = self._turn % len(last.shown), len(last.shown)
@@ -143,16 +144,16 @@ class PreviousFrame(WarmStart):
         work.field.views.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
         judge.run(work)
         if work.psnr(last.gaussians) < last.psnr - FAR:
-            work.run.leave_out(WARM_START, "it shows something else")
+            work.run.skip(WARM_START, "the frame differs too much")
             return False
         with work.run.stage("views") as stage:
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
             images = render_views(work.field.views, cameras, last.settings)
             for camera, image, old in zip(cameras, images, before, strict=True):
-                _still(image, old, last.shown[turn], camera, last.rule)
-            stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
+                _keep_unchanged(image, old, last.shown[turn], camera, last.rule)
+            stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the previous frame"
         assert work.check is not None
-        judged, psnr = _near(work.check, found), 0.0
+        judged, psnr = _changed_blocks(work.check, found), 0.0
         asked = work.fit.steps
         left = ROUNDS * STEPS if asked is None else min(asked, ROUNDS * STEPS)
         while left > 0:
@@ -162,18 +163,18 @@ class PreviousFrame(WarmStart):
                 "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=STEPS
             )
             result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
-            result = as_stored(widened_small(result, work.fit.size)[0])
+            result = as_stored(widen_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
             if psnr >= last.psnr - WORSE or work.run.report.interrupted:
                 return True
-        told = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
-        work.run.leave_out(WARM_START, told)
+        worse = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
+        work.run.skip(WARM_START, worse)
         return False
 
 
-def _still(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:
-    """Where a view (h, w, 4) shows what it has shown, fit to what the Gaussians showed then: it is to stay."""
+def _keep_unchanged(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:
+    """Set unchanged pixels of a view (h, w, 4) to those of the Gaussians, so that descent keeps them."""
     from vvgt_cli.splat import render
 
     if old is not None:
@@ -182,7 +183,7 @@ def _still(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: 
 
 
 def _moved(start: Gaussians, result: Gaussians, free: np.ndarray) -> Gaussians:
-    """``result`` where ``free`` (K,) bool, else ``start``, bit for bit."""
+    """Return the rows of ``result`` where ``free`` (K,) bool, else those of ``start``, bit for bit."""
     arrays = {}
     for name, array in start.arrays().items():
         arrays[name] = array.copy()
@@ -190,18 +191,21 @@ def _moved(start: Gaussians, result: Gaussians, free: np.ndarray) -> Gaussians:
     return Gaussians(**arrays)
 
 
-def _differing(first: Gaussians, second: Gaussians) -> int:
-    """How many rows are not the same."""
+def _count_differing(first: Gaussians, second: Gaussians) -> int:
+    """Return the number of Gaussians that differ."""
     pairs = zip(first.arrays().values(), second.arrays().values(), strict=True)
     return int(np.any([(a != b).reshape(len(first), -1).any(axis=1) for a, b in pairs], axis=0).sum())
 
 
-def _near(views: Views, found: Changes) -> Views:
-    """The blocks of views that show what differs, to judge by; all of them where none does."""
-    cameras, images, parts = [], [], []
+def _changed_blocks(views: Views, found: Changes) -> Views:
+    """Return the blocks of views that show differences, to judge by; all views where none does."""
+    cameras, images, blocks = [], [], []
     for k, camera in enumerate(views.cameras):
         shown = found.seen_by(camera)
-        shown[camera.height // BLOCK :], shown[:, camera.width // BLOCK :] = False, False  # not wholly inside
+        shown[camera.height // BLOCK :], shown[:, camera.width // BLOCK :] = (
+            False,
+            False,
+        )  # blocks cut by the picture's edge
         numbers, image = np.flatnonzero(shown), views.images[k]
         if views.blocks is None:
             image = Blocks(camera.width, camera.height, numbers).pick(image)
@@ -212,5 +216,5 @@ def _near(views: Views, found: Changes) -> Views:
         if len(numbers):
             cameras.append(camera)
             images.append(image)
-            parts.append(Blocks(camera.width, camera.height, numbers))
-    return Views(cameras, images, parts) if cameras else views  # type: ignore[arg-type] # of several heights
+            blocks.append(Blocks(camera.width, camera.height, numbers))
+    return Views(cameras, images, blocks) if cameras else views  # type: ignore[arg-type] # of several heights

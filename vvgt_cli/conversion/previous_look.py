@@ -1,4 +1,4 @@
-"""Start a conversion from an earlier one of the same volume under another function, light or screen."""
+"""The warm start of a conversion from an earlier one of the same volume under another function, light or screen."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.conversion.live import in_box
-from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.live import box_lighting
+from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
-from vvgt_cli.conversion.stages.views import views_of, wide
+from vvgt_cli.conversion.stages.views import suits_small_views, view_count
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
@@ -27,44 +27,45 @@ from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
 STEPS = 50  # of gradient descent at most
-FAR = 7.5  # dB on the check views below what the last conversion by itself had: before the steps
-WORSE = 2.0  # the same after them: of other looks, other errors are what is possible
-FAINT = 1e-3  # of the mean extinction: less says nothing of a colour
-MOST = 50.0  # times the extinction, or a part of it: more says nothing of an opacity
-OTHER = 0.5  # from colour to colour: what descent has found out of the one is not so of the other
+FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
+WORSE = 2.0  # the same after the steps, since other looks allow other errors
+FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
+MOST = 50.0  # greatest ratio of extinctions
+OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
 WARM_START = "starting from the earlier conversion"
-GRADIENT = slice(2, 5)  # of what is under Gaussians
+GRADIENT = slice(2, 5)  # columns of samples
 
 
 class PreviousLook(WarmStart):
     """The Gaussians of an earlier conversion of the same volume, recoloured and refined by a few steps."""
 
     def __init__(self, earlier: Conversion) -> None:
+        """Start from ``earlier``."""
         self.earlier = earlier
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """See `WarmStart.try_start`.
+        """Implement `WarmStart.try_start`.
 
         Raises:
             UsageError: the earlier conversion is of another volume.
         """
-        why = self._unfit(work, request)
+        why = self._obstacle(work, request)
         if why is None:
             work.run.compile(LIVE, work.field.source.kernel_type())
             with work.run.stage("earlier") as stage:
-                work.gaussians = as_stored(recoloured(self.earlier, work.field))
+                work.gaussians = as_stored(recolor_earlier(self.earlier, work.field))
                 stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
             why = self._fitted(work, plan)
         if why is None:
             plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         else:
             work.reset()
-            work.run.leave_out(WARM_START, why)
+            work.run.skip(WARM_START, why)
         return why is None
 
-    def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
-        """Why there is nothing to go on from, None where there is."""
+    def _obstacle(self, work: Work, request: ConvertRequest) -> str | None:
+        """Return the reason against a warm start; None for none."""
         field, before = work.field, self.earlier.field
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
@@ -78,21 +79,24 @@ class PreviousLook(WarmStart):
         budget = self.earlier.report.options["max_gaussians"]
         if not len(self.earlier.gaussians) <= work.fit.max_gaussians <= budget:
             return f"it has {len(self.earlier.gaussians)} Gaussians, of at most {budget}"
-        if not _same(field, before):
+        if not _same_volume(field, before):
             raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         return None
 
     def _fitted(self, work: Work, plan: Plan) -> str | None:
-        """Gradient descent; why the result is not near enough, None where it is."""
+        """Refine the recoloured Gaussians; return the reason why they are not good enough, None if they are."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
-        steps, small = min(work.fit.steps or STEPS, STEPS), wide(work.made(), work.fit.size)
-        stages = TrainingViews(views_of(steps, small), view_edge(work.fit.size, small)), Refinement(steps, steps, small)
+        steps, small = min(work.fit.steps or STEPS, STEPS), suits_small_views(work.made(), work.fit.size)
+        stages = (
+            TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
+            Refinement(steps, steps, small),
+        )
         judge = CheckViews()
         work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
         if work.psnr(work.made()) < standard - FAR:
-            return "it shows something else"
+            return "the look differs too much"
         work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])
         for stage in stages:
             stage.run(work)
@@ -102,25 +106,25 @@ class PreviousLook(WarmStart):
         if made["reason"] == "steps" and made["psnr_after"] < (work.limits.target_psnr or -math.inf):
             return "more steps for --target-psnr"
         if made["reason"] == "steps" and made["psnr_after"] < standard - WORSE:
-            return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last one without"
+            return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last conversion without"
         return None
 
 
-def recoloured(earlier: Conversion, field: Field) -> Gaussians:
-    """Gaussians of an earlier conversion under the look of a field of the same volume, where they are; box frame.
+def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
+    """Return the Gaussians of an earlier conversion, in place, under the look of a field of the same volume; box frame.
 
-    Under each lies a mean value and a spread. By what the two functions, and lights, make of these, optical depths
-    change by the ratio, colours and harmonics by the difference; of what descent has found out of these the less stays,
-    the more the colours differ.
+    Each Gaussian covers a mean value and a spread, to which both looks assign an extinction and a colour. Optical
+    depths are scaled by the ratio of extinctions. Colours and harmonics are those of the new look, plus the deviation
+    that descent found under the old one, weighted by how similar the two colours are.
     """
     before, source = earlier.field.source, field.source
-    gaussians = into_box(earlier.gaussians, source.volume)
-    under = field.sample(gaussians)
-    there = np.isfinite(under).all(axis=1)
-    under[~there] = 0
-    old, a = _seen(before, source, gaussians, under)
-    new, b = _seen(source, source, gaussians, under)
-    least = max(FAINT * float(a.mean()), 1e-30)  # of a function that showed nothing under any
+    gaussians = to_box_frame(earlier.gaussians, source.volume)
+    samples = field.sample(gaussians)
+    there = np.isfinite(samples).all(axis=1)
+    samples[~there] = 0
+    old, a = _look_alone(before, source, gaussians, samples)
+    new, b = _look_alone(source, source, gaussians, samples)
+    least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
@@ -135,22 +139,24 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians as a look alone has them, of ``under`` (K, 5), and (K,) extinctions, per unit-frame length."""
+def _look_alone(
+    look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
+) -> tuple[Gaussians, np.ndarray]:
+    """Return Gaussians with the colours of a look at ``samples`` (K, 5), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
     grain = 2 / max(source.volume.dims)
     table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
-    sums = table.of(under)
+    sums = table.of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
-    lighting = in_box(look)
-    return (plain if lighting is None else relight(plain, under[:, GRADIENT], lighting)), tau
+    lighting = box_lighting(look)
+    return (plain if lighting is None else relight(plain, samples[:, GRADIENT], lighting)), tau
 
 
-def _same(field: Field, other: Field) -> bool:
-    """Whether two fields are of one volume, under whatever look."""
+def _same_volume(field: Field, other: Field) -> bool:
+    """Return whether two fields are of one volume, under any look."""
     first, second = field.source.volume, other.source.volume
     if first is second:
         return True

@@ -1,4 +1,4 @@
-"""Gaussians that carry values, under a function: on the data values that their file says, without the volume."""
+"""Recolouring of live Gaussians, which carry data values, under a transfer function and without the volume."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from vvgt_cli.volume import Volume
 
 @dataclass(frozen=True)
 class FunctionRequest:
-    """A look, as the options of commands say it.
+    """A look, as the options of commands give it.
 
     Attributes:
-        tf: file or colour-map name, or a function; None: that which the file has.
+        tf: file or colour-map name, or a function; None: the function of the file.
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
-        labels: table of labels, its file, or "auto", of a file that carries labels; None: that which the file has.
-        light: what falls on it; without options what the function's file says, else what the file was made under.
-        layers: of a file of several layers or channels: looks of some of them; the others keep that which the file has.
+        labels: for a label map, a table of labels, its file, or "auto"; None: the table of the file.
+        light: options of the light; without options that of the function's file, else that of the Gaussians' file.
+        layers: for a file of several layers or channels, looks of some of them; the others keep theirs.
     """
 
     tf: str | TransferFunction | None = None
@@ -44,17 +44,17 @@ class FunctionRequest:
     layers: tuple[LayerLook, ...] = ()
 
     def paths(self) -> list[str]:
-        """What of it is read from files."""
-        given = [self.tf, self.labels, *(part for one in self.layers for part in (one.tf, one.labels))]
+        """Return the paths of the files that it names."""
+        given = [self.tf, self.labels, *(look for one in self.layers for look in (one.tf, one.labels))]
         return [path for path in given if isinstance(path, str) and path != "auto"]
 
 
 @dataclass(frozen=True)
 class LayerLook:
-    """The look of one of several layers; attributes as of `FunctionRequest`.
+    """The look of one of several layers; other attributes as in `FunctionRequest`.
 
     Attributes:
-        layer: its number or name, or a part of the name that no other has.
+        layer: its number, its name, or a unique part of the name.
     """
 
     layer: str
@@ -65,63 +65,68 @@ class LayerLook:
 
 @dataclass(frozen=True)
 class SeveralLooks:
-    """What each of several layers is shown under, with the world length that its opacity is per."""
+    """The function or label table of each of several layers, with its opacity unit distance (world length)."""
 
-    parts: tuple[tuple[TransferFunction | LabelTable, float], ...]
+    looks: tuple[tuple[TransferFunction | LabelTable, float], ...]
 
     @property
     def name(self) -> str:
-        """Of all of them."""
-        return " + ".join(tf.name for tf, _ in self.parts)
+        """Return the names of all layers' functions, joined."""
+        return " + ".join(tf.name for tf, _ in self.looks)
 
 
 Look = TransferFunction | LabelTable | SeveralLooks
 
 
 def parse_layer_look(text: str) -> LayerLook:
-    """``LAYER[,tf=TF][,labels=TABLE][,distance=D]``.
+    """Parse ``LAYER[,tf=TF][,labels=TABLE][,distance=D]``.
 
     Raises:
-        UsageError: a key that is none, or no look.
+        UsageError: an unknown key, or no look.
     """
     name, *rest = re.split(r",(?=[a-z]+=)", text)
-    given = dict(part.split("=", 1) for part in rest if "=" in part)
+    given = dict(entry.split("=", 1) for entry in rest if "=" in entry)
     if not name or not rest or set(given) - {"tf", "labels", "distance"} or not all(given.values()):
         raise UsageError(f"--layer {text}: expected LAYER,tf=TF or LAYER,labels=TABLE, and perhaps distance=LENGTH")
     return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
 
 
-def under_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
-    """What Gaussians that carry values are under a function on data values (or labels under a table) and the light of
-    ``options``, unit frame.
+def apply_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
+    """Return live Gaussians under a function on data values (or labels under a table) and a light, unit frame.
+
+    Args:
+        gaussians: live Gaussians, unit frame.
+        facts: header of their file.
+        tf: the look.
+        options: unit distance, light and screen size of the result.
 
     Raises:
-        DataError: not one of them is visible.
+        DataError: none of them is visible.
     """
     assert facts.live is not None
     assert facts.scale is not None
     assert options.unit_distance is not None
-    table = looked_up(facts.live, tf, options.unit_distance, facts.scale)
-    found = lit_by(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
+    table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
+    found = visible_cloud(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
     if not len(found):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
 
 
-def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
-    """A function, or a table of labels, as Gaussians look it up.
+def lookup_table(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
+    """Build the lookup table of a function or a label table.
 
     Args:
-        facts: of what Gaussians carry.
+        facts: header of the live Gaussians.
         tf: the look.
-        distance: world length that opacity is per; several looks have their own.
+        distance: opacity unit distance, world length; several looks have their own.
         scale: unit-frame lengths per world length.
 
     Raises:
         DataError: a label without an entry.
     """
     if isinstance(tf, SeveralLooks):
-        tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
+        tables = [lookup_table(one, look, own, scale) for one, (look, own) in zip(facts.layers, tf.looks, strict=True)]
         return LayerTables(tuple(table for table in tables if not isinstance(table, LayerTables)))
     if not isinstance(tf, LabelTable):
         return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
@@ -129,10 +134,10 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
     return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
 
 
-def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
-    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame.
+def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
+    """Return the visible ones of live Gaussians as ordinary Gaussians, under a light in their frame.
 
-    ``pixel``: as for `apply_look`.
+    ``pixel`` is that of `vvgt_cli.gaussians.live.apply_look`.
     """
     seen = gaussians.take(visible_under(gaussians, table, pixel))
     assert seen.live is not None
@@ -146,41 +151,39 @@ def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel:
     return relight(found, gradient, lighting)
 
 
-def placed_function(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
-    """A function on the data values of a file, a table of its labels, or of several layers a look each; and how a file
-    of that look is laid out.
+def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
+    """Resolve a look on the data values or labels of a file, and return it with the layout of a file of that look.
 
     Raises:
-        DataError: a file without values, a function that is none, or shows nothing of the range of values.
-        UsageError: a range or a distance that is none; a function of labels, or a table of values.
+        DataError: a file without values, an unreadable function, or one that shows nothing of the range of values.
+        UsageError: an invalid range or distance; a function for labels, or a table for values.
     """
     from vvgt_cli.look import check_visible
 
     if header.live is None:
         raise DataError(
-            f"{name}: its Gaussians carry no values, so that they have one look alone; expected a .ply of 'vvgt "
-            "convert --live'"
+            f"{name}: its Gaussians carry no values, so their look is fixed; expected a .ply of 'vvgt convert --live'"
         )
     if header.live.others:
         return _several(name, header, function)
     if function.layers:
         first = function.layers[0].layer
-        raise UsageError(f"{name}: one layer; expected --tf or --labels in the place of --layer {first}")
-    tf, shown, distance, label = _placed(name, header, header.live, function, header.unit_distance)
+        raise UsageError(f"{name}: has one layer; expected --tf or --labels instead of --layer {first}")
+    tf, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
     if isinstance(shown, LabelTable):
         check_labels([shown])
     else:
         check_visible(shown, header.live.statistics())
     light = light_of(function.light, tf.lighting or header.light, header.space)
-    return shown, _laid(header, shown, distance, label, light)
+    return shown, _options(header, shown, distance, label, light)
 
 
-def _placed(
+def _layer_look(
     name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: FunctionRequest, recorded: float | None
 ) -> tuple[TransferFunction | LabelTable, TransferFunction | LabelTable, float, str]:
-    """The look of one layer as it was given, and on its values; what opacity is per, and how that was chosen.
+    """Return the look of one layer as given and on its values, its opacity unit distance, and how that was chosen.
 
-    ``recorded``: what it is per in the file.
+    ``recorded`` is the unit distance in the file.
     """
     from vvgt_cli.look import unit_distance
 
@@ -188,13 +191,13 @@ def _placed(
     given, asked = function.labels if facts.labels else function.tf, function.unit_distance
     if given is None and asked is None and recorded is not None:
         asked = repr(recorded)
-    return tf, shown, *unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    return tf, shown, *unit_distance(asked, grid_of(name, header), tf if isinstance(tf, TransferFunction) else None)
 
 
-def _laid(
+def _options(
     header: PlyHeader | PlyOptions, shown: Look, distance: float, label: str, light: Lighting | None
 ) -> PlyOptions:
-    """How a file of a look is laid out."""
+    """Return the layout of a file of a look."""
     from vvgt_cli.conversion.gaussian_files import layout_of
 
     old = header if isinstance(header, PlyOptions) else layout_of(header)
@@ -206,33 +209,33 @@ def _laid(
 
 
 def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[SeveralLooks, PlyOptions]:
-    """Of a file of several layers: the looks that are given, the others as in the file."""
+    """Return the looks of several layers: those that are given, and the file's for the others."""
     assert header.live is not None
     layers = header.live.layers
     wrong = {"--tf": function.tf, "--labels": function.labels, "--opacity-unit-distance": function.unit_distance}
     wrong["--tf-range"] = None if function.tf_range == "data" else function.tf_range
     if given := [option for option, value in wrong.items() if value is not None]:
         raise UsageError(
-            f"{name}: {len(layers)} layers, each with a look of its own, as --layer LAYER,tf=TF; leave out "
+            f"{name}: has {len(layers)} layers, each with its own look, as --layer LAYER,tf=TF; remove "
             f"{' and '.join(given)}; {_listed(layers)}"
         )
-    asked = {number_of(name, layers, one.layer): one for one in function.layers}
+    asked = {layer_number(name, layers, one.layer): one for one in function.layers}
     placed = []
     for k, layer in enumerate(layers):
         one = asked.get(k, LayerLook(""))
         request = FunctionRequest(one.tf, "data", one.unit_distance, one.labels)
-        placed.append(_placed(f"{name}, layer {k}", header, layer, request, layer.distance))
+        placed.append(_layer_look(f"{name}, layer {k}", header, layer, request, layer.distance))
     presets = [tf.lighting for tf, *_ in placed if tf.lighting is not None]
     light = light_of(function.light, presets[0] if presets else header.light, header.space)
     looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
-    return looks, _laid(header, looks, *placed[0][2:], light)
+    return looks, _options(header, looks, *placed[0][2:], light)
 
 
-def number_of(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
-    """Of the layer that is asked for by number, name, or a part of its name.
+def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
+    """Return the number of a layer given by number, name, or a part of its name.
 
     Raises:
-        UsageError: none of that name, or several.
+        UsageError: no layer of that name, or several.
     """
     if asked.isdecimal() and int(asked) < len(layers):
         return int(asked)
@@ -246,13 +249,13 @@ def number_of(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
 def layer_look(
     header: PlyHeader | PlyOptions, key: int | str, look: str | TransferFunction | LabelTable
 ) -> LayerLook:  # fmt: skip
-    """The look of a layer, a table where it carries labels and a function where it carries values.
+    """Return the look of a layer: a label table where it carries labels, and a function where it carries values.
 
     Raises:
         UsageError: no such layer.
     """
     layers = () if header.live is None else header.live.layers
-    labels = bool(layers) and bool(layers[number_of("result", layers, str(key))].labels)
+    labels = bool(layers) and bool(layers[layer_number("result", layers, str(key))].labels)
     if isinstance(look, TransferFunction) or (isinstance(look, str) and not labels):
         return LayerLook(str(key), tf=look)
     return LayerLook(str(key), labels=look)
@@ -263,7 +266,7 @@ def _listed(layers: Sequence[LiveFacts]) -> str:
 
 
 def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[TransferFunction, TransferFunction]:
-    """A function as it was given, and on the data values of a file."""
+    """Return a function as given, and on the data values of a file."""
     from vvgt_cli.look import read_transfer_function, resolve
     from vvgt_cli.look.resolve import parse_tf_range
 
@@ -276,14 +279,12 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
 
 
 def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:
-    """A table of labels as it was given, twice."""
+    """Return a table of labels, twice: as given and as used, which are the same."""
     from vvgt_cli.look.label_files import read_labels
 
     wrong = ["--tf"] * (function.tf is not None) + ["--tf-range"] * (function.tf_range != "data")
     if wrong:
-        raise UsageError(
-            f"{name}: its Gaussians carry labels, not values; leave out {' and '.join(wrong)} (--labels gives a table)"
-        )
+        raise UsageError(f"{name}: its Gaussians carry labels, not values; replace {' and '.join(wrong)} by --labels")
     numbers = [label.number for label in facts.labels]
     if function.labels is None:
         table = LabelTable("the labels of the file", facts.labels)
@@ -296,28 +297,27 @@ def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[Labe
 
 
 def light_of(asked: LightOptions, preset: Lighting | None, space: str | None) -> Lighting | None:
-    """The light on Gaussians that carry values, None for none.
+    """Return the light on live Gaussians, None for none.
 
     Raises:
-        UsageError: lights that are none; shadows or occlusion, which the volume is needed for.
+        UsageError: invalid lights; shadows or occlusion, which need the volume.
     """
     lighting = asked.lighting(preset, space if space in ("RAS", "LPS") else None)
     if lighting is not None and lighting.attenuated:
         raise UsageError(
-            "--shadows and --ambient-occlusion need the volume, which Gaussians that carry values are shown without; "
-            "leave them out"
+            "--shadows and --ambient-occlusion need the volume, which live Gaussians are shown without; remove them"
         )
     return lighting
 
 
-def volume_of(name: str, header: FileFacts) -> Volume:
-    """The grid that a file is of, without values.
+def grid_of(name: str, header: FileFacts) -> Volume:
+    """Return the grid of the volume that a file was made of, without values.
 
     Raises:
-        DataError: a header that does not say where it is.
+        DataError: the header does not place the grid.
     """
     if header.live is None or header.affine is None or header.scale is None:
-        raise DataError(f"{name}: its header does not say on which grid the values are; expected a file of 'vvgt'")
+        raise DataError(f"{name}: its header does not describe the grid of the values; expected a file of 'vvgt'")
     affine = np.reshape(header.affine, (3, 4))
     spacing = np.linalg.norm(affine[:, :3], axis=0)
     data = np.broadcast_to(np.uint8(0), header.live.dims[::-1])
@@ -326,13 +326,13 @@ def volume_of(name: str, header: FileFacts) -> Volume:
     return Volume(data, (x, y, z), tuple(affine[:, 3].tolist()), direction, name)
 
 
-def shown(name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None) -> Gaussians:
-    """The Gaussians of a file under a function that is given, as they are without.
+def recolored(name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None) -> Gaussians:
+    """Return the Gaussians of a file under the function that is given, unchanged without one.
 
     Raises:
-        DataError, UsageError: as `placed_function` and `under_function`; a range or a distance without a function.
+        DataError, UsageError: see `resolve_look` and `apply_function`; a range or a distance without a function.
     """
     if function is None:
         return gaussians
-    tf, options = placed_function(name, header, function)
-    return under_function(gaussians, header, tf, options)
+    tf, options = resolve_look(name, header, function)
+    return apply_function(gaussians, header, tf, options)

@@ -1,4 +1,4 @@
-"""What is asked of a conversion."""
+"""Requests of conversions: options, limits, inputs and outputs."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.outputs import STDOUT, Output
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
-HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
+HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # by degree
 HEADER_BYTES = {0: 3600, 1: 3800, 2: 4200, 3: 4800}  # a legend takes up to 2500
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What the Gaussians are made for.
+    """Options of the fit: budget, screen, method, steps.
 
     Attributes:
-        max_gaussians: budget K.
-        size: pixels along an image's edge that the file is made for.
+        max_gaussians: budget of Gaussians.
+        size: pixels along the edge of the screen that the file is made for.
         init: "vbm", "wavelet" or "uniform".
-        rule: of `vvgt_cli.gaussians.rules` that is fitted to and scored by.
-        seed: of whatever draws random numbers.
-        model: network that runs before the steps: a folder or the name of a shipped one, None for none.
-        steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
+        rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by.
+        seed: seed of random numbers.
+        model: network that runs before the steps, a folder or the name of a shipped one; None for none.
+        steps: maximal number of steps of gradient descent; None: as many as the plan finds worth their time.
         device: "cpu", or "cuda" for views and steps.
     """
 
@@ -47,15 +47,15 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a user allows, any or none.
+    """Limits that a user may set.
 
     Attributes:
-        target_psnr: dB on the check views that are enough.
+        target_psnr: PSNR (dB) on the check views at which to stop.
         time_budget: wall seconds of the whole run, from the start of reading on.
-        max_megabytes: size of the file, 10^6 bytes.
+        max_megabytes: maximal size of the file, 10^6 bytes.
 
     Raises:
-        UsageError: a limit that cannot be.
+        UsageError: a limit is out of range.
     """
 
     target_psnr: float | None = None
@@ -63,6 +63,7 @@ class Limits:
     max_megabytes: float | None = None
 
     def __post_init__(self) -> None:
+        """Check the limits."""
         if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
             raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")
         if self.time_budget is not None and not 0 < self.time_budget < math.inf:
@@ -71,10 +72,10 @@ class Limits:
             raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
 
     def gaussians(self, most: int, sh_degree: int) -> int:
-        """As many Gaussians as budget and file size allow.
+        """Return the number of Gaussians that budget and file size allow.
 
         Raises:
-            UsageError: not even one fits the size.
+            UsageError: not even one fits.
         """
         if self.max_megabytes is None:
             return most
@@ -87,7 +88,7 @@ class Limits:
 
 
 def file_bytes(gaussians: int, sh_degree: int) -> int:
-    """Of a `.ply`, at most."""
+    """Return the maximal size of a `.ply` in bytes."""
     return HEADER_BYTES[sh_degree] + gaussians * (VERTEX_BYTES + HARMONIC_BYTES[sh_degree])
 
 
@@ -96,21 +97,21 @@ class ConvertRequest:
     """A whole conversion.
 
     Attributes:
-        source: what to read.
+        source: volume and look to read.
         output: file to write, any of `vvgt_cli.gaussians.formats`, "-" for a `.ply` on standard output, None for none.
-        fit: what the Gaussians are made for.
-        limits: error, time and size that decide what is done.
-        ply: how the file is written; up, the volume's place and the distance are filled in from the source.
+        fit: options of the fit.
+        limits: limits of error, time and size.
+        ply: layout of the file; up, the volume's place and the unit distance follow from the source.
         up: world axis or anatomical direction that viewers show upwards, "none", or "auto" (superior in the unit frame
             of an anatomical space).
         report: JSON to write, "-" for standard output, None for none.
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
-        overwrite: replace files that exist.
-        checkpoint: folder that keeps what the stages make, until the output is written; None for none.
-        blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
-        live: the Gaussians carry values, so that they can be shown under any function (docs/live.md).
-        command: what is written into the file as the command that made it; None from Python.
-        all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
+        overwrite: replace existing files.
+        checkpoint: folder for the results of stages until the output is written; None for none.
+        blocks: how the volume is processed in blocks; None: blocks only where the volume is large.
+        live: let the Gaussians carry values, so that they can be shown under any function (docs/live.md).
+        command: command line that the file records; None from Python.
+        all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
     """
 
     source: SourceRequest
@@ -129,30 +130,29 @@ class ConvertRequest:
     blocks: BlockOptions | None = None
 
     def budget(self) -> int:
-        """Gaussians that fit.
+        """Return the number of Gaussians that the limits allow.
 
         Raises:
-            UsageError: not one does, or the size of the output's format does not follow from their number.
+            UsageError: not even one fits, or the size limit is not for a `.ply`.
         """
         if self.limits.max_megabytes is not None and self.output and format_of(self.output):
-            raise UsageError(f"--max-size is of a .ply, -o {self.output} is none; try --max-gaussians in its place")
+            raise UsageError(f"--max-size needs .ply output; got -o {self.output}; try --max-gaussians instead")
         return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree or 0)
 
     @property
     def scored_whole(self) -> bool:
-        """Whether on all ten test views."""
+        """Return whether all ten test views are scored."""
         return self.all_views or self.report is not None
 
     @property
     def writes(self) -> int:
-        """How often the output is written: before there are scores, and with them; once only where it is a pipe, or the
-        same command is to go on with a checkpoint."""
+        """Return how often the output is written: before and after scoring; once for pipes and with a checkpoint."""
         if self.output is None:
             return 0
         return 1 if self.output == STDOUT or is_stream(self.output) or self.checkpoint is not None else 2
 
     def outputs(self) -> list[Output]:
-        """Everything that will be written."""
+        """List the files that will be written."""
         outputs = [Output("-o", self.output, SUFFIXES, splats=True)] if self.output else []
         if self.report:
             outputs.append(Output("--report", self.report, (".json",), binary=False))
@@ -161,5 +161,5 @@ class ConvertRequest:
         return outputs
 
     def inputs(self) -> list[str]:
-        """Files that are read."""
+        """List the files that are read."""
         return self.source.paths()

@@ -1,4 +1,4 @@
-"""What a run leaves in memory: Gaussians, how they came about, and what can be done with them."""
+"""Results of a run in memory, which can be saved, drawn, previewed and recoloured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.place import AUTO, NONE, into_box, preview, upright, way_up
+from vvgt_cli.conversion.place import AUTO, NONE, preview, to_box_frame, up_axis, upright_axes
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
-FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
+FROM_THE_SIDE = 4  # test view of pictures by default
 
 
 @dataclass(repr=False)
 class Result:
-    """Gaussians of a conversion or a refinement.
+    """The Gaussians of a conversion or a refinement, with their report.
 
     Attributes:
-        gaussians: in the unit frame, as a file holds them.
-        report: stages with their times, scores, what was left out; `report.to_json()` is what ``--report`` writes.
-        ply: how a file of them is written, unless `save` is told otherwise.
+        gaussians: Gaussians in the unit frame, as a file holds them.
+        report: stages with times, scores, skipped stages; ``--report`` writes `report.to_json()`.
+        ply: default layout of a file.
     """
 
     gaussians: Gaussians
@@ -47,18 +47,19 @@ class Result:
     ply: PlyOptions
 
     def __repr__(self) -> str:
+        """Return a summary: Gaussians, PSNR and time."""
         scores = self.scores
         psnr = "" if scores is None else f", {scores['psnr']:.2f} dB"
         return f"<{type(self).__name__}: {len(self.gaussians)} Gaussians{psnr}, {self.report.seconds:.1f} s>"
 
     @property
     def scores(self) -> dict[str, Any] | None:
-        """Means over the test views, by name (docs/report.md); None where none was drawn."""
+        """Return mean scores over the test views by name (docs/report.md); None where none were drawn."""
         return self.report.scores
 
     @property
     def stages(self) -> list[StageRecord]:
-        """What was done, in order, each with its seconds."""
+        """Return the stages in order, each with its seconds."""
         return self.report.stages
 
     def save(
@@ -71,27 +72,27 @@ class Result:
         comments: bool | None = None,
         overwrite: bool = True,
     ) -> int:
-        """Write a standard ``.ply``, or another format by the name's ending, whole or not at all.
+        """Write a standard ``.ply``, or another format by the ending of the name, atomically.
 
         Args:
-            path: the file: ``.ply``, ``.html`` (a page that shows them), one of `vvgt_cli.gaussians.formats.SUFFIXES`.
-            frame: "unit" or "world"; None, here and below: as `ply` says.
-            up: what viewers show upwards: a world axis, an anatomical direction, "none" or "auto" (superior in the unit
-                frame of an anatomical space); "auto" where another frame is asked for.
-            sh_degree: 0 to 3, of the file: zeros where there are no harmonics, those above it left out.
-            comments: write what the file is into its header.
-            overwrite: replace a file that exists, as a notebook's cell that is run again must.
+            path: the file: ``.ply``, ``.html`` (a viewer page) or one of `vvgt_cli.gaussians.formats.SUFFIXES`.
+            frame: "unit" or "world"; None, here and below: that of `ply`.
+            up: direction that viewers show upwards: a world axis, an anatomical one, "none" or "auto" (superior in the
+                unit frame of an anatomical space); None with another frame: "auto".
+            sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
+            comments: describe the file in its header.
+            overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:
-            Bytes written.
+            Number of bytes written.
 
         Raises:
-            UsageError: the file exists, or a value that is none of these; streamed levels.
+            UsageError: the file exists, a value is invalid, or the name is that of streamed levels.
             DataError: a library that the format needs is not installed.
         """
         if is_streamed(os.fspath(path)):
             raise UsageError(
-                f"{os.fspath(path)}: levels are made of a volume's closed form, not of finished Gaussians; expected a "
+                f"{os.fspath(path)}: streamed levels need the volume, not finished Gaussians; expected a "
                 ".ply or another format, or 'vvgt convert VOLUME -o FOLDER/lod-meta.json'"
             )
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
@@ -99,7 +100,7 @@ class Result:
         ply = replace(
             old,
             frame=frame,
-            up=old.up if up is None and frame == old.frame else way_up(up or AUTO, frame, space),
+            up=old.up if up is None and frame == old.frame else up_axis(up or AUTO, frame, space),
             sh_degree=old.sh_degree if sh_degree is None else sh_degree,
             comments=old.comments if comments is None else comments,
         )
@@ -114,35 +115,35 @@ class Result:
         labels: str | LabelTable | None = None, light: LightOptions | None = None,
         layers: Mapping[int | str, str | TransferFunction | LabelTable] | None = None,
     ) -> Result:  # fmt: skip
-        """What Gaussians that carry values (``convert(..., live=True)``) are under another function: ``vvgt recolor``.
+        """Return live Gaussians (``convert(..., live=True)``) under another function: ``vvgt recolor``.
 
         Args:
-            look: file, colour map's name, or a function; None: that which they have.
-            range: "data", "rescale" or "LO,HI": where the function's nodes lie.
-            unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
-            labels: of a label map's: a table, its file, or "auto"; None: that which they have.
-            light: what falls on them; None: what the function's file says, else what they were made under.
-            layers: of several layers or channels: functions, or tables of labels, by number or name; the others keep
-                that which they have.
+            look: file, colour map's name, or a function; None: their own.
+            range: "data", "rescale" or "LO,HI": position of the function's nodes.
+            unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
+            labels: for a label map, a table, its file, or "auto"; None: their own.
+            light: light options; None: those of the function's file, else those they were made under.
+            layers: for several layers or channels, functions or label tables by number or name; the others keep
+                theirs.
 
         Raises:
-            DataError: they carry none, or the function shows nothing of them.
-            UsageError: a range, a distance or a light that is none.
+            DataError: they carry no values, or the function shows nothing of them.
+            UsageError: an invalid range, distance or light.
         """
-        from vvgt_cli.conversion.recolored import FunctionRequest, layer_look, placed_function, under_function
+        from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
 
         others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
         asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions(), others)
-        tf, options = placed_function("result", self.ply, asked)
-        found = under_function(self.gaussians, self.ply, tf, options)
+        tf, options = resolve_look("result", self.ply, asked)
+        found = apply_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
     def normals(self) -> np.ndarray | None:
-        """Normals (K, 3) that a `.ply` of them has, unit frame; None for zeros."""
+        """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
         return None
 
     def _repr_html_(self) -> str | None:
-        """What notebooks show: the page, live where the Gaussians are; nothing where a library is missing."""
+        """Return the viewer page for a notebook; None where a library is missing."""
         name = str(self.report.volume.get("name") or "result")
         page = format_of("x.html")
         assert page is not None
@@ -152,18 +153,18 @@ class Result:
             return None
 
     def render(self, camera: Camera | None = None, *, size: int | None = None, rule: str | None = None) -> np.ndarray:
-        """The Gaussians as viewers draw them.
+        """Draw the Gaussians as viewers do.
 
         Args:
-            camera: in the unit frame; None: a test view from the side.
-            size: pixels along the edge where no camera is given; None: what the Gaussians are made for.
-            rule: of `vvgt_cli.gaussians.rules`; None: that of the Gaussians.
+            camera: a camera in the unit frame; None: a test view from the side.
+            size: pixels along the edge where no camera is given; None: the size that the Gaussians are made for.
+            rule: one of `vvgt_cli.gaussians.rules`; None: that of the Gaussians.
 
         Returns:
             (h, w, 4) float32, premultiplied RGBA.
 
         Raises:
-            UsageError: no such rule.
+            UsageError: the rule is unknown.
         """
         from vvgt_cli.splat import render
 
@@ -174,7 +175,7 @@ class Result:
 
 @dataclass(repr=False)
 class Conversion(Result):
-    """What became of a volume under a transfer function.
+    """The result of a conversion, with its volume.
 
     Attributes:
         field: the volume under its function, labels, layers and light.
@@ -183,13 +184,13 @@ class Conversion(Result):
     field: Field
 
     def normals(self) -> np.ndarray | None:
-        """Directions (K, 3) of the mean gradient around each Gaussian, unit frame; None where nothing is lit."""
+        """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""
         return self._normals
 
     @cached_property
     def _normals(self) -> np.ndarray | None:
         volume = self.field.source.volume
-        normals = self.field.normals(into_box(self.gaussians, volume))
+        normals = self.field.normals(to_box_frame(self.gaussians, volume))
         if normals is None:
             return None
         turned = normals @ np.linalg.inv(volume.axes)
@@ -197,10 +198,10 @@ class Conversion(Result):
         return found
 
     def preview(self, size: int | None = None, views: Sequence[int] = PREVIEW_VIEWS) -> np.ndarray:
-        """Volume, splats and eight times their difference, a row a test view, with the way up upwards.
+        """Draw volume, splats and eight times their difference, one row per test view, upright.
 
         Args:
-            size: pixels along a picture's edge; None: what the Gaussians are made for.
+            size: pixels along a picture's edge; None: the size that the Gaussians are made for.
             views: numbers of test views, 0 to 9.
 
         Returns:
@@ -208,11 +209,11 @@ class Conversion(Result):
         """
         cameras = default_views("test", size=size or self.ply.made_for or SIZE)
         volume = self.field.source.volume
-        axes, inside = upright(volume, self.ply.up), into_box(self.gaussians, volume)
+        axes, inside = upright_axes(volume, self.ply.up), to_box_frame(self.gaussians, volume)
         return preview(self.field.views, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:
-        """What stands for it where a notebook is not shown by a browser."""
+        """Return a PNG preview, for notebooks outside a browser."""
         from vvgt_cli.images import png_bytes
 
         return png_bytes(self.preview(SIZE, (FROM_THE_SIDE,)))

@@ -1,7 +1,7 @@
-"""Conversions that go on where they ended: a folder with what each stage made, each file whole or not there.
+"""Checkpoints of conversions: a folder with the result of each stage, in files written atomically.
 
-What lies there has a key, the digest of everything that the stages depend on; a run that goes on ends with the bytes
-of one that was never interrupted.
+Each file has a key, the digest of everything that the stages depend on. A resumed run writes the same bytes as one that
+was never interrupted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
 
 CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
-DESCENT = "refinement.npz"  # of `vvgt_cli.refine.checkpoint`
+DESCENT = "refinement.npz"  # written by `vvgt_cli.refine.checkpoint`
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, DataError),
     *(zipfile.BadZipFile, struct.error),
@@ -39,11 +39,11 @@ _FAULTS = (
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What the stages of one conversion made; nothing is kept where there is no folder.
+    """The results of the stages of one conversion; without a folder, nothing is saved.
 
     Attributes:
-        folder: of the files.
-        key: digest of all that they depend on.
+        folder: folder of the files.
+        key: digest of everything that they depend on.
     """
 
     folder: Path | None = None
@@ -51,15 +51,15 @@ class Checkpoint:
 
     @property
     def descent(self) -> str | None:
-        """Where gradient descent keeps its state."""
+        """Return the path of the state of gradient descent."""
         return None if self.folder is None else str(self.folder / DESCENT)
 
     def load(self, name: str) -> tuple[Gaussians, dict[str, Any]] | None:
-        """What a stage made, and the plain values beside it; None where it has not come so far.
+        """Return the Gaussians of a stage and the plain values saved with them; None without a file.
 
         Raises:
-            DataError: damaged.
-            UsageError: of another conversion.
+            DataError: the file is damaged.
+            UsageError: the file is of another conversion.
         """
         if self.folder is None or not (path := self.folder / name).exists():
             return None
@@ -69,18 +69,16 @@ class Checkpoint:
             gaussians = Gaussians(**arrays)
         except _FAULTS as error:
             text = " ".join(str(error).split())[:200]
-            raise DataError(f"{path}: not what a stage of 'vvgt convert' keeps ({text}); remove it") from None
+            raise DataError(f"{path}: not a checkpoint of 'vvgt convert' ({text}); remove it") from None
         if key != self.key:
-            raise UsageError(
-                f"{path}: of a conversion of another volume, or with other options; give --checkpoint another folder"
-            )
+            raise UsageError(f"{path}: belongs to another volume or other options; give --checkpoint another folder")
         return gaussians, beside
 
     def save(self, name: str, gaussians: Gaussians, **beside: Any) -> None:
-        """Keep what a stage made.
+        """Save the result of a stage.
 
         Raises:
-            DataError: the operating system refuses.
+            DataError: the file cannot be written.
         """
         if self.folder is None:
             return
@@ -90,7 +88,7 @@ class Checkpoint:
             np.savez(stream, about=about, **arrays)
 
     def finish(self) -> None:
-        """Remove what is of no use once the output is written."""
+        """Remove all files, once the output is written."""
         if self.folder is not None:
             for name in (CLOSED_FORM, CELLS, DESCENT, FITTED):
                 (self.folder / name).unlink(missing_ok=True)
@@ -98,10 +96,10 @@ class Checkpoint:
 
 @contextmanager
 def checkpoint_folder(folder: str | None) -> Iterator[None]:
-    """Within the block the folder is there, and this run's alone; an empty one is removed at the end.
+    """Make and lock the folder of checkpoints within the block; remove it afterwards if it is empty.
 
     Raises:
-        UsageError: it is a file, cannot be made, or another run is at work in it.
+        UsageError: the folder cannot be made, or another run uses it.
     """
     if folder is None:
         yield
@@ -110,7 +108,7 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
         Path(folder).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(
-            f"--checkpoint {folder}: cannot be made ({error.strerror or error}); expected the name of a folder, in one "
+            f"--checkpoint {folder}: cannot be made ({error.strerror or error}); expected a folder within one "
             "that exists"
         ) from error
     try:
@@ -118,14 +116,14 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
             yield
     finally:
         with suppress(OSError):
-            Path(folder).rmdir()  # refused where something lies in it
+            Path(folder).rmdir()  # fails where it is not empty
 
 
 def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Limits) -> Checkpoint:
-    """The stages of a conversion, under the key of what they depend on.
+    """Return the checkpoint of a conversion, with the key of everything that it depends on.
 
     Raises:
-        DataError: the model of ``fit`` cannot be read.
+        DataError: the model of ``fit`` is unreadable.
     """
     if folder is None:
         return Checkpoint()

@@ -1,4 +1,4 @@
-"""`Stage`, of which a plan is a list, and `Work`, what stages hand on."""
+"""Stages, of which a plan is a list, and the state that they share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Cost(NamedTuple):
-    """What a stage should cost: wall seconds, and bytes of memory that it takes for the rest of the run."""
+    """The expected cost of a stage: wall seconds, and bytes of memory that it holds for the rest of the run."""
 
     seconds: float
     memory: float = 0.0
@@ -30,20 +30,20 @@ class Cost(NamedTuple):
 
 @dataclass
 class Work:
-    """What the stages of one conversion read and leave.
+    """The state that the stages of one conversion share.
 
     Attributes:
-        run: times stages and tells the console.
+        run: times stages and prints messages.
         field: the volume under its function, labels, layers and light.
-        fit, limits: what is asked for.
-        degree: of the harmonics that colours have where the light depends on the view.
-        checkpoint: where stages keep what they made; `Checkpoint` of no folder for nowhere.
-        ending: seconds that the stages after the present one should take.
-        start: the closed form, once it is there, with the pyramid that it was cut from.
-        gaussians: so far, in the box frame.
-        check: views to judge by, once they are there; ``train``: views to fit to.
-        train_rule: by which training views are drawn; ``train_settings``: what the volume's were rendered with.
-        judged: of which Gaussians the PSNR on which check views is known, and it.
+        fit, limits: options of the conversion.
+        degree: degree of the harmonics of colours where the light depends on the view.
+        checkpoint: where stages save their results; without a folder nowhere.
+        ending: expected seconds of the stages after the current one.
+        start: the closed form, once made, with its pyramid.
+        gaussians: current Gaussians, box frame.
+        check, train: views to judge by, and to fit to, once rendered.
+        train_rule, train_settings: drawing rule of the training views, and settings of their references.
+        judged: the Gaussians and check views last compared, and their PSNR (dB).
     """
 
     run: Run
@@ -63,33 +63,33 @@ class Work:
 
     @property
     def rule(self) -> Rule:
-        """By which the file will be drawn."""
+        """Return the drawing rule that the file is made for."""
         return rule_of(self.fit.rule)
 
     def made(self) -> Gaussians:
-        """The Gaussians that a stage before has made."""
+        """Return the Gaussians that an earlier stage has made."""
         assert self.gaussians is not None, "a stage that needs Gaussians stands before the one that makes them"
         return self.gaussians
 
     def psnr(self, gaussians: Gaussians) -> float:
-        """On the check views; of the Gaussians that were asked for last it is known."""
+        """Return the PSNR (dB) on the check views; the last one is cached."""
         assert self.check is not None, "a stage that judges stands before the check views"
         if self.judged is None or self.judged[0] is not gaussians or self.judged[1] is not self.check:
             self.judged = gaussians, self.check, self.check.psnr(gaussians, self.rule)
         return self.judged[2]
 
     def reset(self) -> None:
-        """Forget all that stages have made."""
+        """Discard the results of all stages."""
         self.gaussians = self.check = self.train = self.train_rule = self.train_settings = self.judged = None
         self.run.report.refinement = None
 
     def target_reached(self) -> bool:
-        """Whether the target is reached."""
+        """Return whether the target PSNR is reached."""
         target = self.limits.target_psnr
         return target is not None and self.check is not None and self.psnr(self.made()) >= target
 
     def keep_better(self, before: float, after: float, gaussians: Gaussians) -> bool:
-        """Take ``gaussians`` where the check views agree; whether they did."""
+        """Take ``gaussians`` if their PSNR ``after`` is better, and return whether it is."""
         if after > before:
             self.gaussians = gaussians
         return after > before
@@ -97,12 +97,12 @@ class Work:
 
 @dataclass(frozen=True)
 class Stage(ABC):
-    """One step of a conversion: what it is called, what it costs, what it does.
+    """One step of a conversion, with its name and cost.
 
     Attributes:
-        name: as the console and reports show it.
-        improves: makes better Gaussians of those that are there, as the check views see them.
-        scores: changes nothing, and is done whatever target is reached before.
+        name: name in messages and reports.
+        improves: whether it improves existing Gaussians, by the check views.
+        scores: whether it only scores, and so runs even if a target is reached before.
     """
 
     name: ClassVar[str]
@@ -110,17 +110,17 @@ class Stage(ABC):
     scores: ClassVar[bool] = False
 
     @abstractmethod
-    def cost(self, case: Workload) -> Cost:
-        """What it should cost."""
+    def cost(self, workload: Workload) -> Cost:
+        """Return the expected cost."""
 
     @abstractmethod
     def run(self, work: Work) -> None:
-        """Do it."""
+        """Run the stage."""
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """Pictures of the volume that it will ask for, as far as they are known before there are Gaussians."""
+        """List the pictures of the volume that it will request, as far as they are known beforehand."""
         return []
 
     def label(self) -> str:
-        """The name with what the plan chose, for `--dry-run`."""
+        """Return the name with the choices of the plan, for `--dry-run`."""
         return self.name

@@ -1,4 +1,4 @@
-"""What a conversion starts from: the frame before it in a series, or the same volume under another look."""
+"""Warm starts of a conversion: from the previous frame of a series, or from the same volume under another look."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ class WarmStart(ABC):
 
     @abstractmethod
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Make the Gaussians of ``work`` from the earlier ones, and return whether they are as good as new ones.
+        """Derive the Gaussians of ``work`` from the earlier ones, and return whether they are as good as new ones.
 
-        Where they are not, ``work`` is as it was.
+        If they are not, ``work`` is reset.
         """
 
     def views(self, views: ViewRenderer) -> ViewRenderer:
-        """Return the views to convert by, which may remember what they draw."""
+        """Return the views to convert by, which may cache their pictures."""
         return views
 
     def keep(self, work: Work, plan: Plan) -> None:  # noqa: B027
-        """Remember a conversion that did not start from another."""
+        """Store a conversion that did not start from another."""
 
     def facts(self) -> dict[str, Any]:
-        """Return what an index says of the last conversion."""
+        """Return entries of the index for the last conversion."""
         return {}
 
     def memory(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
-        """Return the bytes that it will keep: of pictures, and, given a workload, of Gaussians."""
+        """Return the bytes of pictures that it will keep, and a function of a workload for those of Gaussians."""
         return 0, lambda _: 0.0

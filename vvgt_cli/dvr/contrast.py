@@ -9,7 +9,7 @@ from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
 @inlined()
-def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
+def _difference(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
     """Return the largest difference of pixels (row, col) and (i, j) of ``image`` (h, w, c) in any channel."""
     most = 0.0
     for channel in range(image.shape[2]):
@@ -30,7 +30,7 @@ def _contrast(thread: ThreadSlice, image: np.ndarray, known: np.ndarray, out: np
             for i in range(max(row - 1, 0), min(row + 2, height)):
                 for j in range(max(col - 1, 0), min(col + 2, width)):
                     if known[i, j]:
-                        most = max(most, _apart(image, row, col, i, j))
+                        most = max(most, _difference(image, row, col, i, j))
             out[row, col] = most
 
 

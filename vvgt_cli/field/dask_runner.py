@@ -15,7 +15,7 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.runners import Progress, Task
-from vvgt_cli.resources import asked_memory
+from vvgt_cli.resources import memory_limit
 
 LOCAL, SLURM = "local", "slurm"
 AGAIN = 30.0  # seconds between checks for jobs that have ended
@@ -62,7 +62,7 @@ class DaskRunner:
                 raise DataError(
                     "--scheduler slurm: sbatch not found; run this on a node that submits jobs, or try local"
                 )
-            if asked_memory() is None:
+            if memory_limit() is None:
                 raise UsageError("--scheduler slurm: no memory size for its jobs; expected --memory, as --memory 16G")
 
     def __enter__(self) -> DaskRunner:
@@ -132,7 +132,7 @@ class DaskRunner:
         jobqueue = _need("dask_jobqueue")
         try:
             cluster = jobqueue.SLURMCluster(
-                job_name="vvgt-blocks", processes=1, cores=1, job_cpu=self._threads, memory=f"{asked_memory()}B",
+                job_name="vvgt-blocks", processes=1, cores=1, job_cpu=self._threads, memory=f"{memory_limit()}B",
                 job_script_prologue=[f"export {name}={n}" for name, n in _environment(self._threads).items()],
                 worker_extra_args=["--memory-limit", "0"], silence_logs=logging.CRITICAL,
                 scheduler_options={"dashboard_address": None},

@@ -106,14 +106,14 @@ def blocked(
     """
     request, message = _resolved(request, options, needs.size)
     if message:
-        run.console.say(message)
+        run.console.message(message)
     settings = _settings(request, needs)
     edge = store.kept_edge(settings) if options.size is None else options.size
     edge = edge or _edge(request, options)
     with _runner(options) as runner:
         run_pass = Pass(runner, store, run.console.bar, options.shard)
         if store.open({**settings, "blocks": edge}, ours=options.shard is None):
-            run.console.say(f"resuming with the blocks in {store.folder}")
+            run.console.message(f"resuming with the blocks in {store.folder}")
         run.compile(COUNT_WHOLE + COUNT_REAL)
         access = BlockAccess(
             store, edge, lambda task: run_pass(task, "count"), needs.values or needs_histogram(request)
@@ -235,11 +235,11 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
     """
     given = request.volume
     if not isinstance(given, str) and any(isinstance(one.data, Stored) for one in content_of(given).volumes):
-        console.say("a Dask array: processed in blocks (docs/scale.md)")
+        console.message("a Dask array: processed in blocks (docs/scale.md)")
         return BlockOptions()
     if not better_in_blocks(request):
         return None
-    console.say("large: processed in blocks (docs/scale.md)")
+    console.message("large: processed in blocks (docs/scale.md)")
     return BlockOptions()
 
 

@@ -32,7 +32,7 @@ class Certificate:
         psnr: mean PSNR in dB of the first scored views against the volume.
         views: number of these views.
         live_psnr: PSNR in dB of a live file recoloured with its own function; None for other files.
-        seats: name and PSNR in dB of each viewing condition that was scored, worst first.
+        conditions: name and PSNR in dB of each viewing condition that was scored, worst first.
         texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
             nothing is opaque and smooth.
         position_error: largest distance of a stored centre from the computed one, in world units.
@@ -48,7 +48,7 @@ class Certificate:
     psnr: float
     views: int
     live_psnr: float | None = None
-    seats: tuple[tuple[str, float], ...] = ()
+    conditions: tuple[tuple[str, float], ...] = ()
     texture: tuple[float, float] | None = None
     position_error: float = 0.0
     seconds: float | None = None
@@ -56,7 +56,7 @@ class Certificate:
 
     def facts(self) -> dict[str, Any]:
         """Return the known values by name."""
-        found = vars(self) | {"seats": dict(self.seats)}
+        found = vars(self) | {"conditions": dict(self.conditions)}
         return {key: value for key, value in found.items() if value not in (None, {})}
 
     def line(self) -> str:
@@ -71,9 +71,9 @@ class Certificate:
             ValueError: the text is something else.
         """
         found = json.loads(text)
-        if not isinstance(found, dict) or not isinstance(found.get("seats", {}), dict):
+        if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):
             raise ValueError(text)
-        seats = tuple((str(name), _number(value)) for name, value in found.pop("seats", {}).items())
+        conditions = tuple((str(name), _number(value)) for name, value in found.pop("conditions", {}).items())
         woven = found.pop("texture", None)
         if woven is not None and (not isinstance(woven, list) or len(woven) != 2):
             raise ValueError(text)
@@ -90,7 +90,7 @@ class Certificate:
             found[key] = _number(value) if kind is float else value
             if not isinstance(found[key], kind) or isinstance(value, bool):
                 raise ValueError(text)
-        return cls(**(known | found), seats=seats)
+        return cls(**(known | found), conditions=conditions)
 
 
 def _number(value: Any) -> float:

@@ -69,7 +69,7 @@ class Table:
         covers = -np.expm1(-tau * grain)
         fine = np.concatenate([tf.color(x) * covers[:, None], covers[:, None]], axis=1)
         nodes = law_nodes()
-        found, near = _under(fine, nodes), _under(fine, AROUND * nodes).mean(axis=2)
+        found, near = _samples_of(fine, nodes), _samples_of(fine, AROUND * nodes).mean(axis=2)
         moments = found[..., TAU, None] * np.stack([nodes, nodes**2], axis=1)
         sums = np.concatenate([found.mean(axis=2), moments.mean(axis=2)], axis=2)
         covered = np.maximum(sums[..., [TAU]], 1e-30)
@@ -155,7 +155,7 @@ def spreads() -> np.ndarray:
     return found
 
 
-def _under(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def _samples_of(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return rows of ``fine`` (FINE, 4) at the samples of each distribution, (MEANS, SPREADS, NODES, 4)."""
     at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
     found: np.ndarray = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.files import atomic_write, check_room, check_target, claim, is_stream
+from vvgt_cli.files import atomic_write, check_disk_space, check_target, claim, is_stream
 from vvgt_cli.gaussians.formats import ready
 
 STDOUT = "-"
@@ -52,7 +52,7 @@ def _check_one(output: Output, overwrite: bool) -> None:
         raise UsageError(f"{output.option}: {error}") from None
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable; choose another")
-    check_room(path, SMALLEST)
+    check_disk_space(path, SMALLEST)
     if output.splats:
         ready(path)
 

@@ -1,1 +1,1 @@
-"""What `import vvgt_cli` offers: the commands as functions on files and on what is in memory (docs/python.md)."""
+"""The Python API: the commands as functions on files and on data in memory (docs/python.md)."""

@@ -1,4 +1,4 @@
-"""The commands as functions. Each is as its command: `docs/commands` has what the options do."""
+"""The commands as functions, with the options of docs/commands."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from vvgt_cli.library.inputs import (
     looks_of,
     ply_of,
     source_of,
-    under,
     volume_of,
+    with_look,
 )
 from vvgt_cli.volume import Volume
 
@@ -54,7 +54,7 @@ def convert(
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Conversion | Clouds:
-    """A volume under a transfer function as 3D Gaussians: ``vvgt convert`` without its files.
+    """Convert a volume under a transfer function to 3D Gaussians: ``vvgt convert`` without files.
 
     >>> import vvgt_cli as vvgt
     >>> result = vvgt.convert("example:marschner-lobb:24", goal={"max_gaussians": 200, "size": 64, "steps": 0})
@@ -64,34 +64,34 @@ def convert(
     Args:
         volume: a path (or ``example:NAME``); an array (nz, ny, nx), of numpy or Dask, with ``spacing`` (x, y, z) or
             ``affine`` (4, 4); an xarray.DataArray; a pyvista.ImageData; or a `Volume`. A file of several time steps
-            without ``time``, or a glob of volumes, is a series. Arrays of Dask are never computed as a whole.
-        look: function, light, labels and layers: a `Look`; or the function alone. Several: a list of them, or a mapping
-            of names to them.
+            without ``time``, or a glob of volumes, is a series. Dask arrays are never computed as a whole.
+        look: function, light, labels and layers: a `Look`, or the function alone. Several: a list, or a mapping
+            of names to looks.
         goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
-        split_labels: of a label map, a result a label.
-        live: the Gaussians carry the values under them: `Result.recolor` shows them under any function (docs/live.md).
-        after: an earlier conversion of the same volume to go on from, a few times as fast where that is about as near:
-            its Gaussians, under the new look, refined by some steps (docs/python.md).
-        blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
-        progress: lines and bars on standard error.
-        **reading: how to read the volume: see `Reading`.
+        split_labels: return a result for each label of a label map.
+        live: let Gaussians carry data values, so that `Result.recolor` shows them under any function (docs/live.md).
+        after: an earlier conversion of the same volume to start from: its Gaussians, under the new look, are refined by
+            a few steps where that is about as accurate, which is several times as fast (docs/python.md).
+        blocks: voxels along the edge of blocks, or "auto"; None: only for large files.
+        progress: print messages and bars on standard error.
+        **reading: how to read the volume; see `Reading`.
 
     Returns:
-        Gaussians in the unit frame with scores, stages, `save`, `render` and `preview`; of several frames, looks or
-        labels `Clouds`: a mapping of names to results, with a `save` of all.
+        Gaussians in the unit frame with scores, stages, `save`, `render` and `preview`; for several frames, looks or
+        labels `Clouds`, a mapping of names to results with a `save` for all.
 
     Raises:
-        DataError: input that is not what it must be, or a scene that shows nothing.
-        UsageError: options that do not fit.
+        DataError: the input is invalid, or nothing is visible.
+        UsageError: options contradict each other.
     """
     from vvgt_cli.conversion.convert_batch import convert_to_memory
 
     if not isinstance(after, Conversion | None):
-        raise UsageError("after: expected what convert returns for one volume and look")
+        raise UsageError("after: expected the result of convert for one volume and look")
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
     request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live)
-    requests = {name: replace(request, source=under(source, one)) for name, one in looks.items()}
+    requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, several=several, split_labels=split_labels, after=after, console=console_of(progress)
     )
@@ -104,26 +104,27 @@ def _blocks(blocks: int | str | None) -> BlockOptions | None:
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
-    """A volume from a file, or from what is in memory.
+    """Read a volume from a file, or from data in memory.
 
     >>> import numpy as np, vvgt_cli as vvgt
     >>> vvgt.read_volume(np.zeros((4, 5, 6)), spacing=(1, 1, 2)).dims
     (6, 5, 4)
 
     Args:
-        volume, reading: as of `convert`.
+        volume: as in `convert`.
+        **reading: as in `convert`.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     return volume_of(volume, reading)
 
 
 def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
-    """Gaussians of a standard ``.ply`` in the unit frame, and what its header says; other formats by their names.
+    """Read Gaussians (unit frame) and the header of a standard ``.ply``, or another format by the name's ending.
 
     Raises:
-        DataError: not a 3DGS ``.ply``, or one without Gaussians.
+        DataError: not a 3DGS ``.ply``, or an empty one.
     """
     from vvgt_cli.conversion.gaussian_files import open_gaussians
 
@@ -139,7 +140,7 @@ def render_views(
     step: float = 0.5,
     **reading: Unpack[Reading],
 ) -> tuple[list[Camera], np.ndarray]:
-    """Pictures of a volume by our renderer, in memory; ``vvgt render-views`` writes them for trainers.
+    """Render pictures of a volume in memory; ``vvgt render-views`` writes them for trainers.
 
     >>> import vvgt_cli as vvgt
     >>> cameras, images = vvgt.render_views("example:blob:16", cameras=2, size=32)
@@ -147,16 +148,17 @@ def render_views(
     (2, 32, 32, 4)
 
     Args:
-        volume, look, reading: as of `convert`.
-        cameras: in the unit frame, all of one size; or how many of the training views.
+        volume: as in `convert`.
+        look: as in `convert`.
+        cameras: cameras in the unit frame, all of one size, or the number of training views.
         size: pixels along the edge of the training views.
-        step: along a ray, in voxels.
+        step: step along a ray, in voxels.
 
     Returns:
         cameras, images: (n, h, w, 4) float32, premultiplied RGBA.
 
     Raises:
-        DataError, UsageError: as `convert`; cameras of several sizes.
+        DataError, UsageError: see `convert`; cameras differ in size.
     """
     import numpy as np
 
@@ -181,29 +183,31 @@ def evaluate(
     size: int | None = None,
     rule: str | None = None,
     step: float = 0.125,
-    seats: bool = True,
+    conditions: bool = True,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Evaluation:
-    """Scores of a ``.ply``, or of a result, against its volume: ``vvgt evaluate``.
+    """Score a ``.ply``, or a result, against its volume: ``vvgt evaluate``.
 
     Args:
-        ply: path, or what `convert` or `optimize` returned.
-        volume, look, reading: as of `convert`.
-        size, rule: to score at and draw by; None: the file's.
-        step: of the reference, in voxels.
-        seats: every rule at several sizes and close up, too.
-        blocks: as of `convert`.
-        progress: lines and bars on standard error.
+        ply: path, or result of `convert` or `optimize`.
+        volume: as in `convert`.
+        look: as in `convert`.
+        size: pixels along the edge of pictures; None: the file's.
+        rule: drawing rule; None: the file's.
+        step: step of the reference, in voxels.
+        conditions: also score every rule at several sizes and close up.
+        blocks: as in `convert`.
+        progress: print messages and bars on standard error.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     from vvgt_cli.commands import evaluate as pipeline
 
     source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats, _blocks(blocks))
+    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, conditions, _blocks(blocks))
     return pipeline.evaluate(request, console_of(progress))
 
 
@@ -211,22 +215,23 @@ def recolor(
     ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
     labels: LabelsLike | None = None, light: LightLike = None, layers: Mapping[int | str, Any] | None = None,
 ) -> Result:  # fmt: skip
-    """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
+    """Show a live ``.ply`` under another function, without its volume: ``vvgt recolor``.
 
     Args:
-        ply: path of a file that ``vvgt convert --live`` wrote.
-        look: a function as of `Look`; None: the file's own.
-        range, unit_distance: as of `Result.recolor`.
-        labels: of a label map's file, a table as of `Look`; None: the file's own.
-        light: as of `Look`; None: what the function's file says, else what the file was made under.
-        layers: of a file of several layers or channels: functions, or tables of labels, by number or name.
+        ply: path of a file of ``vvgt convert --live``.
+        look: a function as in `Look`; None: the file's own.
+        range: as in `Result.recolor`.
+        unit_distance: as in `Result.recolor`.
+        labels: for a label map, a table as in `Look`; None: the file's own.
+        light: as in `Look`; None: that of the function's file, else that of the file.
+        layers: for several layers or channels, functions or label tables by number or name.
 
     Returns:
-        An ordinary cloud.
+        Ordinary Gaussians.
 
     Raises:
-        DataError: a file whose Gaussians carry no values, or a function that shows nothing of them.
-        UsageError: a range, a distance or a light that is none.
+        DataError: the Gaussians carry no values, or the function shows nothing of them.
+        UsageError: an invalid range, distance or light.
     """
     from vvgt_cli.conversion.gaussian_files import layout_of
     from vvgt_cli.score.record import ConversionReport
@@ -255,25 +260,28 @@ def optimize(
     seed: int = 0,
     progress: bool = False,
 ) -> Result:
-    """Gaussians refined by gradient descent on views: ``vvgt optimize``.
+    """Refine Gaussians by gradient descent on views: ``vvgt optimize``.
 
     Args:
-        ply: path, or what `convert` returned.
-        views: folder that ``vvgt render-views`` wrote.
-        steps, time_budget: one of the two: steps of one view each, or seconds.
-        target_psnr: dB on the check views at which to end.
-        method: "frame", "adam" or "3dgs"; max_gaussians: that "3dgs" may grow to.
-        size, rule: of the screen that they are made for; None: the file's.
-        sh_degree: of the spherical harmonics that are refined, 0 to 3; None: the file's.
-        seed: of the order of views.
-        progress: lines and bars on standard error.
+        ply: path, or result of `convert`.
+        views: folder of ``vvgt render-views``.
+        steps: number of steps, of one view each; or give ``time_budget``.
+        time_budget: seconds; or give ``steps``.
+        target_psnr: dB on the check views at which to stop.
+        method: "frame", "adam" or "3dgs".
+        max_gaussians: maximal number of Gaussians, for "3dgs".
+        size: pixels along the edge of the target screen; None: the file's.
+        rule: drawing rule; None: the file's.
+        sh_degree: degree of the spherical harmonics that are refined, 0 to 3; None: the file's.
+        seed: seed of the order of views.
+        progress: print messages and bars on standard error.
 
     Returns:
-        The best that the check views have seen.
+        The best Gaussians by the check views.
 
     Raises:
-        DataError: a ``.ply`` or a folder of views that is not one.
-        UsageError: both of steps and time_budget, or none.
+        DataError: an invalid ``.ply`` or folder of views.
+        UsageError: both of steps and time_budget, or neither.
     """
     from vvgt_cli.commands.optimize import OptimizeRequest, budget, optimized
     from vvgt_cli.refine import OptimizeOptions

@@ -1,4 +1,4 @@
-"""What callers hand in, as requests of the pipeline have it."""
+"""Conversion of the arguments of the Python API to requests."""
 
 from __future__ import annotations
 
@@ -36,38 +36,42 @@ class ArrayLike(Protocol):
     """An array of NumPy, Dask or xarray."""
 
     @property
-    def shape(self) -> tuple[Any, ...]: ...
+    def shape(self) -> tuple[Any, ...]:
+        """Return the shape (nz, ny, nx)."""
 
     @property
-    def dtype(self) -> Any: ...
+    def dtype(self) -> Any:
+        """Return the type of values."""
 
 
 class ReadAlready(Protocol):
     """A `Session`."""
 
     @property
-    def content(self) -> Content: ...
+    def content(self) -> Content:
+        """Return the content of its volume."""
 
 
 class VtkImage(Protocol):
-    """A vtkImageData, pyvista's too."""
+    """A vtkImageData, or a pyvista.ImageData."""
 
-    def GetDimensions(self) -> Any: ...
+    def GetDimensions(self) -> Any:
+        """Return the dimensions (nx, ny, nz)."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a volume is shown.
+    """A look: function, light, labels and layers of a volume.
 
     Attributes:
         function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`;
-            None makes one from the data.
-        range: "data", "rescale" or (lo, hi): where the function's nodes lie.
-        unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
-        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
-            the function's file says.
-        labels: a label map's table: a file, a mapping {label: {"name", "color", "opacity"}}, "auto", "none".
-        layers: volumes laid over it: files as ``--layer`` has them, or `SourceRequest`.
+            None chooses one from the data.
+        range: "data", "rescale" or (lo, hi): position of the function's nodes.
+        unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
+        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: that
+            of the function's file.
+        labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
+        layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
     """
 
     function: FunctionLike | None = None
@@ -79,7 +83,7 @@ class Look:
 
     @classmethod
     def of(cls, look: LookLike) -> Look:
-        """A look, or one of a function alone."""
+        """Return a look as it is, or one with a function alone."""
         return look if isinstance(look, Look) else cls(look)
 
 
@@ -88,13 +92,13 @@ LooksLike = LookLike | Sequence[LookLike] | Mapping[str, LookLike]
 
 
 def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
-    """Return looks by name, and whether several were asked for.
+    """Return looks by name, and whether several were given.
 
-    A mapping is of several looks where all its values are functions or looks; a function's own holds lists of numbers.
+    A mapping holds several looks if all its values are functions or looks; one of a function holds lists of numbers.
 
     Raises:
-        UsageError: none, or two of one name.
-        DataError: a mapping that is no function.
+        UsageError: there is no look, or two share a name.
+        DataError: a mapping is not a function.
     """
     if isinstance(look, Mapping):
         kinds = (Look, str, os.PathLike, Mapping, TransferFunction)
@@ -107,13 +111,15 @@ def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
     looks = [Look.of(one) for one in look]
     names = [_name_of(one.function) for one in looks]
     if not names or len(set(names)) < len(names):
-        told = ", ".join(dict.fromkeys(names)) or "none"
-        raise UsageError(f"{len(looks)} looks, named {told}; expected one name each: pass a mapping of names to looks")
+        stated = ", ".join(dict.fromkeys(names)) or "none"
+        raise UsageError(
+            f"{len(looks)} looks, named {stated}; expected one name each: pass a mapping of names to looks"
+        )
     return dict(zip(names, looks, strict=True)), True
 
 
 def _name_of(function: FunctionLike | None) -> str:
-    """Of a function: its file's or its own."""
+    """Return the name of a function, or that of its file."""
     from vvgt_cli.look import read_transfer_function
 
     if function is None:
@@ -125,7 +131,7 @@ def _name_of(function: FunctionLike | None) -> str:
 
 @dataclass(frozen=True)
 class Goal(Limits, FitOptions):
-    """What a conversion is for: the attributes of `FitOptions` and `Limits`.
+    """The goal of a conversion: the attributes of `FitOptions` and `Limits`.
 
     Attributes:
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
@@ -135,10 +141,10 @@ class Goal(Limits, FitOptions):
 
     @classmethod
     def of(cls, goal: GoalLike) -> Goal:
-        """Return a goal as it is, or made of a mapping of its attributes.
+        """Return a goal as it is, or made from a mapping of its attributes.
 
         Raises:
-            UsageError: an attribute that there is not.
+            UsageError: an attribute is unknown.
         """
         if not isinstance(goal, Mapping):
             return goal or cls()
@@ -148,7 +154,7 @@ class Goal(Limits, FitOptions):
         return cls(**goal)
 
     def request(self, source: SourceRequest) -> ConvertRequest:
-        """Return the conversion of a source that it asks for."""
+        """Return the request for the conversion of a source."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         fit = FitOptions(**{field.name: given[field.name] for field in fields(FitOptions)})
         limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
@@ -159,7 +165,7 @@ GoalLike = Goal | Mapping[str, Any] | None
 
 
 class Reading(TypedDict, total=False):
-    """How to read a volume; see `vvgt_cli.volume.ReadOptions`, and `vvgt_cli.volume.memory` for affine and origin."""
+    """Options of reading a volume; see `vvgt_cli.volume.ReadOptions`, and `volume.memory` for affine and origin."""
 
     dims: tuple[int, int, int]
     dtype: str
@@ -177,16 +183,16 @@ class Reading(TypedDict, total=False):
 
 
 def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volume:
-    """The volume that a caller means.
+    """Read or wrap the volume of a caller.
 
     Args:
         volume: a path (or ``example:NAME``), a `Volume`, or what `vvgt_cli.volume.memory.volume_in_memory` takes.
         reading: how to read it.
-        name: of an array, for reports.
+        name: name of an array, for reports.
 
     Raises:
-        DataError: not a volume, or a damaged one.
-        UsageError: options that it does not take, or that there are not.
+        DataError: the volume is invalid or damaged.
+        UsageError: an option is unknown, or does not apply.
     """
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.volume.memory import volume_in_memory
@@ -197,21 +203,21 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     options = _options(given)
     if isinstance(volume, Volume):
         if reading:
-            raise UsageError(f"{', '.join(reading)}: a Volume has been read; leave out {', '.join(reading)}")
+            raise UsageError(f"{', '.join(reading)}: the Volume is read already; remove {', '.join(reading)}")
         return volume
     if isinstance(volume, str | os.PathLike):
         if affine is not None or origin is not None:
-            raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
+            raise UsageError("affine and origin are for arrays, and files have their own; remove them")
         return open_volume(os.fspath(volume), options)
     found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
     return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Content:
-    """`volume_of`, and of a file its colours, channels or segments too; what a `Session` holds as it is.
+    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`.
 
     Raises:
-        DataError, UsageError: as `volume_of`.
+        DataError, UsageError: see `volume_of`.
     """
     if isinstance(volume, str | os.PathLike):
         return open_content(os.fspath(volume), _options(reading))
@@ -219,23 +225,23 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
     if not isinstance(content, Content):
         return Content((volume_of(volume, reading),))
     if reading:
-        raise UsageError(f"{', '.join(reading)}: a session's volume has been read; leave out {', '.join(reading)}")
+        raise UsageError(f"{', '.join(reading)}: the session's volume is read already; remove {', '.join(reading)}")
     return content
 
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:
-    """How to read, of what callers hand in.
+    """Return the reading options of a caller.
 
     Raises:
-        UsageError: options that there are not.
+        UsageError: an option is unknown.
     """
     import numpy as np
 
     given = dict(reading)
     if unknown := sorted(set(given) - set(Reading.__annotations__)):
-        raise UsageError(f"{unknown[0]}: no such option; of reading expected {', '.join(Reading.__annotations__)}")
+        raise UsageError(f"{unknown[0]}: unknown option; expected one of {', '.join(Reading.__annotations__)}")
     if "affine" in given or "origin" in given:
-        raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
+        raise UsageError("affine and origin are for arrays, and files have their own; remove them")
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
@@ -250,10 +256,10 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
 
 
 def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
-    """The function that a caller means: a path or a name as it is, what a JSON file holds read.
+    """Return the function of a caller: a path or name as it is, or a mapping read as a JSON file.
 
     Raises:
-        DataError: a mapping that is not a function.
+        DataError: the mapping is not a function.
     """
     from vvgt_cli.look import read_transfer_function
 
@@ -266,20 +272,20 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
     """Return the request for a volume under a look.
 
     Raises:
-        DataError, UsageError: as `volume_of` and `function_of`.
+        DataError, UsageError: see `volume_of` and `function_of`.
     """
     if isinstance(volume, str | os.PathLike):  # the source opens it: colours and channels are several volumes
         source = SourceRequest(os.fspath(volume), _options(reading))
     else:
         source = SourceRequest(content_of(volume, reading))
-    return under(source, Look.of(look))
+    return with_look(source, Look.of(look))
 
 
-def under(source: SourceRequest, look: Look) -> SourceRequest:
+def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look.
 
     Raises:
-        DataError, UsageError: as `function_of`.
+        DataError, UsageError: see `function_of`.
     """
     return replace(
         source,
@@ -293,10 +299,10 @@ def under(source: SourceRequest, look: Look) -> SourceRequest:
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
-    """The table that a caller means: a path, ``auto`` or ``none`` as they are, a mapping read as a JSON file is.
+    """Return the label table of a caller: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file.
 
     Raises:
-        DataError: a mapping that is no table.
+        DataError: the mapping is not a table.
     """
     if isinstance(labels, Mapping):
         return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
@@ -304,24 +310,24 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
 
 
 def layer_of(layer: LayerLike) -> SourceRequest:
-    """A layer as ``--layer`` writes it, or as it is."""
+    """Return a layer as it is, or parsed from a value of ``--layer``."""
     return layer if isinstance(layer, SourceRequest) else parse_layer(os.fspath(layer))
 
 
 def light_of(light: LightLike) -> LightOptions:
-    """The light that a caller means: options as they are, a name, three numbers, or several of these."""
+    """Return light options as they are, or made from a name, three numbers, or several of these."""
     if isinstance(light, LightOptions):
         return light
     if light is None or isinstance(light, str):
         return LightOptions(() if light is None else (light,))
-    parts: list[Any] = list(light)
-    if all(isinstance(part, Real) for part in parts):
-        parts = [parts]
-    return LightOptions(tuple(p if isinstance(p, str) else ",".join(repr(float(v)) for v in p) for p in parts))
+    lights: list[Any] = list(light)
+    if all(isinstance(one, Real) for one in lights):
+        lights = [lights]
+    return LightOptions(tuple(p if isinstance(p, str) else ",".join(repr(float(v)) for v in p) for p in lights))
 
 
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:
-    """A ``.ply``'s path, or a result as the file that it would be."""
+    """Return the path of a ``.ply``, or a result as a stream of its file."""
     if isinstance(ply, Result):
         from vvgt_cli.gaussians import write_ply
 
@@ -333,5 +339,5 @@ def ply_of(ply: PathLike | Result) -> str | BinaryIO:
 
 
 def console_of(progress: bool) -> Console:
-    """Lines and bars on standard error, or silence."""
+    """Return a console that prints messages and bars, or is silent."""
     return Console(quiet=not progress)

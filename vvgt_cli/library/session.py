@@ -1,4 +1,4 @@
-"""`Session`: a volume that several functions are tried on."""
+"""Sessions: a volume for several conversions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Session:
-    """A volume, read, counted and laid out once, for one function after the other.
+    """A volume, read and laid out once, for conversions under one function after another.
 
     >>> import vvgt_cli as vvgt
     >>> session = vvgt.Session("example:blob:16")
@@ -23,31 +23,32 @@ class Session:
     >>> [len(session.convert(tf, few).gaussians) for tf in ("gray", "viridis")]
     [20, 20]
 
-    It stands for the volume wherever the library takes one.
+    It can be passed wherever the library takes a volume.
 
     Args:
-        volume, reading: as of `convert`.
+        volume, reading: as in `convert`.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
 
     def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
+        """Read the volume; see the class."""
         self.content = content_of(volume, reading)
         if isinstance(self.volume.data, Stored):
             raise UsageError(
-                f"{self.volume.name}: a Dask array, which is not held in memory; convert it without a session, or pass "
-                "what its compute() returns"
+                f"{self.volume.name}: a Dask array, which is not in memory; convert it without a session, or pass "
+                "the result of its compute()"
             )
         self.content.prepare()
 
     @property
     def volume(self) -> Volume:
-        """What was read: of colours and channels the first."""
+        """Return the volume, or the first of colours and channels."""
         return self.content.volumes[0]
 
     def convert(self, look: LooksLike = None, goal: GoalLike = None, **options: Any) -> Conversion | Clouds:
-        """The volume under another look, or several: `convert`, with its options, without reading again."""
+        """Convert the volume under another look, or several, with the options of `convert`."""
         from vvgt_cli.library.functions import convert
 
         return convert(self, look, goal, **options)

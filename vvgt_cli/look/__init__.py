@@ -1,4 +1,4 @@
-"""Transfer functions: read, put on the data, drawn, or chosen from the histogram."""
+"""Transfer functions, label tables and lights: read, mapped to the data, drawn, or chosen from the histogram."""
 
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import from_histogram

@@ -1,4 +1,4 @@
-"""Transfer functions written to files: our minimal JSON and ParaView's preset JSON."""
+"""Writing transfer functions: our minimal JSON and ParaView's preset JSON."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from vvgt_cli.look.resolve import BY
 
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
-    """The function on data values, its nodes stretched to ``limits`` where some are given.
+    """Return the function on data values, its nodes stretched to ``limits`` if given.
 
     Raises:
-        UsageError: fractions of a range and no limits, or limits for percentiles.
+        UsageError: fractions of a range without limits, or limits for percentiles.
     """
     if tf.domain in BY:
         if limits is not None:
-            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; leave out --tf-range")
+            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
         return tf
     if tf.domain == "fraction":
         if limits is None:
             raise UsageError(
-                f"{tf.name}: its nodes are fractions of the range of the data; say of which: --tf-range LO,HI"
+                f"{tf.name}: its nodes are fractions of the range of the data; give that range as --tf-range LO,HI"
             )
         share = tf.breakpoints()
         return tf.moved(limits[0] * (1 - share) + limits[1] * share)
@@ -34,28 +34,28 @@ def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> Transfer
 
 
 def to_text(tf: TransferFunction, form: str) -> str:
-    """The JSON text of a function on data values or percentiles.
+    """Return the JSON text of a function on data values or percentiles.
 
     Args:
-        tf: see `placed`.
+        tf: as `placed` returns it.
         form: "minimal" or "paraview".
 
     Raises:
-        DataError: something that the format cannot hold.
+        DataError: a feature that the format cannot store.
     """
     body = _minimal(tf) if form == "minimal" else _paraview(tf)
     return json.dumps(body, indent=1, allow_nan=False) + "\n"
 
 
 def _linear(function: PiecewiseOpacity | ColorMap) -> bool:
-    """Whether values between nodes are on straight lines, in their colour space."""
+    """Return whether values between nodes are linear, in their colour space."""
     inner = slice(0, -1)  # the last node's are of no segment
-    straight = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
-    return bool(straight.all())
+    linear = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
+    return bool(linear.all())
 
 
 def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
-    return DataError(f"{tf.name}: {what}; {form} cannot hold that: {hint}")
+    return DataError(f"{tf.name}: {what}; {form} cannot store that: {hint}")
 
 
 def _minimal(tf: TransferFunction) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def _minimal(tf: TransferFunction) -> dict[str, Any]:
 
 
 def _points(tf: TransferFunction) -> list[dict[str, Any]]:
-    """Nodes of opacity and of colour; one point where both have the same nodes."""
+    """Return nodes of opacity and of colour; combined if both have the same positions."""
     opacity, color = tf.opacity_nodes, tf.color_map
     if np.array_equal(opacity.x, color.x):
         rows = zip(opacity.x.tolist(), color.rgb.tolist(), opacity.y.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""The look that live splats are placed by: all values but the background's, or all labels alike."""
+"""The look that places live splats: all values but the background's, or all labels alike."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ NAME = "fog"
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
 BETWEEN = 9  # places around a node where the function that is given may show something
 NODES = 129  # of a function over 256 bins
-HIDDEN = 0.25  # how much a label of opacity 0 counts, which another table may show
+HIDDEN_WEIGHT = 0.25  # how much a label of opacity 0 counts, which another table may show
 SMALL = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
 GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
 
 
 def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> TransferFunction:
-    """A function that is transparent where the background is, and only there; thicker the farther from it.
+    """Return a function that is transparent only in the background, and denser the farther a value is from it.
 
     Args:
         statistics: range and histogram of the data.
-        shown: a function, on data values, whose visible values are not transparent.
+        shown: a function on data values whose visible values must not be transparent.
 
     Returns:
         Opacity per `UNIT_SHARE`; red is the value as a share of the range, green its square: their means over a cell
-        say how far its values are spread.
+        give the variance of its values.
     """
     counts = np.asarray(statistics.histogram, np.float64)
     lo, hi = float(statistics.lo), float(statistics.hi)
@@ -59,14 +59,14 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
 
 
 def label_fog(table: LabelTable, voxels: Mapping[int, int]) -> LabelTable:
-    """A table in which the labels of ``voxels`` have the opacity `THIN`, and a code each of its own.
+    """Return a table that gives each label in ``voxels`` the opacity `THIN` and a code of its own.
 
-    Red is the code in [0, 1] and green its square: their means over a cell say whether it holds several labels. Blue is
-    how much the label counts, by its ``voxels``.
+    Red is the code in [0, 1] and green its square: their means over a cell show whether it holds several labels. Blue
+    is the weight of the label, from its number of ``voxels``.
     """
     least, labels = max(min(voxels.values(), default=1), 1), []
     for number, label in enumerate(table.labels):
         code, weight = (number * GOLDEN) % 1, (least / max(voxels.get(label.number, least), least)) ** SMALL
-        weight *= 1 if label.opacity > 0 else HIDDEN
+        weight *= 1 if label.opacity > 0 else HIDDEN_WEIGHT
         labels.append(replace(label, color=(code, code**2, weight), opacity=THIN if label.number in voxels else 0.0))
     return LabelTable(NAME, tuple(labels))

@@ -1,4 +1,4 @@
-"""Transfer functions: `TransferFunction`, made of a `PiecewiseOpacity` and a `ColorMap`, whose values VTK computes."""
+"""Transfer functions: `TransferFunction`, made of a `PiecewiseOpacity` and a `ColorMap`, both evaluated by VTK."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Named(Protocol):
 
 
 class TransferFunctionLike(Named, Protocol):
-    """The interface that the renderers need; `TransferFunction` is the one implementation."""
+    """The interface that the renderers need; `TransferFunction` implements it."""
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,)."""
@@ -67,7 +67,8 @@ class PiecewiseOpacity:
     sharpness: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        _settle(self, "opacity function", "y", "opacity")
+        """Check and sort the nodes."""
+        _check_nodes(self, "opacity function", "y", "opacity")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity at x of any shape, float64; 0 at NaN."""
@@ -129,12 +130,13 @@ class ColorMap:
     nan_color: tuple[float, float, float] = (0.5, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check and sort the nodes."""
         if self.space not in SPACES:
             raise DataError(f"colour function: colour space {self.space!r}; expected one of {', '.join(SPACES)}")
         count = np.shape(self.x)[0] if np.ndim(self.x) else 0
         if np.shape(self.rgb) != (count, 3):
             raise DataError(f"colour function: {count} nodes, colours of shape {np.shape(self.rgb)}; expected (n, 3)")
-        _settle(self, "colour function", "rgb", "colour")
+        _check_nodes(self, "colour function", "rgb", "colour")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return RGB at data values x of any shape, float64, one axis of 3 behind it; ``nan_color`` at NaN."""
@@ -148,7 +150,7 @@ class ColorMap:
         return _each(function.GetColor, x, np.dtype((np.float64, 3)))
 
     def _along_paths(self, x: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return RGB at x between nodes (n,), straight between the samples of `_ciede2000_path`."""
+        """Return RGB at x between nodes (n,), interpolated between the samples of `_ciede2000_path`."""
         bends = zip(self.midpoint.tolist(), self.sharpness.tolist(), strict=True)
         pairs = pairwise(triple(map(float, rgb)) for rgb in self.rgb)
         colors = np.concatenate([_ciede2000_path(a, b, *bend) for (a, b), bend in zip(pairs, bends, strict=False)])
@@ -161,17 +163,17 @@ class ColorMap:
         return found
 
 
-def _settle(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
+def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
     """Check the arrays of a function and sort them as VTK does (equal positions keep their order), float64.
 
     Args:
-        nodes: whose empty midpoints and sharpness become 0.5 and 0.
+        nodes: empty midpoints and sharpness become 0.5 and 0.
         what: the function, for messages.
         column: name of the attribute with the values.
-        called: what messages call these.
+        called: name of the values in messages.
 
     Raises:
-        DataError: no node, lengths that differ, a value that is not finite, or not in [0, 1] beside positions.
+        DataError: no node, lengths that differ, a value that is not finite, or one outside [0, 1] (positions aside).
     """
     arrays = {name: np.asarray(getattr(nodes, name), np.float64) for name in ("x", column, "midpoint", "sharpness")}
     x = arrays["x"]
@@ -190,7 +192,7 @@ def _settle(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: 
 
 
 def _each(function: Callable[[float], Any], x: np.ndarray, kind: Any) -> np.ndarray:
-    """Return what ``function`` gives at each of x, any shape, as an array of dtype ``kind``."""
+    """Apply ``function`` to each element of x, any shape; return an array of dtype ``kind``."""
     values, places = np.unique(np.asarray(x, np.float64), return_inverse=True)
     found = np.fromiter(map(function, values.tolist()), kind, values.size)
     return found[places.reshape(np.shape(x))]
@@ -213,7 +215,7 @@ def _vtk_colors(space: str, hsv_wrap: bool, *columns: np.ndarray) -> Any:
 def _ciede2000_path(
     start: tuple[float, float, float], end: tuple[float, float, float], midpoint: float, sharpness: float
 ) -> np.ndarray:
-    """Return RGB (`PATH_SAMPLES`, 3) at even steps between two nodes; VTK searches the path in each call (70 ms)."""
+    """Return RGB (`PATH_SAMPLES`, 3) at even steps between two nodes; cached because VTK searches for 70 ms."""
     # with a node more on either side: only between nodes does a path begin and end on VTK's grid of colours
     nodes = [[-1.0, *start, 0.5, 0], [0.0, *start, midpoint, sharpness], [1.0, *end, 0.5, 0], [2.0, *end, 0.5, 0]]
     function = _vtk_colors("Lab/CIEDE2000", False, np.array(nodes))
@@ -224,21 +226,21 @@ def _ciede2000_path(
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """Scalar to colour and opacity per unit distance; implements `TransferFunctionLike`.
+    """Colour and opacity per unit distance of a scalar; implements `TransferFunctionLike`.
 
     Attributes:
-        name: for reports; says where opacity or colour were not given but chosen.
+        name: for reports; mentions opacity or colour that were chosen because the source has none.
         opacity_nodes: opacity per unit distance over the scalar.
         color_map: colour over the scalar.
-        opacity_unit_distance: world length that the opacities are per, when the source says one.
-        opacity_unit_label: where ``opacity_unit_distance`` is from: the ``file``, or a default of its program;
-            `PER_VOXEL` without a distance: opacities are per mean edge of a voxel.
+        opacity_unit_distance: world length that the opacities are per, if the source states one.
+        opacity_unit_label: source of ``opacity_unit_distance``: the ``file``, or a default of its program; `PER_VOXEL`
+            without a distance: opacities are per mean edge of a voxel.
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
-        domain: what the node positions are: ``data`` values; a ``fraction`` in [0, 1] of the data range;
-            a ``percentile`` / 100 of the voxels, or of those in the ``foreground``; or ``sigma``, standard deviations
+        domain: meaning of the node positions: ``data`` values; a ``fraction`` in [0, 1] of the data range; a
+            ``percentile`` / 100 of the voxels, or of those in the ``foreground``; or ``sigma``, standard deviations
             above the mean. `vvgt_cli.look.resolve.resolve` turns all into data values.
-        lighting: that the source asks for, None where it asks for none.
-        otherwise: the function for data that are not in Hounsfield units, where this one is for those.
+        lighting: requested by the source, None if it requests none.
+        otherwise: the function for data that are not in Hounsfield units, if this one is for those.
 
     Raises:
         DataError: unknown domain, unit distance not finite and above 0, fractions outside [0, 1].
@@ -255,6 +257,7 @@ class TransferFunction:
     otherwise: TransferFunction | None = None
 
     def __post_init__(self) -> None:
+        """Check domain, unit distance and node range."""
         if self.domain not in DOMAINS:
             raise DataError(f"{self.name}: node domain {self.domain!r}; expected one of {', '.join(DOMAINS)}")
         distance = self.opacity_unit_distance
@@ -266,7 +269,7 @@ class TransferFunction:
 
     @property
     def of_histogram(self) -> bool:
-        """Tell whether nodes follow from the histogram of the data, not from their range alone."""
+        """Return whether the node positions depend on the histogram, not on the range of the data alone."""
         return self.domain in ("percentile", "foreground", "sigma") or self.otherwise is not None
 
     def opacity(self, x: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The function used when none is given: tissue by Hounsfield units, or a part in the picture for every value."""
+"""Default transfer functions: tissue by Hounsfield units, contours of densities, or opacity from the histogram."""
 
 from __future__ import annotations
 
@@ -59,19 +59,18 @@ TISSUES = (
 
 
 def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density: bool = False) -> TransferFunction:
-    """A transfer function chosen from the histogram; deterministic.
+    """Return a transfer function chosen from the histogram; deterministic.
 
-    Densities get contours at standard deviations above the mean, and below it where they go nearly as far down
-    (`contours`). Hounsfield units (told, or air near -1000 and tissue around 0) get `TISSUES`. Of other values the peak
-    that holds most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977), on each
-    side that leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too.
-    Every value in front of it has its part of an optical depth of `DEPTH`, by the square of its distance from the
-    background and however many voxels hold it: what is common (the inside of things) is thin, what is rare (small
-    things, the brightest) is thick. Data without a dominant peak are shown whole.
+    Densities get contours at standard deviations above the mean, and below it if they reach nearly as far down
+    (`contours`). Hounsfield units (stated, or air near -1000 and tissue around 0) get `TISSUES`. For other values the
+    peak with most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977) on each side
+    that leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too. Every
+    other value contributes to an optical depth of `DEPTH`, by the square of its distance from the background, however
+    many voxels hold it: common values are thin, rare ones dense. Data without a dominant peak are shown whole.
 
     Args:
         statistics: range and histogram of the data.
-        hounsfield: whether the file says that data values are Hounsfield units.
+        hounsfield: whether the file states that data values are Hounsfield units.
         density: whether it is a map of densities.
 
     Returns:
@@ -121,7 +120,7 @@ def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density
 
 
 def contours(counts: np.ndarray, edges: np.ndarray) -> str:
-    """Name of the function for a density: of both signs where its least value is far below the mean too."""
+    """Return the name of a density's function: with both signs if its least value is far below the mean too."""
     mean, _ = moments(counts, edges)
     filled = np.flatnonzero(counts)
     below, above = mean - float(edges[filled[0]]), float(edges[filled[-1] + 1]) - mean
@@ -135,7 +134,7 @@ def _function(name: str, x: np.ndarray, y: np.ndarray, colors: ColorMap) -> Tran
 
 
 def _side(counts: np.ndarray, total: float, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes of the values on one side of the background, from it outwards: bins from it, opacity, RGB."""
+    """Return nodes for one side of the background, outwards: distance from it in bins, opacity, RGB."""
     bins, filled = counts.size, np.flatnonzero(counts)
     common = counts[filled] if filled.size <= LABELS * bins else _averaged(counts[filled])
     weight = ((filled + 0.5) / bins) ** RISE
@@ -154,25 +153,25 @@ def _side(counts: np.ndarray, total: float, colors: np.ndarray) -> tuple[np.ndar
 
 
 def _averaged(counts: np.ndarray) -> np.ndarray:
-    """Counts of neighbouring filled bins, averaged by a Gaussian, (n,); all above 0."""
+    """Return counts of neighbouring filled bins, averaged by a Gaussian, (n,); all above 0."""
     reach = np.arange(-int(4 * SMOOTH), int(4 * SMOOTH) + 1)
     kernel = np.exp(-0.5 * (reach / SMOOTH) ** 2)
     return np.convolve(np.pad(counts, reach[-1], mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
 def worth_showing(side: slice, counts: np.ndarray) -> bool:
-    """Whether a side of the background is wide and full enough to be more than padding or stray voxels."""
+    """Return whether a side of the background is wide and full enough to be more than padding or stray voxels."""
     inside = counts[side]
     # of the foreground as a whole: all but the voxels of the highest bin, which is always background
     return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
 
 
 def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
-    """Name of a function that shows something of a volume, None where none is made for such data.
+    """Return the name of a function that shows something of a volume, None if none is made for such data.
 
-    Densities get contours. In Hounsfield units it is the lungs where they are large, else bone where there is any, else
-    soft tissue. Voxels on a surface to air have any value in between, `EDGE`'s as often as `LUNG`'s; foam of head rests
-    lies below. Other volumes in an anatomical space, with a background, are taken for MR of a head.
+    Densities get contours. Hounsfield units get the lungs if they are large, else bone if there is any, else soft
+    tissue. Voxels on a surface to air have any value in between, `EDGE`'s as often as `LUNG`'s; foam of head rests lies
+    below. Other volumes in an anatomical space, with a background, are treated as MR of a head.
     """
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if not counts.any() or statistics.lo == statistics.hi:
@@ -189,6 +188,6 @@ def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
 
 
 def _share(counts: np.ndarray, edges: np.ndarray, lo: float, hi: float) -> float:
-    """Voxels with values from ``lo`` to ``hi``, straight lines within bins."""
+    """Return the number of voxels with values from ``lo`` to ``hi``, interpolated linearly within bins."""
     below = np.interp((lo, hi), edges, np.concatenate([[0.0], np.cumsum(counts)]))
     return float(below[1] - below[0])

@@ -45,7 +45,7 @@ EXPECTED = (
     "(index, name, R, G, B or color), .seg.nrrd, "
     'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
-_WHOLE, _PART = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
+_INTEGER, _DECIMAL = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
 Row = tuple[str, int, str, Any, float | None]  # place for errors, label, name, colour in [0, 1], A / 255 or None
 _SNAP = re.compile(
     r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
@@ -53,12 +53,12 @@ _SNAP = re.compile(
 
 
 def holds_table(source: str | None) -> bool:
-    """Whether a file is a label map that brings its own table: a .seg.nrrd, or a DICOM segmentation."""
+    """Return whether a file is a label map with its own table: a .seg.nrrd, or a DICOM segmentation."""
     return source is not None and (source.endswith(SEGMENTATION) or is_segmentation_file(source))
 
 
 def is_table(path: Path) -> bool:
-    """Whether a file holds a table of labels and nothing else, by its name and the way that it begins."""
+    """Return whether a file holds a table of labels and nothing else, by its name and first line."""
     suffix = path.suffix.lower()
     if suffix not in TEXTS:
         return suffix in TABLES
@@ -66,7 +66,7 @@ def is_table(path: Path) -> bool:
         text = text_of(path, "a table of labels")
         if text.lstrip().startswith("{"):
             parsed = json_of(text, path, "a table of labels")
-            return bool(parsed) and all(_WHOLE.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
+            return bool(parsed) and all(_INTEGER.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
     except DataError:
         return False
     rows = (line.strip() for line in text.splitlines())
@@ -75,7 +75,7 @@ def is_table(path: Path) -> bool:
 
 
 def read_labels(source: str) -> LabelTable:
-    """The table in a file.
+    """Read the table in a file.
 
     Raises:
         UsageError: no such file.
@@ -98,12 +98,12 @@ def read_labels(source: str) -> LabelTable:
 
 
 def segments_of(source: str, layer: int) -> LabelTable:
-    """The segments of one layer of a .seg.nrrd in which segments overlap, or that of a DICOM SEG (a layer each).
+    """Read the segments of one layer of an overlapping .seg.nrrd, or one segment of a DICOM SEG (a layer each).
 
-    Numbers of labels are those of the layer.
+    The label numbers are those of the layer.
 
     Raises:
-        DataError: none in this layer, or faulty ones.
+        DataError: no segment in this layer, or faulty ones.
     """
     if is_segmentation_file(source):
         own = sorted((label for label in _dicom(source) if label.number), key=lambda label: label.number)
@@ -116,7 +116,7 @@ def segments_of(source: str, layer: int) -> LabelTable:
 
 def _table(found: list[Label], what: str) -> LabelTable:
     if not found:
-        raise DataError(f"{what}: no label in it; {EXPECTED}")
+        raise DataError(f"{what}: no labels; {EXPECTED}")
     return LabelTable(Path(what).name, tuple(sorted(found, key=lambda label: label.number)))
 
 
@@ -143,19 +143,19 @@ def _separated(text: str, path: Path) -> list[Label]:
     """Read labels from a CSV or TSV table; without a row of names its columns are `NAMELESS`.
 
     Raises:
-        DataError: a row without a label, or a colour that is not of numbers.
+        DataError: a row without a label, or a colour that is not numeric.
     """
     lines = [line for line in text.splitlines(keepends=True) if line.strip() and not line.startswith("#")] or [""]
     comma, rows, head = max("\t,;", key=lines[0].count), list[Row](), list[str]()
     try:
         head = [cell.strip().lower() for cell in next(csv.reader(lines, delimiter=comma), [])]
-        names, body = (NAMELESS, lines) if _WHOLE.fullmatch("".join(head[:1])) else (head, lines[1:])
+        names, body = (NAMELESS, lines) if _INTEGER.fullmatch("".join(head[:1])) else (head, lines[1:])
         for n, cells in enumerate(csv.DictReader(body, names, delimiter=comma), 1):
             texts = {key: " ".join(cell.splitlines()).strip() for key, cell in cells.items() if isinstance(cell, str)}
             found = {key: next((texts[k] for k in keys if texts.get(k)), "") for key, keys in COLUMNS.items()}
             value, color = found["number"].removesuffix(".0"), [found[key] for key in "rgb" if found[key]]
-            numbers = all(_PART.fullmatch(found[key] or "0") for key in "rgba")
-            if not _WHOLE.fullmatch(value) or len(color) in (1, 2) or not numbers:
+            numbers = all(_DECIMAL.fullmatch(found[key] or "0") for key in "rgba")
+            if not _INTEGER.fullmatch(value) or len(color) in (1, 2) or not numbers:
                 raise DataError(f"{path}: row {n}: label {value[:20]!r}, colour {', '.join(color)[:40]}; {EXPECTED}")
             shown = [float(v) / 255 for v in color] or _hex(found["color"])
             last = float(found["a"]) / 255 if found["a"] else None
@@ -166,14 +166,14 @@ def _separated(text: str, path: Path) -> list[Label]:
 
 
 def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label]:
-    """Make labels of rows, in distinct colours where they have none; ``opacity``: column A is known to be that."""
+    """Make labels from rows, with distinct colours for those without; ``opacity``: column A is known to be opacity."""
     opacity = opacity or _is_opacity([row[4] for row in rows if row[1] and row[4] is not None], path, text)
-    parts = [v * 255 for row in rows for v in row[3] or ()]
-    if parts and max(parts) <= 1 and any(v % 1 for v in parts):
+    channels = [v * 255 for row in rows for v in row[3] or ()]
+    if channels and max(channels) <= 1 and any(v % 1 for v in channels):
         raise DataError(f"{path}: no colour above 1; expected red, green and blue from 0 to 255")
     colors: dict[int, Any] = {}
     if blank := [row[1] for row in rows if row[3] is None]:
-        warnings.warn(f"{path.name}: {len(blank)} labels have no colour; shown in distinct ones", stacklevel=2)
+        warnings.warn(f"{path.name}: {len(blank)} labels have no colour; given distinct ones", stacklevel=2)
         colors = {label.number: list(label.color) for label in distinct(sorted(set(blank))).labels}
     found = []
     for here, value, name, color, last in rows:
@@ -183,7 +183,7 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
 
 
 def _is_opacity(given: list[float], path: Path, text: str) -> bool:
-    """Tell whether column A of a table is opacity (3D Slicer), not transparency (FreeSurfer).
+    """Return whether column A of a table is opacity (3D Slicer), not transparency (FreeSurfer).
 
     FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``given`` is A / 255
     of every label but 0.
@@ -203,39 +203,39 @@ def _is_opacity(given: list[float], path: Path, text: str) -> bool:
 
 
 def _hex(text: str) -> list[float] | None:
-    """Parse a colour, ``#rrggbb``; None for other texts."""
+    """Parse a colour ``#rrggbb``; return None for other texts."""
     digits = text.removeprefix("#")
     return [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)] if re.fullmatch("[0-9a-fA-F]{6}", digits) else None
 
 
 def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
-    """Label, name, red, green and blue, and A over 255 of ``number name R G B [A]``; None where it is no such line.
+    """Parse ``number name R G B [A]`` into label, name, (R, G, B) and A / 255; return None for other lines.
 
-    Of names that end in numbers the last four are R, G, B and A. By words: an expression over a line of blanks would
-    take the third power of its length.
+    If a name ends in numbers, the last four are R, G, B and A. The line is split into words because a regular
+    expression would take cubic time on a line of blanks.
     """
     words = line.split()
-    last = next((k for k, word in enumerate(reversed(words)) if not _PART.fullmatch(word)), len(words))
+    last = next((k for k, word in enumerate(reversed(words)) if not _DECIMAL.fullmatch(word)), len(words))
     many = min(last, len(words) - 2, 4)  # of the numbers at the end; label and name come before
-    if many < 3 or not _WHOLE.fullmatch(words[0]):
+    if many < 3 or not _INTEGER.fullmatch(words[0]):
         return None
     name = line.split(None, 1)[1].rsplit(None, many)[0].strip('"')
     return words[0], name, words[-many:][:3], float(words[-1]) / 255 if many == 4 else None
 
 
 def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
-    """Of the segments that a NRRD header names, in one layer or in all."""
-    parts: dict[str, dict[str, str]] = {}
+    """Read the segments in a NRRD header, of one layer or of all."""
+    segments: dict[str, dict[str, str]] = {}
     for index, key, value in re.findall(r"^Segment([0-9]{1,9})_(\w+):=(.*)$", header, re.M):
-        parts.setdefault(index, {})[key] = value.strip()
+        segments.setdefault(index, {})[key] = value.strip()
     found = []
-    for index, part in parts.items():
-        if layer is not None and part.get("Layer", "0") != str(layer):
+    for index, segment in segments.items():
+        if layer is not None and segment.get("Layer", "0") != str(layer):
             continue
-        color, label = part.get("Color", "").split(), part.get("LabelValue", str(int(index) + 1))
+        color, label = segment.get("Color", "").split(), segment.get("LabelValue", str(int(index) + 1))
         if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
             raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
-        name = part.get("Name", part.get("ID", f"label {label}"))
+        name = segment.get("Name", segment.get("ID", f"label {label}"))
         found.append(_label(f"{what}: segment {index}", int(label), name, [float(c) for c in color], SOLID))
     return found
 
@@ -251,10 +251,10 @@ def _dicom(source: str) -> list[Label]:
 
 
 def table_of(parsed: Any, what: str) -> LabelTable:
-    """The table that a parsed JSON file holds.
+    """Return the table in a parsed JSON file.
 
     Raises:
-        DataError: none, or a faulty one.
+        DataError: no table, or a faulty one.
     """
     if not isinstance(parsed, dict):
         raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
@@ -275,7 +275,7 @@ def _is_number(text: str) -> bool:
 
 
 def _label(what: str, value: int, name: str, color: Any, opacity: float) -> Label:
-    """Make a label of checked parts; a warning says where its name is cut to `LONGEST_NAME` characters."""
+    """Make a label from checked values; warn if its name is cut to `LONGEST_NAME` characters."""
     if not 0 <= opacity <= 1:
         raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
     if abs(value) > MOST:

@@ -1,4 +1,4 @@
-"""`LabelTable`: names, colours and opacities of a label map's labels; its files are read by `label_files`."""
+"""`LabelTable`: names, colours and opacities of a label map's labels; `label_files` reads its files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOLID = 1.0  # opacity of a label whose table says none
 
 @dataclass(frozen=True)
 class Label:
-    """One label.
+    """A label.
 
     Attributes:
         number: the voxels' value.
@@ -39,11 +39,11 @@ class Label:
 
 @dataclass(frozen=True)
 class LabelTable:
-    """What labels look like; a function of whole numbers, transparent elsewhere. Label 0 is transparent by default.
+    """Look of labels: a function of integers, transparent elsewhere. Label 0 is transparent by default.
 
     Attributes:
         name: for reports.
-        labels: by ascending numbers, each once.
+        labels: ascending by number, each once.
 
     Raises:
         DataError: no labels, or a number twice.
@@ -56,6 +56,7 @@ class LabelTable:
     opacity_unit_share = None
 
     def __post_init__(self) -> None:
+        """Check that numbers ascend."""
         if not self.labels:
             raise DataError(f"{self.name}: no labels; expected one")
         numbers = [label.number for label in self.labels]
@@ -69,34 +70,34 @@ class LabelTable:
 
     @cached_property
     def _optics(self) -> np.ndarray:
-        """(n, 4) float64 red, green, blue and opacity."""
+        """Return (n, 4) float64 red, green, blue and opacity."""
         return np.array([(*label.color, label.opacity) for label in self.labels], np.float64)
 
     def _rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row of each of x (n,), and whether it has one."""
+        """Return the row of each of x (n,), and whether it has one."""
         found = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
         return found, self._numbers[found] == x
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
-        """Opacity in [0, 1] per unit distance of labels x (n,); 0 where there is no entry."""
+        """Return the opacity in [0, 1] per unit distance of labels x (n,); 0 without an entry."""
         rows, there = self._rows(x)
         return np.where(there, self._optics[rows, 3], 0.0)
 
     def color(self, x: np.ndarray) -> np.ndarray:
-        """RGB (n, 3) in [0, 1] of labels x (n,)."""
+        """Return RGB (n, 3) in [0, 1] of labels x (n,)."""
         result: np.ndarray = self._optics[self._rows(x)[0], :3]
         return result
 
     def node_range(self) -> tuple[float, float]:
-        """Smallest and largest label."""
+        """Return the smallest and largest label."""
         return float(self._numbers[0]), float(self._numbers[-1])
 
     def support(self, lo: float, hi: float) -> list[tuple[float, float]]:
-        """Visible labels in [lo, hi], as intervals."""
+        """Return the visible labels in [lo, hi], as intervals."""
         return [(float(e.number),) * 2 for e in self.labels if e.opacity > 0 and lo <= e.number <= hi]
 
     def of(self, numbers: Sequence[int], where: str) -> LabelTable:
-        """The entries of a volume's labels, ascending ``numbers``; 0 is left out.
+        """Return the entries of a volume's labels, ascending ``numbers``; label 0 needs none.
 
         Raises:
             DataError: labels without an entry, or none of the table's labels.
@@ -114,7 +115,7 @@ class LabelTable:
         return replace(self, labels=tuple(known[n] for n in numbers if n in known))
 
     def warned(self, numbers: Sequence[int], where: str) -> LabelTable:
-        """Return the table; a warning names those of a volume's labels, ``numbers``, that it hides, 0 aside."""
+        """Return the table; warn about labels of the volume, ``numbers``, that it hides (0 aside)."""
         there = {*numbers} - {0}
         if hidden := [f"{e.number} ({e.name})" for e in self.labels if e.number in there and not e.opacity]:
             shown = ", ".join(hidden[:LISTED]) + (", ..." if len(hidden) > LISTED else "")
@@ -122,23 +123,23 @@ class LabelTable:
         return self
 
     def only(self, number: int) -> LabelTable:
-        """The table with one label, the others transparent."""
+        """Return the table with one label, the others transparent."""
         kept = tuple(e if e.number == number else replace(e, opacity=0.0) for e in self.labels)
         return replace(self, name=f"{self.name}, label {number}", labels=kept)
 
 
 def check_labels(looks: Sequence[Named]) -> None:
-    """Refuse looks that hide everything: of several layers one may hide all its labels, but not alone.
+    """Refuse looks that hide everything; one of several layers may hide all its labels.
 
     Raises:
-        DataError: they are transparent.
+        DataError: all labels are transparent.
     """
     if all(isinstance(look, LabelTable) and not any(e.opacity > 0 for e in look.labels) for look in looks):
         raise DataError(f"{looks[0].name}: none of its labels is visible; expected opacity above 0: try --labels auto")
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:
-    """Solid labels in distinct colours, which depend on a label's number alone; above 78 they repeat.
+    """Return solid labels in distinct colours, which depend on the label's number alone and repeat above 78.
 
     Args:
         numbers: of the labels, ascending; 0 is transparent.

@@ -1,4 +1,4 @@
-"""`Lighting`: lights and coefficients, as presets and users give them (docs/light.md)."""
+"""`Lighting`: lights and coefficients, given by presets and users (docs/light.md)."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ Direction = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Lighting:
-    """Lights of one white, and how matter answers them: ``c = ka c0 + kd |n.l| c0 + ks |n.h|^p``.
+    """White lights and the response of matter: ``c = ka c0 + kd |n.l| c0 + ks |n.h|^p``.
 
     Attributes:
         headlight: a light at the eye.
         directions: unit vectors towards lights at infinity, world axes.
         ambient, diffuse, specular, specular_power: ka, kd, ks, p.
-        shadows: lights at infinity arrive attenuated by what lies before them.
-        occlusion: unit-frame length within which what is around takes of ambient and diffuse light; None: none.
+        shadows: lights at infinity are attenuated on their way.
+        occlusion: unit-frame length within which surroundings attenuate ambient and diffuse light; None: not at all.
 
     Raises:
         UsageError: no light, a direction of length zero, a coefficient that is not finite, negative or above `MOST`,
-            shadows without a light that throws any.
+            shadows without a light that casts any.
     """
 
     headlight: bool = True
@@ -47,6 +47,7 @@ class Lighting:
     occlusion: float | None = None
 
     def __post_init__(self) -> None:
+        """Check lights and coefficients."""
         if not (self.headlight or self.directions):
             raise UsageError(f"no light; {EXPECTED}")
         for name in COEFFICIENTS:
@@ -56,20 +57,20 @@ class Lighting:
         if self.occlusion is not None and not 0 < self.occlusion < math.inf:
             raise UsageError(f"--ambient-occlusion {self.occlusion:g}: expected a length above 0")
         if self.shadows and not self.directions:
-            raise UsageError("--shadows: a headlight throws none that its eye sees; give --light X,Y,Z too, or none")
+            raise UsageError("--shadows: a headlight casts no visible shadows; add --light X,Y,Z, or omit --shadows")
 
     @property
     def depends_on_view(self) -> bool:
-        """Whether colours change with the eye."""
+        """Return whether colours change with the eye."""
         return (self.headlight and self.diffuse > 0) or self.specular > 0
 
     @property
     def attenuated(self) -> bool:
-        """Whether light is marched through the scene, for shadows or occlusion."""
+        """Return whether light is marched through the scene, for shadows or occlusion."""
         return self.shadows or self.occlusion is not None
 
     def text(self) -> str:
-        """One line, as the header of a `.ply` has it; `parse_lighting` reads it."""
+        """Return one line for the header of a `.ply`; `parse_lighting` reads it."""
         words = [repr(float(getattr(self, name))) for name in COEFFICIENTS]
         words += [HEADLIGHT] * self.headlight + [",".join(repr(v) for v in d) for d in self.directions]
         words += ["shadows"] * self.shadows
@@ -77,10 +78,10 @@ class Lighting:
 
 
 def parse_lighting(text: str) -> Lighting:
-    """What `Lighting.text` wrote.
+    """Parse a line of `Lighting.text`.
 
     Raises:
-        ValueError, UsageError: something else.
+        ValueError, UsageError: another text.
     """
     words = text.split()
     numbers: list[Any] = [float(word) for word in words[:4]]
@@ -97,12 +98,12 @@ def parse_lighting(text: str) -> Lighting:
 
 @dataclass(frozen=True)
 class LightOptions:
-    """What a user asks for; None, here and of each: what the function's file says, else VTK's defaults.
+    """Lighting options of a user; None leaves the choice to the function's file, else to VTK's defaults.
 
     Attributes:
-        lights: ``none``, ``headlight``, ``X,Y,Z``, an axis or a word of `WORDS`; empty: what the function's file says.
+        lights: ``none``, ``headlight``, ``X,Y,Z``, an axis or a word of `WORDS`; empty: those of the function's file.
         ambient, diffuse, specular, specular_power: coefficients.
-        shadows, occlusion: as `Lighting` has them.
+        shadows, occlusion: as in `Lighting`.
     """
 
     lights: tuple[str, ...] = ()
@@ -114,31 +115,31 @@ class LightOptions:
     occlusion: float | None = None
 
     def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
-        """Light of a scene, None for none.
+        """Return the light of a scene, None if it is not lit.
 
         Args:
-            preset: what the function's file says.
-            space: anatomical space of the world, None where it is not.
+            preset: light of the function's file.
+            space: anatomical space of the world, None if it has none.
 
         Raises:
-            UsageError: lights that are none, or other options where nothing is lit.
+            UsageError: invalid lights, or other options without a light.
         """
         given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}
         given |= {"occlusion": self.occlusion} if self.occlusion is not None else {}
         given |= {"shadows": True} if self.shadows else {}
         if NONE in self.lights or not (self.lights or preset):
             if len(self.lights) > 1:
-                raise UsageError(f"--light {' --light '.join(self.lights)}: none and others; give one of both")
+                raise UsageError(f"--light {' --light '.join(self.lights)}: expected none, or other lights, not both")
             if given:
                 name = {"occlusion": "ambient-occlusion"}.get(first := next(iter(given)), first.replace("_", "-"))
-                raise UsageError(f"--{name}: nothing is lit; give --light headlight, or a direction as X,Y,Z, too")
+                raise UsageError(f"--{name}: there is no light; add --light headlight or a direction, --light X,Y,Z")
             return None
         if not self.lights:
             assert preset is not None
             return replace(preset, **given)
         fixed = _directions([light for light in self.lights if light != HEADLIGHT], space)
         if len(self.lights) - len(fixed) > 1:
-            raise UsageError("--light headlight: twice; there is one")
+            raise UsageError("--light headlight: given twice; expected once")
         kept = {} if preset is None else {name: getattr(preset, name) for name in COEFFICIENTS}
         return Lighting(HEADLIGHT in self.lights, fixed, **(kept | given))
 
@@ -148,7 +149,7 @@ def _directions(lights: Sequence[str], space: str | None) -> tuple[Direction, ..
 
 
 def _direction(light: str, space: str | None) -> Direction:
-    """Unit vector towards a light."""
+    """Return the unit vector towards a light."""
     word = {"above": "z", "below": "-z"}.get(light, light)
     if word in WORDS:
         if space is None and word not in ("left", "right"):
@@ -163,16 +164,16 @@ def _direction(light: str, space: str | None) -> Direction:
         raise UsageError(f"--light {light}; {EXPECTED}") from None
     largest = max(abs(x), abs(y), abs(z))
     if not 0 < largest < math.inf:
-        raise UsageError(f"--light {light}: of length {'0' if largest == 0 else 'nothing finite'}; {EXPECTED}")
+        raise UsageError(f"--light {light}: its length is {'0' if largest == 0 else 'not finite'}; {EXPECTED}")
     length = largest * math.hypot(x / largest, y / largest, z / largest)
     return x / length, y / length, z / length
 
 
 def preset_lighting(what: str, shade: bool, fields: dict[str, Any]) -> Lighting | None:
-    """What a volume property says of light: a head-light where it is shaded, None where not.
+    """Return the light of a volume property: a headlight if it is shaded, else None.
 
     Raises:
-        DataError: coefficients that cannot be.
+        DataError: coefficients out of range.
     """
     if not shade:
         return None

@@ -1,4 +1,4 @@
-"""What a histogram tells of the data: background, mean and deviation, and whether they are Hounsfield units."""
+"""Properties of data from their histogram: background, mean and deviation, and whether they are Hounsfield units."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PEAK = 2.0  # times as many voxels per HU as between the two
 
 
 def background_bins(counts: np.ndarray) -> tuple[int, int]:
-    """Bins [first, last) of the background; an empty range at 0 when no peak dominates, or a wide one above others."""
+    """Return the background's bins [first, last); (0, 0) if no peak dominates, or a wide one lies above others."""
     total = counts.sum()
     first, last = _peak(counts)
     if counts[first:last].sum() < DOMINANT * total:
@@ -28,20 +28,20 @@ def background_bins(counts: np.ndarray) -> tuple[int, int]:
     if first == 0 and last <= PADDING_BINS and rest.sum() > 0:
         a, b = _peak(rest)
         behind = rest[b:].sum()
-        apart = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
-        if apart and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
+        separate = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
+        if separate and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
             last += b
     return first, last
 
 
 def _peak(counts: np.ndarray) -> tuple[int, int]:
-    """Bins [first, last) of the highest peak, out to its feet."""
+    """Return the bins [first, last) of the highest peak, out to its feet."""
     top = int(np.argmax(counts))
     return top - _foot(counts[top::-1]) + 1, top + _foot(counts[top:])
 
 
 def _foot(falling: np.ndarray) -> int:
-    """Bins from the peak (bin 0) to its foot: farthest below the line from the peak to the last filled bin."""
+    """Return the bins from the peak (bin 0) to its foot, farthest below the line from peak to last filled bin."""
     filled = np.flatnonzero(falling)
     end = int(filled[-1])
     if end < 2:
@@ -51,7 +51,7 @@ def _foot(falling: np.ndarray) -> int:
 
 
 def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
-    """Whether data values are Hounsfield units: a peak of them is air's, another one is tissue's."""
+    """Return whether data values are Hounsfield units: one of their peaks is air's, another one tissue's."""
     cumulative = np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum()
     spans = (AIR, BETWEEN, TISSUE)
     air, between, tissue = (float(np.diff(np.interp(span, edges, cumulative))[0]) for span in spans)
@@ -61,16 +61,16 @@ def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
 
 
 def foreground(counts: np.ndarray) -> np.ndarray:
-    """The counts with those up to the background's last set to 0; themselves where there is nothing to leave out."""
+    """Return the counts with the background and all below it set to 0; unchanged if nothing would remain."""
     last = background_bins(counts)[1]
     front = np.where(np.arange(counts.size) < last, 0.0, counts)
     return front if last and front.any() else counts
 
 
 def moments(counts: np.ndarray, edges: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of data values, from the middles of bins, with Sheppard's correction.
+    """Return mean and standard deviation of data values, from the middles of bins, with Sheppard's correction.
 
-    Both are off by at most half a bin (1/512 of the range); for values spread over several bins by far less.
+    Both are off by at most half a bin (1/512 of the range), by far less for values spread over several bins.
     """
     weight, middle = counts / counts.sum(), edges[:-1] / 2 + edges[1:] / 2
     scale = float(np.abs(edges).max()) or 1.0  # squares of values near the limit of float64

@@ -1,4 +1,4 @@
-"""Putting a transfer function on the data: ``--tf-range``, ``--opacity-unit-distance``, and what is visible."""
+"""Mapping a transfer function to the data: ``--tf-range``, ``--opacity-unit-distance``, and what is visible."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
 class StatisticsLike(Protocol):
-    """What this room needs to know of the data.
-
-    Attributes:
-        lo, hi: smallest and largest finite data value.
-        histogram: (bins,) counts of finite voxels, equal bins over [lo, hi].
-        edges: (bins + 1,) bin edges, data values.
-    """
+    """Statistics of the data that this room needs."""
 
     @property
-    def lo(self) -> float: ...
+    def lo(self) -> float:
+        """Return the smallest finite data value."""
+
     @property
-    def hi(self) -> float: ...
+    def hi(self) -> float:
+        """Return the largest finite data value."""
+
     @property
-    def histogram(self) -> np.ndarray: ...
+    def histogram(self) -> np.ndarray:
+        """Return (bins,) counts of finite voxels, equal bins over [lo, hi]."""
+
     @property
-    def edges(self) -> np.ndarray: ...
+    def edges(self) -> np.ndarray:
+        """Return (bins + 1,) bin edges, data values."""
 
 
 def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]:
-    """``data``, ``rescale`` or two ascending numbers.
+    """Return ``data``, ``rescale`` or two ascending numbers.
 
     Raises:
         UsageError: anything else.
@@ -60,21 +61,21 @@ def resolve(
     tf_range: str | tuple[float, float] = "data",
     hounsfield: bool = False,
 ) -> TransferFunction:
-    """The function with its nodes on data values.
+    """Return the function with its nodes on data values.
+
+    With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which was
+    assumed: values if the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
 
     Args:
         tf: as read; of any domain.
         statistics: of the data.
-        tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale``
-            stretches them linearly to the data range, ``LO,HI`` to that range.
-        hounsfield: whether the file says that data values are Hounsfield units; else the histogram tells.
-
-    With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which
-    was taken: values where the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
+        tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale`` stretches
+            them linearly to the data range, ``LO,HI`` to that range.
+        hounsfield: whether the file states that data values are Hounsfield units; else the histogram decides.
 
     Raises:
         DataError: no finite voxel; a function of one position to stretch.
-        UsageError: a ``tf_range`` that is none, or a range for a function of percentiles.
+        UsageError: an invalid ``tf_range``, or a range for a function of percentiles.
     """
     chosen = parse_tf_range(tf_range)
     lo, hi = _data_range(statistics)
@@ -85,7 +86,7 @@ def resolve(
         tf = replace(tf.otherwise, name=f"{tf.name} ({BY[tf.otherwise.domain]})")
     if tf.domain in BY:
         if chosen != "data":
-            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; leave out --tf-range")
+            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
         return tf.moved(_positions(tf, statistics))
     if tf.domain == "fraction":
         a, b = (lo, hi) if isinstance(chosen, str) else chosen
@@ -113,7 +114,7 @@ def _in_hounsfield(statistics: StatisticsLike) -> bool:
 
 
 def _positions(tf: TransferFunction, statistics: StatisticsLike) -> np.ndarray:
-    """Data values of the breakpoints (m,) of a function over what is counted of the data."""
+    """Return data values of the breakpoints (m,) of a function on percentiles or standard deviations."""
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if tf.domain == "sigma" and counts.any():
         mean, deviation = moments(counts, edges)
@@ -123,7 +124,7 @@ def _positions(tf: TransferFunction, statistics: StatisticsLike) -> np.ndarray:
 
 
 def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:
-    """Data values below which ``fraction`` (n,) in [0, 1] of the voxels lie, linear within a histogram bin, (n,)."""
+    """Return data values below which ``fraction`` (n,) in [0, 1] of the voxels lie, linear within bins, (n,)."""
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     return _quantiles(counts, edges, fraction)
 
@@ -139,19 +140,21 @@ def _quantiles(counts: np.ndarray, edges: np.ndarray, fraction: np.ndarray) -> n
 
 
 def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction | None = None) -> tuple[float, str]:
-    """The world length that opacities are per, and where it comes from.
+    """Return the world length that opacities are per, and its source.
 
     Args:
-        spec: a positive number; ``paraview``: diagonal of the box of voxel centres over the cube root of the
-            number of cells, prod(dims - 1), as ParaView's domain of ScalarOpacityUnitDistance does (axes of one
-            voxel are left out: with k others it is the k-th root; a single voxel has the mean spacing);
-            ``mean-spacing``: arithmetic mean of the three spacings; None: the function's own, or ``paraview``.
+        spec: a positive number; ``paraview``: diagonal of the box of voxel centres over the cube root of the number of
+            cells, prod(dims - 1), as ParaView's domain of ScalarOpacityUnitDistance does (axes of one voxel are
+            skipped: with k others it is the k-th root; a single voxel has the mean spacing); ``mean-spacing``:
+            arithmetic mean of the three spacings; None: the function's own, or ``paraview``.
+        volume: dimensions and spacing.
+        tf: the function, None if only the volume decides.
 
     Returns:
         (distance, label), the label one of ``given``, ``file``, ``paraview``, ``mean-spacing``, or the function's own.
 
     Raises:
-        UsageError: anything else.
+        UsageError: an invalid ``spec``.
     """
     if spec is None:
         if tf is not None and tf.opacity_unit_distance is not None:
@@ -178,7 +181,7 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
 
 
 def check_visible(tf: TransferFunction, statistics: StatisticsLike) -> None:
-    """Raise DataError when the function (on data values) makes every value of the data transparent."""
+    """Raise DataError if the function (on data values) makes every value of the data transparent."""
     lo, hi = _data_range(statistics)
     if tf.support(lo, hi):
         return

@@ -1,4 +1,4 @@
-"""A picture of a transfer function over the histogram."""
+"""Picture of a transfer function over the histogram."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw(
     Args:
         tf: the function; drawn over the data range with ``statistics`` (then on data values), else over its nodes.
         statistics: of the data, or None.
-        path: the PNG; written beside and renamed.
+        path: the PNG.
         overwrite: replace an existing file.
 
     Raises:
@@ -51,7 +51,7 @@ def draw(
 
 
 def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[float, float]:
-    """Ends of the horizontal axis: the data's range, or the nodes'."""
+    """Return the ends of the horizontal axis: the data's range, or the nodes'."""
     lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
     if lo == hi:
         margin = abs(lo) * 0.5 or 0.5
@@ -65,8 +65,8 @@ def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
     y = tf.opacity(x)
     colors = tf.color(np.linspace(x[0], x[-1], SAMPLES))[None]  # (1, SAMPLES, 3)
     outline = np.concatenate([[(x[0], 0)], np.column_stack([x, y]), [(x[-1], 0)]])
-    under = Polygon(outline, closed=True, transform=axes.transData)
-    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=under, zorder=1)
+    area = Polygon(outline, closed=True, transform=axes.transData)
+    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=area, zorder=1)
     nodes = tf.opacity_nodes
     axes.plot(x, y, color="black", linewidth=1.2)
     axes.plot(nodes.x, nodes.y, "o", color="black", markerfacecolor="white", markersize=4, clip_on=False)

@@ -1,7 +1,7 @@
 """Transfer functions that highlight one range of values each, from the histogram alone (`vvgt tf suggest`).
 
-The set-up of the VVGT paper (Experiment Setup, Datasets): about ten functions a volume, "to highlight different
-scalar value ranges and internal structures".
+The VVGT paper (Experiment Setup, Datasets) uses about ten functions per volume, "to highlight different scalar value
+ranges and internal structures".
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Suggestion:
     """A function that shows one band of values.
 
     Attributes:
-        name: says which band.
+        name: number and range of the band.
         x: (k,) ascending data values.
         opacity: (k,) per ``unit_distance``.
         rgb: (k, 3) in [0, 1].
@@ -50,7 +50,7 @@ class Suggestion:
     share: float
 
     def to_json(self) -> str:
-        """The minimal JSON form (`vvgt_cli.look.readers.minimal`); numbers keep every bit."""
+        """Return the minimal JSON form (`vvgt_cli.look.readers.minimal`); numbers keep every bit."""
         points: list[dict[str, Any]] = [
             {"x": float(x), "rgb": [round(float(c), 4) for c in rgb], "opacity": float(opacity)}
             for x, rgb, opacity in zip(self.x, self.rgb, self.opacity, strict=True)
@@ -60,11 +60,11 @@ class Suggestion:
 
 
 def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: float) -> list[Suggestion]:
-    """Functions for ``count`` bands of the values in front of the background, low values first; deterministic.
+    """Return functions for ``count`` bands of the foreground's values, low values first; deterministic.
 
-    A band is a trapezoid: transparent outside, constant in its middle half and up to the ends of the data. Its
-    height lets a ray through the volume meet an optical depth of 1.5 on average, so that common values are fog and
-    rare ones are solid. A peak that spans more than a quarter of the values is no background.
+    A band is a trapezoid: transparent outside, constant in its middle half and up to the ends of the data. Its height
+    gives a ray through the volume an optical depth of 1.5 on average, so that common values are fog and rare ones
+    solid. A peak that spans more than a quarter of the values is no background.
 
     Args:
         statistics: range and histogram of the data.
@@ -88,14 +88,14 @@ def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: floa
 
 
 def _background(counts: np.ndarray) -> Bins:
-    """Bins [first, last) that no function shows; (0, 0) for none."""
+    """Return the bins [first, last) that no function shows; (0, 0) for none."""
     first, last = background_bins(counts)
     alone = counts[first:last].sum() == counts.sum()
     return (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
 
 
 def _bands(counts: np.ndarray, background: Bins, count: int) -> list[Bins]:
-    """Bins [first, last) of each band: some, on one side of the background, and some voxels among them."""
+    """Return the bins [first, last) of each band, all on one side of the background, with some voxels."""
     sides = [(0, background[0]), (background[1], counts.size)]
     sides = [(a, b) for a, b in sides if counts[a:b].sum() > 0]
     bins = np.concatenate([np.arange(a, b) for a, b in sides])
@@ -118,7 +118,7 @@ def _bands(counts: np.ndarray, background: Bins, count: int) -> list[Bins]:
 def _suggestion(
     band: tuple[int, int], data: tuple[np.ndarray, np.ndarray, Bins], which: tuple[int, int], grid: tuple[float, float]
 ) -> Suggestion:
-    """The function of a band of bins, number ``which[0]`` of ``which[1]``.
+    """Return the function of a band of bins, number ``which[0]`` of ``which[1]``.
 
     ``data`` is (counts, edges, background), ``grid`` (voxels, spacing).
     """

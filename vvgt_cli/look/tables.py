@@ -17,24 +17,22 @@ BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_B
 
 
 def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
-    """``tau = -ln(1 - a) / d`` with a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
+    """Return ``tau = -ln(1 - a) / d``, a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
     result: np.ndarray = -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
     return result
 
 
 class Optics(NamedTuple):
-    """Extinction and colour over ``u = (stored - lo) * inv_width`` in [0, n]; values beyond take the end's.
-
-    Kernels take it as it is.
+    """Extinction and colour over ``u = (stored - lo) * inv_width`` in [0, n], constant beyond; passed to kernels.
 
     Attributes:
         lo: stored value at u = 0.
-        inv_width: bins per stored unit (negative where the stored scaling's slope is).
+        inv_width: bins per stored unit (negative if the stored scaling's slope is).
         nodes: (n + 1, 4) float64, tau * (r, g, b) and tau at the bin edges, per unit-frame length.
         cumulative: (n + 1, 4) float64, integral over u of the same (trapezoid: exact for linear tau within a bin).
         dark: (n + 1,) float64, the u up to which extinction is zero from bin i on: [u0, u1] is transparent if and only
             if u1 <= dark[floor(u0)].
-        flat: (n + 1,) float64, the u up to which nodes differ by at most `FLAT` a voxel from bin i on.
+        flat: (n + 1,) float64, the u up to which nodes differ by at most `FLAT` per voxel from bin i on.
     """
 
     lo: float
@@ -46,7 +44,7 @@ class Optics(NamedTuple):
 
     @classmethod
     def of(cls, lo: float, inv_width: float, nodes: np.ndarray, cumulative: np.ndarray, voxel: float = 1.0) -> Optics:
-        """Of everything but what follows from the nodes; ``voxel``: mean edge, unit-frame lengths."""
+        """Return tables with what follows from the nodes; ``voxel``: mean edge, unit-frame lengths."""
         count = len(nodes)
         positive = np.where(nodes[:, 3] > 0, np.arange(count), count + 1)
         dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
@@ -54,25 +52,27 @@ class Optics(NamedTuple):
 
     @classmethod
     def linear(cls, top: float) -> Optics:
-        """Of values from 0 to ``top`` that are extinction themselves, black."""
+        """Return black tables for values from 0 to ``top`` that are extinction themselves."""
         nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top or 1.0]])
         return cls.of(0.0, 1 / (top or 1.0), nodes, np.cumsum(nodes / 2, axis=0))
 
     @property
     def bins(self) -> int:
+        """Return the number n of bins."""
         return len(self.nodes) - 1
 
     def coordinate(self, stored: np.ndarray) -> np.ndarray:
-        """Table coordinate u of stored values, clamped to [0, n]; NaN stays NaN."""
+        """Return the table coordinate u of stored values, clamped to [0, n]; NaN stays NaN."""
         with np.errstate(invalid="ignore", over="ignore"):
             return np.clip((np.asarray(stored, np.float64) - self.lo) * self.inv_width, 0.0, float(self.bins))
 
     def largest_extinction(self) -> float:
+        """Return the largest extinction per unit-frame length."""
         return float(self.nodes[:, 3].max())
 
 
 def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
-    """The last node (n + 1,) float64 up to which, from each one on, no column differs by more than ``most``."""
+    """Return for each node the last one, (n + 1,) float64, up to which no column varies by more than ``most``."""
     count = len(nodes)
     if (np.ptp(nodes, axis=0) <= most).all():
         return np.full(count, count - 1.0)
@@ -109,10 +109,10 @@ def build_tables(
     voxel: float = 1.0,
     bins: int | None = None,
 ) -> Optics:
-    """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant, and `BESIDE`.
+    """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it varies, and `BESIDE`.
 
-    ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length,
-    ``voxel`` a voxel's mean edge in the latter.
+    ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length, ``voxel`` a
+    voxel's mean edge in the latter.
     """
     first, last = tf.node_range()
     lo, hi = max(value_range[0], first), min(value_range[1], last)

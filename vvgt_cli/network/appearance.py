@@ -1,4 +1,4 @@
-"""The 2D appearance transformer (Sec. 4.2.1) and its multi-scale maps (Sec. 4.3.1)."""
+"""2D appearance transformer (Sec. 4.2.1) and its multi-scale maps (Sec. 4.3.1)."""
 
 from __future__ import annotations
 
@@ -13,24 +13,28 @@ POSE = 9  # translation 3, quaternion 4, field of view (h, w) 2
 
 
 class CameraEncoder(nn.Module):
-    """Encoder of Eq. 4: a camera's pose (n, 9) to a token (n, width)."""
+    """Encoder of Eq. 4: camera poses (n, 9) to tokens (n, width)."""
 
     def __init__(self, width: int) -> None:
+        """Create the layers."""
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(POSE, width), nn.GELU(), nn.Linear(width, width))
 
     def forward(self, poses: Tensor) -> Tensor:
+        """Return tokens (n, width) of poses (n, 9)."""
         return self.layers(poses)
 
 
 class PatchEmbed(nn.Module):
-    """Non-overlapping patches to tokens: (n, channels, h, w) -> (n, patches, width)."""
+    """Embedding of non-overlapping patches as tokens."""
 
     def __init__(self, channels: int, width: int) -> None:
+        """Create the convolution."""
         super().__init__()
         self.proj = nn.Conv2d(channels, width, PATCH, stride=PATCH)
 
     def forward(self, images: Tensor) -> Tensor:
+        """Return tokens (n, patches, width) of images (n, channels, h, w)."""
         return self.proj(images).flatten(2).transpose(1, 2)
 
 
@@ -41,6 +45,7 @@ class ImageEncoder(nn.Module):
     """
 
     def __init__(self, config: ImageConfig, channels: int) -> None:
+        """Create the encoder."""
         super().__init__()
         width = config.width
         self.patch_embed = PatchEmbed(channels, width)
@@ -53,7 +58,7 @@ class ImageEncoder(nn.Module):
             nn.init.trunc_normal_(parameter, std=0.02)
 
     def forward(self, images: Tensor, camera: Tensor) -> Tensor:
-        """Images (n, channels, h, w), what Eq. 4 adds to the camera token (n, width) -> tokens (n, t, width)."""
+        """Return tokens (n, t, width) of images (n, channels, h, w); ``camera`` (n, width) as Eq. 4 adds it."""
         count = images.shape[0]
         patches = self.patch_embed(images) + self.pos_embed[:, 1:]  # (n, grid^2, width)
         token = (self.cls_token + self.pos_embed[:, :1]) + camera[:, None]  # (n, 1, width): Eq. 4
@@ -67,11 +72,13 @@ class AlternatingAttention(nn.Module):
     """One layer of VGGT's decoder: attention within each view, then over the tokens of all views."""
 
     def __init__(self, config: ImageConfig) -> None:
+        """Create the two blocks."""
         super().__init__()
         self.frame = Block(config.width, config.heads, qk_norm=True)
         self.whole = Block(config.width, config.heads, qk_norm=True)
 
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+        """Return tokens of the same shape (views, tokens, width)."""
         views, tokens, width = x.shape
         x = self.frame(x, rope)
         flat = x.reshape(1, views * tokens, width)
@@ -82,11 +89,12 @@ class AlternatingAttention(nn.Module):
 class AppearanceTransformer(nn.Module):
     """Images and poses to the tokens of L layers (Sec. 4.2.1).
 
-    No view is told from another but by its image and pose: VGGT marks the first, whose frame its points are in; here
-    the volume's frame is everyone's.
+    Views differ only by image and pose: VGGT marks the first view, whose frame its points are in; here all views share
+    the volume's frame.
     """
 
     def __init__(self, config: ImageConfig, channels: int) -> None:
+        """Create encoder and layers."""
         super().__init__()
         self.taps = config.taps
         self.special = 1 + config.registers
@@ -99,7 +107,7 @@ class AppearanceTransformer(nn.Module):
         self.register_buffer("sin", sin, persistent=False)
 
     def forward(self, images: Tensor, poses: Tensor) -> list[Tensor]:
-        """Images (n, channels, size, size), poses (n, 9) -> L tensors of patch tokens (n, grid^2, width)."""
+        """Return L tensors (n, grid^2, width) of images (n, channels, size, size) and poses (n, 9)."""
         x = self.encoder(images, self.zero(self.camera_encoder(poses)))
         tapped = []
         for number, layer in enumerate(self.layers):
@@ -113,11 +121,13 @@ class ResidualConv(nn.Module):
     """DPT's residual unit (Ranftl et al. 2021): two 3 x 3 convolutions."""
 
     def __init__(self, width: int) -> None:
+        """Create the convolutions."""
         super().__init__()
         self.conv1 = nn.Conv2d(width, width, 3, padding=1)
         self.conv2 = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return maps of the same shape (n, width, h, w)."""
         return x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
 
 
@@ -128,6 +138,7 @@ class MultiScaleMaps(nn.Module):
     """
 
     def __init__(self, config: ImageConfig) -> None:
+        """Create the decoder."""
         super().__init__()
         width, layers = config.map_width, len(config.taps)
         self.grid = config.grid
@@ -140,7 +151,7 @@ class MultiScaleMaps(nn.Module):
         )
 
     def forward(self, tokens: list[Tensor]) -> list[Tensor]:
-        """L x (n, grid^2, width) -> S maps (n, 2^s grid, 2^s grid, L, map_width): channels last, to be sampled."""
+        """Return S maps (n, 2^s grid, 2^s grid, L, map_width), channels last, of L tensors (n, grid^2, width)."""
         scales: list[list[Tensor]] = [[] for _ in range(SCALES)]
         deeper: Tensor | None = None
         for number in reversed(range(len(tokens))):

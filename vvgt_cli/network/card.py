@@ -1,4 +1,4 @@
-"""Model cards: what an exported model is, and whether the files beside the card are the ones it speaks of."""
+"""Model cards: description of an exported model, with the digests of its files."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class ModelCard:
     """A model's card, `card.json` in its folder.
 
     Attributes:
-        name: the folder's.
+        name: of the folder.
         config: of the network, `NetworkConfig.to_dict`.
-        parameters: learned numbers.
-        training: what it was trained on and how; from the checkpoint.
+        parameters: number of learned values.
+        training: data and settings of the training; from the checkpoint.
         commit: of the program that trained it.
         metrics: its measured gain; from the checkpoint.
         opset: of ONNX.
         storage: "float32" or "float16", of the weights; arithmetic is float32.
-        difference: largest deviation of onnxruntime from torch, see `vvgt_cli.network.export.difference`.
+        difference: largest deviation of onnxruntime from torch, from `vvgt_cli.network.export.difference`.
         graphs: by "image" and "geometry": file, bytes, sha256, inputs, outputs.
         version: of the program that exported it.
     """
@@ -54,27 +54,27 @@ class ModelCard:
     version: str = VERSION
 
     def to_json(self) -> str:
-        """The card's text."""
+        """Return the card's text."""
         return json.dumps({"format": FORMAT, "schema": SCHEMA, **asdict(self)}, indent=2, allow_nan=False) + "\n"
 
     @property
     def network(self) -> NetworkConfig:
-        """The configuration, checked."""
+        """Return the checked configuration."""
         return NetworkConfig.from_dict(self.config)
 
 
 def graph_record(path: Path, inputs: list[str], outputs: list[str]) -> dict[str, Any]:
-    """A graph's entry in the card."""
+    """Return a graph's entry in the card."""
     content = path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     return {"file": path.name, "bytes": len(content), "sha256": digest, "inputs": inputs, "outputs": outputs}
 
 
 def find_model(name: str) -> Path:
-    """Folder of a model: a path, or the name of one that comes with the program.
+    """Return the folder of a model: a path, or the name of a shipped one.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no such model.
     """
     places = [MODELS, Path(sysconfig.get_path("data")) / INSTALLED]
     for folder in (Path(name), *(place / name for place in places)):
@@ -88,10 +88,10 @@ def find_model(name: str) -> Path:
 
 
 def read_card(folder: Path) -> ModelCard:
-    """Read a card and check that the graphs beside it are whole.
+    """Read a card and check the graphs beside it.
 
     Raises:
-        DataError: not a card, of another schema, or a graph that is missing or not the one the card speaks of.
+        DataError: not a card, another schema, or a graph that is missing or differs from the card.
     """
     path = folder / CARD
     try:
@@ -120,10 +120,10 @@ def read_card(folder: Path) -> ModelCard:
 
 
 def check_graph(folder: Path, record: dict[str, Any]) -> None:
-    """See that a graph's file is there, whole, and the one that was exported.
+    """Check that a graph's file exists, complete and as exported.
 
     Raises:
-        DataError: it is not.
+        DataError: it does not.
     """
     path = folder / str(record["file"])
     if path.parent != folder or not path.is_file():

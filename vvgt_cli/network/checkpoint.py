@@ -1,4 +1,4 @@
-"""Checkpoints: a network's configuration and weights in one file, loaded without running what is in it."""
+"""Checkpoints: a network's configuration and weights in one file, loaded without running code from it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Checkpoint:
 
     Attributes:
         network: with its weights.
-        training: what it was trained on and how, plain values.
-        metrics: its measured gain, plain values.
+        training: data and settings of the training, plain values.
+        metrics: measured gain, plain values.
         commit: of the program that trained it.
     """
 
@@ -33,7 +33,7 @@ class Checkpoint:
     commit: str = "unknown"
 
     def to_dict(self) -> dict[str, Any]:
-        """What the file holds."""
+        """Return the content of the file."""
         return {
             "format": FORMAT,
             "schema": SCHEMA,
@@ -46,18 +46,18 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint, more: dict[str, Any] | None = None) -> None:
-    """Write a checkpoint to ``path`` as it is given (`vvgt_cli.files.atomic_write` makes it whole or none).
+    """Write a checkpoint to ``path`` (`vvgt_cli.files.atomic_write` makes that atomic).
 
-    ``more`` is for the trainer itself: tensors and plain values.
+    ``more`` is the trainer's own state: tensors and plain values.
     """
     torch.save(checkpoint.to_dict() | (more or {}), path)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint; tensors and plain values only, no pickled code is run.
+    """Read a checkpoint: tensors and plain values only; no pickled code is run.
 
     Raises:
-        DataError: not a checkpoint, of another schema, or weights that do not fit the configuration.
+        DataError: not a checkpoint, another schema, or weights that do not fit the configuration.
     """
     document = read_tensors(path)
     if document.get("format") != FORMAT:
@@ -69,11 +69,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         load_weights(network, document["state"], str(path))
         return Checkpoint(network.eval(), document["training"], document["metrics"], str(document["commit"]))
     except KeyError as error:
-        raise DataError(f"{path}: checkpoint without {error}; it was not written whole") from None
+        raise DataError(f"{path}: checkpoint lacks {error}; it is incomplete") from None
 
 
 def read_tensors(path: str | Path) -> dict[str, Any]:
-    """What a file of torch holds, tensors and plain values only: no code that may be in it is run.
+    """Return the content of a torch file, tensors and plain values only; no code in it is run.
 
     Raises:
         DataError: no such file, not one of torch's, damaged, or not a mapping.

@@ -19,11 +19,11 @@ MOST, DEEPEST = 1 << 16, 1 << 8  # of any number in a configuration; of blocks i
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """The 2D appearance transformer and its maps.
+    """2D appearance transformer and its maps.
 
     Attributes:
         size: pixels along an image's edge, a multiple of `PATCH`.
-        views: the number of views it is made for; more are thinned out to it.
+        views: number of views it is made for; a subset of more is used.
         width, heads: of every token; the width of a head must be a multiple of 4 (RoPE turns pairs along two axes).
         encoder: ViT blocks, each view by itself.
         alternating: pairs of a block within views and a block over all views.
@@ -43,6 +43,7 @@ class ImageConfig:
     registers: int = 4
 
     def __post_init__(self) -> None:
+        """Check the values."""
         object.__setattr__(self, "taps", tuple(self.taps))
         if self.size < PATCH or self.size % PATCH:
             raise DataError(f"image size {self.size}: expected a multiple of the patch, {PATCH}")
@@ -55,24 +56,24 @@ class ImageConfig:
 
     @property
     def grid(self) -> int:
-        """Patches along an image's edge."""
+        """Return the patches along an image's edge."""
         return self.size // PATCH
 
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """The 3D geometry transformer, the epipolar attention and the head.
+    """3D geometry transformer, epipolar attention and head.
 
     Attributes:
-        widths, depths, heads: of the five encoder stages; a stage of depth 0 only embeds, pools and hands on.
+        widths, depths, heads: of the five encoder stages; a stage of depth 0 only embeds and pools.
         decoder_widths, decoder_depths, decoder_heads: of stages 0 to 3 on the way back.
         window: points that attend to each other.
         epipolar_stage: encoder stage after whose blocks the views are read (the paper's "second layer").
         epipolar_width: D of Eq. 7.
         head: "residual" adds to every parameter, "direct" predicts all but the position (Eq. 6), "step" scales and
-            corrects the direction of the gradient in the own frame (needs ``gradients``; not in the paper).
+            corrects the gradient in each Gaussian's own axes (needs ``gradients``; not in the paper).
         reach: largest move of a centre in standard deviations along each own axis.
-        gradients: takes how the image error changes with each parameter as input too (not in the paper).
+        gradients: whether the gradients of the image error are an input too (not in the paper).
     """
 
     widths: tuple[int, ...] = (32, 64, 96, 128, 160)
@@ -89,6 +90,7 @@ class GeometryConfig:
     gradients: bool = False
 
     def __post_init__(self) -> None:
+        """Check the values."""
         for name in ("widths", "depths", "heads", "decoder_widths", "decoder_depths", "decoder_heads"):
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
@@ -109,21 +111,21 @@ class GeometryConfig:
 
     @property
     def inputs(self) -> int:
-        """Numbers that describe a Gaussian to the network."""
+        """Return how many numbers describe a Gaussian to the network."""
         return PARAMETERS + (SLOPES if self.gradients else 0)
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The whole network.
+    """Whole network.
 
     Attributes:
         name: of the size, for model cards.
         image, geometry: the two sides.
-        variant: "full", or an ablation of the paper: "wo_3dt" predicts Gaussians a pixel from the 2D side,
-            "wo_vbm" is the full network started from uniform random samples, "wo_vgf" is the 3D side alone.
-        rendering: images carry eight channels, the target and the present Gaussians' rendering (not in the paper).
-        rounds: times that the network is run, each on its own output and on other views (not in the paper).
+        variant: "full", or an ablation of the paper: "wo_3dt" predicts Gaussians per pixel from the 2D side, "wo_vbm"
+            is the full network started from uniform random samples, "wo_vgf" is the 3D side alone.
+        rendering: whether images have eight channels, target and rendering of the Gaussians (not in the paper).
+        rounds: number of runs, each on the previous output and on other views (not in the paper).
     """
 
     name: str = "small"
@@ -134,6 +136,7 @@ class NetworkConfig:
     rounds: int = 1
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if self.rounds < 1:
             raise DataError(f"rounds {self.rounds}: expected at least 1")
         if self.variant not in VARIANTS:
@@ -141,37 +144,39 @@ class NetworkConfig:
 
     @property
     def channels(self) -> int:
-        """Of an input image: premultiplied RGBA, once or twice."""
+        """Return the channels of an input image: premultiplied RGBA, once or twice."""
         return 8 if self.rendering else 4
 
     @property
     def total_views(self) -> int:
-        """Views that it is made for, all rounds together."""
+        """Return the views it is made for, all rounds together."""
         return self.rounds * self.image.views
 
     @property
     def has_images(self) -> bool:
+        """Return whether the network has the 2D side."""
         return self.variant != "wo_vgf"
 
     @property
     def has_geometry(self) -> bool:
+        """Return whether the network has the 3D side."""
         return self.variant != "wo_3dt"
 
     @property
     def start(self) -> str:
-        """Which Gaussians training starts from, a method of `vvgt_cli.closed_form`."""
+        """Return the method of `vvgt_cli.closed_form` whose Gaussians training starts from."""
         return "uniform" if self.variant == "wo_vbm" else "vbm"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as checkpoints and model cards store them."""
+        """Return plain values, as checkpoints and model cards store them."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """The inverse of `to_dict`.
+        """Return the configuration of the values of `to_dict`.
 
         Raises:
-            DataError: a field that is missing, unknown, or of a value that makes no network.
+            DataError: a missing or unknown field, or an invalid value.
         """
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
@@ -183,7 +188,7 @@ class NetworkConfig:
 
 
 def _exactly(kind: type, values: Any) -> Any:
-    """``kind(**values)`` if ``values`` has its fields and no others: a default must not stand in for a lost value."""
+    """Return ``kind(**values)`` if ``values`` has all its fields and no others: no default replaces a lost value."""
     wanted = {entry.name for entry in fields(kind)}
     if not isinstance(values, dict) or set(values) != wanted:
         given = set(values) if isinstance(values, dict) else set()
@@ -196,7 +201,7 @@ def _exactly(kind: type, values: Any) -> Any:
 
 
 def _alike(value: Any, usual: Any) -> bool:
-    """Whether a value from a file has the type of a usual one, and no number in it is beyond `MOST`."""
+    """Return whether a value has the type of a usual one, and no number in it is beyond `MOST`."""
     if isinstance(usual, tuple):
         return isinstance(value, list | tuple) and all(_alike(entry, 0) for entry in value)
     if isinstance(usual, bool) or not isinstance(usual, int | float):

@@ -1,6 +1,6 @@
-"""Space-filling curves: a cell's place along a Z-order or a Hilbert curve (PTV3, Sec. 4.1).
+"""Space-filling curves: codes of cells along a Z-order or a Hilbert curve (PTV3, Sec. 4.1).
 
-Twins in plain Python stand in the tests.
+The tests have twins in plain Python.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
 
 
 def spread(values: np.ndarray) -> np.ndarray:
-    """Bit i of ``values`` (below 2^21) at bit 3 i."""
+    """Return ``values`` (below 2^21) with bit i moved to bit 3 i."""
     bits = values.astype(np.uint64)
     for shift, mask in _SPREAD:
         bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
@@ -22,13 +22,13 @@ def spread(values: np.ndarray) -> np.ndarray:
 
 
 def interleave(cells: np.ndarray) -> np.ndarray:
-    """Z-order code (n,) int64 of ``cells`` (n, 3) non-negative integers below 2^21, first axis first."""
+    """Return the Z-order codes (n,) int64 of ``cells`` (n, 3) non-negative integers below 2^21, first axis first."""
     result: np.ndarray = spread(cells[:, 0]) << 2 | spread(cells[:, 1]) << 1 | spread(cells[:, 2])
     return result
 
 
 def hilbert(cells: np.ndarray, bits: int) -> np.ndarray:
-    """Hilbert code (n,) int64 of ``cells`` (n, 3) below 2^bits.
+    """Return the Hilbert codes (n,) int64 of ``cells`` (n, 3) below 2^bits.
 
     Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004): undo the turns from the top bit down,
     then Gray-decode.
@@ -50,7 +50,7 @@ def hilbert(cells: np.ndarray, bits: int) -> np.ndarray:
 
 
 def curve_code(cells: np.ndarray, bits: int, curve: str) -> np.ndarray:
-    """Code (n,) int64 of ``cells`` (n, 3) below 2^bits along one of `CURVES`; "-trans" swaps the first two axes."""
+    """Return codes (n,) int64 of ``cells`` (n, 3) below 2^bits along one of `CURVES`; "-trans" swaps two axes."""
     if curve.endswith("-trans"):
         cells = cells[:, (1, 0, 2)]
     return hilbert(cells, bits) if curve.startswith("hilbert") else interleave(cells)

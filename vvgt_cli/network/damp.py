@@ -1,4 +1,4 @@
-"""How much of a predicted step to take: as much as lowers the error of views, by halving."""
+"""Line search by halving: the share of a predicted step that lowers the error of views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SMALLEST = 1 / 16  # share of a step; below it none is taken
 
 
 def interpolate(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
-    """The Gaussians ``share`` of the way; quaternions of norm 1, on the short arc's chord."""
+    """Return the Gaussians ``share`` of the way; quaternions of norm 1, on the short arc's chord."""
     mix = lambda a, b: a + np.float32(share) * (b - a)  # noqa: E731
     fields = {field: mix(array, getattr(end, field)) for field, array in start.arrays().items()}
     fields["quaternions"] /= np.linalg.norm(fields["quaternions"], axis=1, keepdims=True)
@@ -26,10 +26,10 @@ def interpolate(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
 def damped(
     start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA
 ) -> tuple[Gaussians, float]:
-    """The share 1, 1/2, ... of the step from ``start`` to ``end`` up to which halving lowers the error; and that share.
+    """Return the step from ``start`` to ``end`` shortened by halving while that lowers the error, and its share.
 
-    A network that meets a scene of another kind than it was trained on errs by the size of its steps first. The error
-    is the squared one of RGBA over `VIEWS` of the given views, averaged 2 x 2; 0 where no share lowers it.
+    On scenes unlike those it was trained on, a network errs first by the size of its steps. The error is the squared
+    one of RGBA over `VIEWS` of the given views, averaged 2 x 2; the share is 0 if none lowers it.
     """
     from vvgt_cli.splat import render
 

@@ -15,9 +15,10 @@ OUTSIDE = -1e4  # bias of a view that does not see the point: exp of it is 0 in 
 
 
 def project(points: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (m, 3) into views.
+    """Project points (m, 3) into views.
 
     Args:
+        points: world positions.
         matrices: (n, 3, 4), to (u w, v w, w) with u, v in [0, 1] across the image and w the depth.
 
     Returns:
@@ -31,9 +32,10 @@ def project(points: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def corners(uv: Tensor, height: int, width: int) -> list[tuple[Tensor, Tensor]]:
-    """Rows of the four pixels around each point in (n * height * width, ...) maps, and their bilinear weights.
+    """Return row and bilinear weight of the four pixels around each point, for (n * height * width, ...) maps.
 
-    uv (n, m, 2) in [0, 1], pixel centres at integer + 0.5 (clamped to the edge's). Four of (n * m,) int64, (n * m, 1).
+    ``uv`` is (n, m, 2) in [0, 1], pixel centres at integer + 0.5 (clamped to the edge's). The four pairs are
+    (n * m,) int64 and (n * m, 1).
     """
     views = uv.shape[0]
     x = (uv[..., 0] * width - 0.5).clamp(0, width - 1)  # (n, m)
@@ -51,14 +53,15 @@ def corners(uv: Tensor, height: int, width: int) -> list[tuple[Tensor, Tensor]]:
 
 
 class EpipolarCrossAttention(nn.Module):
-    """Eq. 7: each 3D token asks all views, layers and scales at its projections; nearer views count more.
+    """Eq. 7: attention of each 3D token to all views, layers and scales at its projections, weighted by nearness.
 
     Keys and values are projected on the maps, before sampling: a 1 x 1 projection commutes with bilinear
     interpolation, and there are fewer pixels than samples. The softmax runs over one map after another (Milakov and
-    Gimelshein 2018), so that no more than one map's samples exist at a time.
+    Gimelshein 2018), so that the samples of only one map exist at a time.
     """
 
     def __init__(self, width: int, map_width: int, layers: int, inner: int) -> None:
+        """Create the projections."""
         super().__init__()
         self.inner, self.layers = inner, layers
         self.norm = nn.LayerNorm(width)
@@ -69,24 +72,24 @@ class EpipolarCrossAttention(nn.Module):
         self.raw_beta = nn.Parameter(torch.zeros(()))  # beta = softplus of it: a nearer view never counts less
 
     def bias(self, points: Tensor, eyes: Tensor, seen: Tensor) -> Tensor:
-        """b = -beta d (n, m), d in half-diagonals of the unit cube; `OUTSIDE` where a view does not see the point.
+        """Return b = -beta d (n, m), d in half-diagonals of the unit cube; `OUTSIDE` if a view does not see the point.
 
-        points (m, 3), eyes (n, 3), seen (n, m).
+        ``points`` is (m, 3), ``eyes`` (n, 3), ``seen`` (n, m).
         """
         gap = points[None] - eyes[:, None]  # (n, m, 3)
         distance = (gap * gap).sum(dim=-1).sqrt() / 3**0.5
         return torch.where(seen, -functional.softplus(self.raw_beta) * distance, OUTSIDE)
 
     def rows(self, of_scale: Tensor, scale: int, layer: int) -> Tensor:
-        """Keys and values (n * h * w, 2 D) of one layer of the maps (n, h, w, L, c) at one scale."""
+        """Return keys and values (n * h * w, 2 D) of one layer of the maps (n, h, w, L, c) at one scale."""
         number = scale * self.layers + layer
         pixels = of_scale[:, :, :, layer].reshape(-1, of_scale.shape[-1])  # (n * h * w, c)
         return self.key_values[number](self.map_norms[number](pixels))
 
     def forward(self, x: Tensor, points: Tensor, matrices: Tensor, eyes: Tensor, maps: list[Tensor]) -> Tensor:
-        """Tokens x (m, width) at points (m, 3); matrices (n, 3, 4), eyes (n, 3), S maps -> what is added, (m, width).
+        """Return what is added to the tokens, (m, width); 0 for tokens that no view sees.
 
-        A token that no view sees gets a zero.
+        ``x`` (m, width) are tokens at ``points`` (m, 3), ``matrices`` (n, 3, 4), ``eyes`` (n, 3), ``maps`` S maps.
         """
         query = self.query(self.norm(x)) * self.inner**-0.5  # (m, D)
         uv, seen = project(points, matrices)

@@ -1,4 +1,4 @@
-"""Export to ONNX: two graphs and a card, checked against torch before anything is written in its place."""
+"""Export to ONNX: two graphs and a card, compared with torch before an existing model is replaced."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _Images(nn.Module):
 
 
 class _Geometry(nn.Module):
-    """The geometry side with all tensors in one mapping: its order is that of the graph's inputs."""
+    """Geometry side with all tensors in one mapping, in the order of the graph's inputs."""
 
     def __init__(self, side: GeometrySide) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class _Geometry(nn.Module):
 
 
 def random_scene(config: NetworkConfig, count: int, views: int, seed: int = 0) -> Prepared:
-    """Input of the right kind for tracing and comparing; no picture of anything."""
+    """Return random input for tracing and comparing."""
     rng = np.random.default_rng(seed)
     gaussians = Gaussians(
         rng.uniform(-1, 1, (count, 3)), rng.normal(-4, 0.5, (count, 3)), rng.normal(size=(count, 4)),
@@ -76,7 +76,7 @@ def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporter prints its steps and warns of its own internals; errors still come as exceptions."""
+    """Silence the exporter, which prints its steps and warns of its own internals; errors still raise."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -89,7 +89,7 @@ def _quiet() -> Iterator[None]:
 
 
 def trace(network: Vvgt) -> dict[str, Any]:
-    """ONNX models of the graphs by "image" and "geometry", numbers of views, Gaussians and points left open."""
+    """Return ONNX models by "image" and "geometry", with variable numbers of views, Gaussians and points."""
     assert network.geometry is not None
     config = network.config
     # small windows: at least two of them at every stage of so few points
@@ -135,7 +135,7 @@ def _exported(
 
 
 def with_float16_weights(proto: Any) -> Any:
-    """A copy with float32 weights stored as float16, each widened again by a Cast that loading folds away."""
+    """Return a copy with float32 weights stored as float16, each with a Cast that loading folds away."""
     import onnx
 
     proto = copy.deepcopy(proto)
@@ -154,7 +154,7 @@ def with_float16_weights(proto: Any) -> Any:
 
 
 def randomised(network: Vvgt) -> Vvgt:
-    """A copy in which nothing is zero: weights as large as trained ones everywhere."""
+    """Return a copy in which nothing is zero: weights as large as trained ones everywhere."""
     network = copy.deepcopy(network)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -164,10 +164,10 @@ def randomised(network: Vvgt) -> Vvgt:
 
 
 def difference(network: Vvgt, model: Model) -> float:
-    """Largest deviation of onnxruntime from torch, each field by its own largest value, over `CHECKED` scenes.
+    """Return the largest deviation of onnxruntime from torch, relative to each field's largest value.
 
     Raises:
-        DataError: the network returns its input: nothing would be compared.
+        DataError: the network returns its input, so nothing would be compared.
     """
     worst = 0.0
     for seed, (count, views) in enumerate(CHECKED, 1):
@@ -183,7 +183,7 @@ def difference(network: Vvgt, model: Model) -> float:
 
 
 def write_model(folder: Path, protos: Mapping[str, Any], card: ModelCard, storage: str) -> None:
-    """Graphs and card into a folder."""
+    """Write graphs and card into a folder."""
     for name, proto in protos.items():
         path = folder / f"{name}.onnx"
         path.write_bytes((with_float16_weights(proto) if storage == "float16" else proto).SerializeToString())
@@ -193,10 +193,10 @@ def write_model(folder: Path, protos: Mapping[str, Any], card: ModelCard, storag
 
 
 def check_folder(target: Path, overwrite: bool) -> None:
-    """Refuse a place that is taken.
+    """Refuse an existing folder that may not be replaced.
 
     Raises:
-        UsageError: it is, or its parent folder does not exist.
+        UsageError: it exists, or its parent does not.
     """
     if not target.parent.is_dir():
         raise UsageError(f"-o {target}: the folder {target.parent} does not exist; make it first")
@@ -210,7 +210,7 @@ def check_folder(target: Path, overwrite: bool) -> None:
 
 
 def replace_folder(place: Path, target: Path) -> None:
-    """Move a finished folder to its place; what stood there goes once the new one is complete."""
+    """Move a finished folder to its place; an existing one is deleted after that."""
     old = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     if target.exists():
         target.rename(old)
@@ -223,17 +223,17 @@ def export_model(
 ) -> ModelCard:
     """Export a checkpoint to a folder of two ONNX graphs and a card.
 
-    A head that is still zero would make the comparison with torch empty; then a copy with other weights everywhere is
-    exported and compared in its place.
+    The comparison with torch means nothing for a head that is still zero; a copy with random weights is compared
+    instead.
 
     Args:
         checkpoint: file that training wrote.
-        folder: to be made; its name is the model's.
+        folder: to create; its name is the model's.
         storage: of the weights, "float32" or "float16".
-        overwrite: replace a model in that place.
+        overwrite: replace an existing model.
 
     Raises:
-        UsageError: the place is taken.
+        UsageError: the folder exists.
         DataError: not a checkpoint, an ablation without a 3D side, or graphs that differ from torch by more than
             `LIMITS`.
     """

@@ -1,6 +1,6 @@
-"""The 3D geometry transformer (Sec. 4.2.2): Point Transformer V3 (Wu et al. 2024) on Gaussians.
+"""3D geometry transformer (Sec. 4.2.2): Point Transformer V3 (Wu et al. 2024) on Gaussians.
 
-Orders, windows, parents and neighbours come as tables (`vvgt_cli.network.tables`).
+Orders, windows, parents and neighbours are inputs (`vvgt_cli.network.tables`).
 """
 
 from __future__ import annotations
@@ -22,28 +22,31 @@ REACH = 4  # points along the order on either side that stage 0's convolution se
 
 
 class OrderConv(nn.Module):
-    """Positional encoding of stage 0: a depthwise convolution along the Z-order, in which the points come.
+    """Positional encoding of stage 0: a depthwise convolution along the points' Z-order.
 
-    Several Gaussians may share a cell there, so that a grid has no single neighbour to give.
+    Several Gaussians may share a cell there, so that a grid has no unique neighbour.
     """
 
     def __init__(self, width: int) -> None:
+        """Create the convolution."""
         super().__init__()
         self.conv = nn.Conv1d(width, width, 2 * REACH + 1, padding=REACH, groups=width)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return features (n, width) of features (n, width)."""
         return self.conv(x.T[None])[0].T  # (n, width)
 
 
 class NeighbourConv(nn.Module):
-    """Positional encoding of later stages: PTV3's sparse 3 x 3 x 3 convolution, depthwise, by gathers."""
+    """Positional encoding of later stages: PTV3's sparse 3 x 3 x 3 depthwise convolution, by gathers."""
 
     def __init__(self, width: int) -> None:
+        """Create the weights."""
         super().__init__()
         self.weight = nn.Parameter(torch.randn(NEIGHBOURS, width) * NEIGHBOURS**-0.5)
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
-        """x (n, width), neighbours (n, 27) with n where there is none -> (n, width)."""
+        """Return features (n, width) of ``x`` (n, width); ``neighbours`` (n, 27) are n if there is none."""
         padded = torch.cat([x, torch.zeros_like(x[:1])])  # (n + 1, width)
         out = torch.zeros_like(x)
         for first in range(0, NEIGHBOURS, SLICE):  # by slices: (n, 27, width) would be the largest array of all
@@ -57,6 +60,7 @@ class GeometryBlock(nn.Module):
     """PTV3's block: positional encoding, attention within windows of a curve, MLP."""
 
     def __init__(self, width: int, heads: int, stage: int, curve: str) -> None:
+        """Create the layers."""
         super().__init__()
         self.stage, self.curve = stage, curve
         self.encoding: nn.Module = NeighbourConv(width) if stage else OrderConv(width)
@@ -67,7 +71,7 @@ class GeometryBlock(nn.Module):
         self.mlp = Mlp(width)
 
     def forward(self, x: Tensor, tables: Tables) -> Tensor:
-        """x (n, width) -> (n, width)."""
+        """Return features (n, width) of ``x`` (n, width)."""
         near = (tables[f"neighbours_{self.stage}"],) if self.stage else ()
         x = x + self.encoding_out(self.encoding(x, *near))
         members = tables[f"windows_{self.stage}_{self.curve}"]  # (p, w)
@@ -79,15 +83,16 @@ class GeometryBlock(nn.Module):
 
 
 class GridPool(nn.Module):
-    """Grid pooling (Wu et al. 2022): project, then the largest of each cell."""
+    """Grid pooling (Wu et al. 2022): projection, then the maximum of each cell."""
 
     def __init__(self, width: int, out: int) -> None:
+        """Create the layers."""
         super().__init__()
         self.proj = nn.Linear(width, out)
         self.norm = nn.LayerNorm(out)
 
     def forward(self, x: Tensor, parents: Tensor, count: int) -> Tensor:
-        """x (n, width), parents (n,) below count -> (count, out)."""
+        """Return (count, out) features of cells; ``x`` (n, width), ``parents`` (n,) below count."""
         y = self.proj(x)
         start = torch.full((count, y.shape[1]), -1e4, dtype=y.dtype, device=y.device)  # every cell has a point
         index = parents[:, None].expand(-1, y.shape[1])
@@ -95,22 +100,24 @@ class GridPool(nn.Module):
 
 
 class GridUnpool(nn.Module):
-    """The way back: each point takes its parent's projected feature and adds its own projected skip."""
+    """Unpooling: each point adds its own projected skip to its parent's projected feature."""
 
     def __init__(self, coarse: int, skip: int, out: int) -> None:
+        """Create the layers."""
         super().__init__()
         self.proj = nn.Sequential(nn.Linear(coarse, out), nn.LayerNorm(out), nn.GELU())
         self.skip = nn.Sequential(nn.Linear(skip, out), nn.LayerNorm(out), nn.GELU())
 
     def forward(self, x: Tensor, skip: Tensor, parents: Tensor) -> Tensor:
-        """Coarse x (m, coarse), skip (n, skip), parents (n,) -> (n, out)."""
+        """Return (n, out) of coarse ``x`` (m, coarse), ``skip`` (n, skip) and ``parents`` (n,)."""
         return self.proj(x).index_select(0, parents) + self.skip(skip)
 
 
 class GeometryTransformer(nn.Module):
-    """Five encoder stages with pooling between, four decoder stages back (Sec. 4.2.2); VGF in one of them."""
+    """Five encoder stages with pooling between, four decoder stages (Sec. 4.2.2); VGF after one of them."""
 
     def __init__(self, config: GeometryConfig, vgf: EpipolarCrossAttention | None) -> None:
+        """Create the stages."""
         super().__init__()
         self.epipolar_stage = config.epipolar_stage
         self.vgf = vgf
@@ -130,7 +137,7 @@ class GeometryTransformer(nn.Module):
         )
 
     def forward(self, features: Tensor, tables: Tables, views: tuple[Tensor, Tensor, list[Tensor]] | None) -> Tensor:
-        """Features (K, inputs), tables, (matrices, eyes, maps) of the views -> (K, decoder_widths[0])."""
+        """Return (K, decoder_widths[0]) of features (K, inputs); ``views``: matrices, eyes and maps."""
         x = self.embedding(features)
         skips = []
         for i, blocks in enumerate(self.encoder):

@@ -1,4 +1,4 @@
-"""Heads: features to the parameters of Gaussians (Eq. 6), and the ablation that predicts them a pixel."""
+"""Heads: features to the parameters of Gaussians (Eq. 6), and the ablation that predicts them per pixel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TYPICAL_LOG_SCALE = -4.0  # 1/50 of half the longest edge
 
 
 def rotation(quaternions: Tensor) -> Tensor:
-    """(n, 3, 3) of unit quaternions (n, 4), (w, x, y, z)."""
+    """Return matrices (n, 3, 3) of unit quaternions (n, 4), (w, x, y, z)."""
     w, x, y, z = quaternions.unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -26,9 +26,9 @@ def rotation(quaternions: Tensor) -> Tensor:
 
 
 def describe(gaussians: Tensor) -> Tensor:
-    """Input features (K, 14) of Gaussians (K, 14): each of a size near 1.
+    """Return input features (K, 14) of Gaussians (K, 14), each of magnitude near 1.
 
-    The level of the closed form's cell is the mean log-scale but for a constant, which these hold.
+    They include the level of the closed form's cell: the mean log-scale up to a constant.
     """
     mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
     scale = (log_scale - TYPICAL_LOG_SCALE) / 2
@@ -36,13 +36,14 @@ def describe(gaussians: Tensor) -> Tensor:
 
 
 class GaussianHead(nn.Module):
-    """Features (K, width) and the Gaussians they belong to (K, 14) -> Gaussians (K, 14).
+    """Features (K, width) and their Gaussians (K, 14) to Gaussians (K, 14).
 
-    The last layer is zero: a network without training returns its input ("residual"). "direct" is Eq. 6 as printed,
-    an offset of the centre and all else predicted.
+    The last layer is zero: an untrained network returns its input ("residual"). "direct" is Eq. 6 as printed: an offset
+    of the centre, and all else predicted.
     """
 
     def __init__(self, config: GeometryConfig) -> None:
+        """Create the layers."""
         super().__init__()
         width = config.decoder_widths[0]
         self.direct, self.reach = config.head == "direct", config.reach
@@ -51,6 +52,7 @@ class GaussianHead(nn.Module):
         self.last = ZeroLinear(width, PARAMETERS)
 
     def forward(self, x: Tensor, gaussians: Tensor, slopes: Tensor | None = None) -> Tensor:
+        """Return Gaussians (K, 14) of features (K, width) and Gaussians (K, 14)."""
         step = self.last(functional.gelu(self.hidden(self.norm(x)))).split(SPLIT, dim=-1)
         mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
         own = self.reach * log_scale.exp() * torch.tanh(step[0])  # (K, 3) along the Gaussian's axes
@@ -65,16 +67,17 @@ class GaussianHead(nn.Module):
 
 
 class StepHead(nn.Module):
-    """A step in each Gaussian's own frame: a factor for the direction of every gradient, and an addition.
+    """A step in each Gaussian's own axes: a factor for every gradient, and an addition.
 
-    ``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, ``logit + .``, ``colour + .``. Without training every factor is 1:
-    a plain step downhill of `SIZES`, which were chosen by trial (docs/train.md).
+    ``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, ``logit + .``, ``colour + .``. Untrained, every factor is 1: a
+    plain gradient step of `SIZES`, which were chosen by trial (docs/train.md).
     """
 
     SIZES = (0.1,) * 3 + (0.05,) * 6 + (0.06,) + (0.016,) * 3
     LARGEST = (2.0,) * 3 + (1.0,) * 6 + (2.0,) + (0.3,) * 3
 
     def __init__(self, config: GeometryConfig) -> None:
+        """Create the layers."""
         super().__init__()
         width = config.decoder_widths[0]
         self.norm = nn.LayerNorm(width)
@@ -83,7 +86,7 @@ class StepHead(nn.Module):
         nn.init.ones_(self.last.bias[:STEP])
 
     def forward(self, x: Tensor, gaussians: Tensor, slopes: Tensor | None = None) -> Tensor:
-        """Features (K, width), Gaussians (K, 14), slopes (K, SLOPES) -> Gaussians (K, 14)."""
+        """Return Gaussians (K, 14) of features (K, width), Gaussians (K, 14) and slopes (K, SLOPES)."""
         assert slopes is not None
         factor, more = self.last(functional.gelu(self.hidden(self.norm(x)))).chunk(2, dim=-1)  # (K, 13) each
         sizes, largest = x.new_tensor(self.SIZES), x.new_tensor(self.LARGEST)
@@ -96,7 +99,7 @@ class StepHead(nn.Module):
 
 
 def turned_by(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Product (n, 4) of quaternions (n, 4) with (0, vector (n, 3))."""
+    """Return the products (n, 4) of quaternions (n, 4) with (0, vector (n, 3))."""
     w, x, y, z = quaternion.unbind(-1)
     a, b, c = vector.unbind(-1)
     return torch.stack(
@@ -105,12 +108,12 @@ def turned_by(quaternion: Tensor, vector: Tensor) -> Tensor:
 
 
 def gaussian_head(config: GeometryConfig) -> GaussianHead | StepHead:
-    """The head that a configuration names."""
+    """Return the head that a configuration names."""
     return StepHead(config) if config.head == "step" else GaussianHead(config)
 
 
 class PixelHead(nn.Module):
-    """Gaussians a pixel of the finest map (the ablation "w/o 3DT", after AnySplat): one on each pixel's ray.
+    """Gaussians per pixel of the finest map (the ablation "w/o 3DT", after AnySplat): one on each pixel's ray.
 
     Depths run from `CLOSE` to the far side of the unit cube's ball; a scale of 1 covers its pixel.
     """
@@ -118,13 +121,14 @@ class PixelHead(nn.Module):
     CLOSE = 0.01
 
     def __init__(self, map_width: int, layers: int) -> None:
+        """Create the layers."""
         super().__init__()
         self.norm = nn.LayerNorm(layers * map_width)
         self.hidden = nn.Linear(layers * map_width, map_width)
         self.last = nn.Linear(map_width, 12)  # depth 1, log-scale 3, quaternion 4, logit 1, colour 3
 
     def forward(self, finest: Tensor, matrices: Tensor, eyes: Tensor) -> Tensor:
-        """Finest maps (n, h, w, L, c), matrices (n, 3, 4), eyes (n, 3) -> (n * h * w, 14)."""
+        """Return (n * h * w, 14) of finest maps (n, h, w, L, c), matrices (n, 3, 4) and eyes (n, 3)."""
         count, height, width = finest.shape[:3]
         out = self.last(functional.gelu(self.hidden(self.norm(finest.flatten(3)))))  # (n, h, w, 12)
         v, u = torch.meshgrid((torch.arange(height) + 0.5) / height, (torch.arange(width) + 0.5) / width, indexing="ij")

@@ -1,4 +1,4 @@
-"""Layers that both transformers use: attention, MLP, pre-norm block; names as in DINOv2's checkpoints."""
+"""Layers of both transformers: attention, MLP, pre-norm block; names as in DINOv2's checkpoints."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from torch.nn import functional
 
 
 class ZeroLinear(nn.Linear):
-    """A linear layer that starts at zero: what it adds comes in smoothly (Eq. 4's ZeroConv, on one token)."""
+    """A linear layer that starts at zero, so that its output fades in (Eq. 4's ZeroConv, on one token)."""
 
     def reset_parameters(self) -> None:
+        """Set weights and bias to zero."""
         nn.init.zeros_(self.weight)
         if self.bias is not None:
             nn.init.zeros_(self.bias)
 
 
 class LayerScale(nn.Module):
-    """A learned factor a channel (Touvron et al. 2021)."""
+    """A learned factor per channel (Touvron et al. 2021)."""
 
     def __init__(self, width: int, start: float = 0.01) -> None:
+        """Start all factors at ``start``."""
         super().__init__()
         self.gamma = nn.Parameter(torch.full((width,), start))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return x times the factors."""
         return x * self.gamma
 
 
@@ -31,23 +34,25 @@ class Mlp(nn.Module):
     """Two linear layers, four times as wide in between."""
 
     def __init__(self, width: int) -> None:
+        """Create the layers."""
         super().__init__()
         self.fc1 = nn.Linear(width, 4 * width)
         self.fc2 = nn.Linear(4 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return features of the same shape (..., width)."""
         return self.fc2(functional.gelu(self.fc1(x)))
 
 
 def apply_rope(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotary embedding (Su et al. 2021) with tables cos, sin (t, d) of `axial_rope`; x (..., t, d)."""
+    """Apply a rotary embedding (Su et al. 2021) with tables cos, sin (t, d) of `axial_rope` to x (..., t, d)."""
     cos, sin = rope
     first, second = x.chunk(2, dim=-1)  # (..., t, d / 2) each
     return x * cos + torch.cat([-second, first], dim=-1) * sin
 
 
 def axial_rope(grid: int, special: int, width: int, base: float = 100.0) -> tuple[Tensor, Tensor]:
-    """cos and sin (special + grid^2, width) of 2D rotary embedding.
+    """Return cos and sin (special + grid^2, width) of a 2D rotary embedding.
 
     Pairs (i, i + width / 2) turn by the row for the first quarter of i, by the column for the second. Patches count
     from 1, the special tokens stand at (0, 0): VGGT's choice, and its base.
@@ -64,9 +69,10 @@ def axial_rope(grid: int, special: int, width: int, base: float = 100.0) -> tupl
 
 
 class Attention(nn.Module):
-    """Self-attention over the second-last axis; QK-norm (Henry et al. 2020) and RoPE where asked for."""
+    """Self-attention over the second-last axis, with optional QK-norm (Henry et al. 2020) and RoPE."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool = False) -> None:
+        """Create the projections."""
         super().__init__()
         self.heads, self.head_width = heads, width // heads
         self.qkv = nn.Linear(width, 3 * width)
@@ -75,6 +81,7 @@ class Attention(nn.Module):
         self.k_norm = nn.LayerNorm(self.head_width) if qk_norm else nn.Identity()
 
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Return features of the same shape (batch, tokens, width)."""
         batch, tokens, width = x.shape
         qkv = self.qkv(x).reshape(batch, tokens, 3, self.heads, self.head_width).permute(2, 0, 3, 1, 4)
         q, k, v = qkv[0], qkv[1], qkv[2]  # (batch, heads, tokens, head_width)
@@ -89,6 +96,7 @@ class Block(nn.Module):
     """Pre-norm transformer block with LayerScale."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool = False) -> None:
+        """Create the layers."""
         super().__init__()
         self.norm1 = nn.LayerNorm(width, eps=1e-6)  # DINOv2's
         self.attn = Attention(width, heads, qk_norm)
@@ -98,5 +106,6 @@ class Block(nn.Module):
         self.ls2 = LayerScale(width)
 
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Return features of the same shape (batch, tokens, width)."""
         x = x + self.ls1(self.attn(self.norm1(x), rope))
         return x + self.ls2(self.mlp(self.norm2(x)))

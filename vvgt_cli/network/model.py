@@ -1,6 +1,6 @@
 """VVGT: the dual-transformer network (Sec. 4.2, Fig. 2), Gaussians and views in, Gaussians out.
 
-One scene at a time: scenes have different numbers of points, so a batch is a loop.
+It takes one scene at a time: scenes have different numbers of points, so a batch is a loop.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ class ImageSide(nn.Module):
     """First graph: images (n, channels, size, size) and poses (n, 9) -> S maps (n, h, w, L, map_width)."""
 
     def __init__(self, config: NetworkConfig) -> None:
+        """Create transformer and maps."""
         super().__init__()
         self.transformer = AppearanceTransformer(config.image, config.channels)
         self.maps = MultiScaleMaps(config.image)
 
     def forward(self, images: Tensor, poses: Tensor) -> list[Tensor]:
+        """Return the S maps."""
         result: list[Tensor] = self.maps(self.transformer(images, poses))
         return result
 
@@ -31,6 +33,7 @@ class GeometrySide(nn.Module):
     """Second graph: Gaussians (K, 14) with tables and maps -> Gaussians (K, 14)."""
 
     def __init__(self, config: NetworkConfig) -> None:
+        """Create transformer and head."""
         super().__init__()
         image, geometry = config.image, config.geometry
         vgf = None
@@ -47,7 +50,7 @@ class GeometrySide(nn.Module):
         views: tuple[Tensor, Tensor, list[Tensor]] | None = None,
         gradients: Tensor | None = None,
     ) -> Tensor:
-        """Gaussians (K, 14) in canonical order; views: matrices (n, 3, 4), eyes (n, 3), S maps; gradients (K, s)."""
+        """Return Gaussians (K, 14); inputs in canonical order, ``views``: matrices, eyes and S maps."""
         features = describe(gaussians)
         if gradients is not None:
             features = cat([features, gradients], dim=-1)
@@ -55,9 +58,10 @@ class GeometrySide(nn.Module):
 
 
 class Vvgt(nn.Module):
-    """f_theta of Eq. 3, and its ablations (`NetworkConfig.variant`)."""
+    """Network f_theta of Eq. 3, and its ablations (`NetworkConfig.variant`)."""
 
     def __init__(self, config: NetworkConfig) -> None:
+        """Create the sides that the variant has."""
         super().__init__()
         self.config = config
         self.image = ImageSide(config) if config.has_images else None
@@ -65,7 +69,7 @@ class Vvgt(nn.Module):
         self.pixels = None if config.has_geometry else PixelHead(config.image.map_width, len(config.image.taps))
 
     def forward(self, inputs: Tables) -> Tensor:
-        """What `vvgt_cli.network.prepare.prepare` gives, as tensors -> Gaussians (K, 14) in canonical order."""
+        """Return Gaussians (K, 14) in canonical order; ``inputs``: `Prepared.arrays` as tensors."""
         views = None
         if self.image is not None:
             views = inputs["matrices"], inputs["eyes"], self.image(inputs["images"], inputs["poses"])

@@ -1,4 +1,4 @@
-"""From Gaussians, cameras and views to the network's arrays, in numpy: what both torch and onnxruntime are given."""
+"""Input arrays of the network, from Gaussians, cameras and views, in numpy for both torch and onnxruntime."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 
 @dataclass(frozen=True)
 class Prepared:
-    """The network's input.
+    """Input of the network.
 
     Attributes:
         config: of the network.
         views: ``images`` (n, channels, size, size), ``poses`` (n, 9), ``matrices`` (n, 3, 4), ``eyes`` (n, 3);
-            nothing for a network that reads no views.
+            empty for a network that reads no views.
         rows: (K, 14) Gaussians in canonical order.
         gradients: (K, `SLOPES`), None for a network that takes none.
         order: (K,) row of the given Gaussians that each of ``rows`` is.
@@ -40,7 +40,7 @@ class Prepared:
     order: np.ndarray
 
     def part(self, start: int = 0, stop: int | None = None) -> dict[str, np.ndarray]:
-        """What the geometry side is given of rows [start, stop): ``gaussians``, ``gradients`` and the tables."""
+        """Return the input of the geometry side for rows [start, stop): Gaussians, gradients and tables."""
         rows = self.rows[start:stop]
         arrays = {"gaussians": rows, **tables.build(rows[:, :3], self.config.geometry)}
         if self.gradients is not None:
@@ -48,17 +48,17 @@ class Prepared:
         return arrays
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that `Vvgt.forward` is given."""
+        """Return all input of `Vvgt.forward`."""
         return self.views | (self.part() if self.config.has_geometry else {})
 
     def accept(self, rows: np.ndarray, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> Gaussians:
-        """`restore`; of a step as much as lowers the error of the views that were read (`vvgt_cli.network.damp`)."""
+        """Return the output ``rows`` as Gaussians; steps are damped on the views (`vvgt_cli.network.damp`)."""
         if self.config.geometry.head != "step":
             return self.restore(rows)
         return damped(self.restore(self.rows), self.restore(rows), cameras, images, rule)[0]
 
     def restore(self, rows: np.ndarray) -> Gaussians:
-        """The network's output (K, 14) as Gaussians in the order that was given; "wo_3dt" has an order of its own."""
+        """Return the output (K, 14) as Gaussians in the given order; "wo_3dt" has an order of its own."""
         if not self.config.has_geometry:
             return unpack(rows)
         given = np.empty_like(rows)
@@ -67,15 +67,15 @@ class Prepared:
 
 
 def pack(gaussians: Gaussians) -> np.ndarray:
-    """(K, 14) float32; quaternions of norm 1, of q and -q (one rotation) the one with the first non-zero above 0.
+    """Return (K, 14) float32; quaternions of norm 1 with the first non-zero component positive (q and -q are equal).
 
     Raises:
-        DataError: Gaussians with harmonics, of which a network knows nothing.
+        DataError: Gaussians with harmonics, which a network does not support.
     """
     if gaussians.harmonics is not None:
         raise DataError(
-            f"spherical harmonics of degree {gaussians.degree}: a network knows only colours that are the same from "
-            "all sides; expected Gaussians of degree 0 ('vvgt optimize --sh-degree 0' leaves the harmonics out)"
+            f"spherical harmonics of degree {gaussians.degree}: a network supports only colours that do not "
+            "depend on the view; expected Gaussians of degree 0 ('vvgt optimize --sh-degree 0' drops the harmonics)"
         )
     q = gaussians.quaternions.astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -86,19 +86,21 @@ def pack(gaussians: Gaussians) -> np.ndarray:
 
 
 def unpack(rows: np.ndarray) -> Gaussians:
-    """The inverse of `pack`."""
+    """Return the Gaussians of `pack`'s rows."""
     return Gaussians(rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10], rows[:, 11:])
 
 
 def prepare(
     gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig, rule: Rule = INRIA
 ) -> Prepared:
-    """Everything that the network is given for a scene.
+    """Return the input of the network for a scene.
 
     Args:
         gaussians: to be improved, unit frame.
-        cameras, images: views, (n, h, w, 4) float32 premultiplied, of any size.
+        cameras: of the views.
+        images: (n, h, w, 4) float32 premultiplied, of any size.
         config: of the network.
+        rule: by which the views are drawn.
 
     Raises:
         DataError: no Gaussians, Gaussians with harmonics, or no views for a network that needs some.
@@ -121,7 +123,7 @@ def prepare(
 
 
 def view_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
-    """``poses`` (n, 9), ``matrices`` (n, 3, 4) to (u w, v w, w) with u, v in [0, 1], and ``eyes`` (n, 3), float32.
+    """Return ``poses`` (n, 9), ``matrices`` (n, 3, 4) to (u w, v w, w), u and v in [0, 1], ``eyes`` (n, 3), float32.
 
     A pose is world-to-camera: translation in half-diagonals of the unit cube, quaternion with w >= 0, field of view
     (h, w) in radians. It is absolute: relative to the first view the volume's frame would be lost.
@@ -141,7 +143,7 @@ def view_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack (2000), sound for every angle."""
+    """Return (w, x, y, z), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack (2000), stable at any angle."""
     m = rotation
     k = np.array([
         [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
@@ -156,7 +158,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 def image_arrays(
     gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig
 ) -> np.ndarray:
-    """(n, channels, size, size) float32: targets, and where the network takes it the Gaussians' own rendering."""
+    """Return (n, channels, size, size) float32: targets, and for some networks the Gaussians' own rendering."""
     size = config.image.size
     out = np.empty((len(cameras), config.channels, size, size), np.float32)
     for i, camera in enumerate(cameras):
@@ -169,14 +171,14 @@ def image_arrays(
 
 
 def resize(image: np.ndarray, size: int) -> np.ndarray:
-    """(h, w, c) to (c, size, size): each axis by a triangle filter, as wide as the coarser of the two grids."""
+    """Resample (h, w, c) to (c, size, size) by a triangle filter as wide as the coarser of the two grids."""
     rows, columns = filter_matrix(image.shape[0], size), filter_matrix(image.shape[1], size)
     result: np.ndarray = np.einsum("ih,hwc,jw->cij", rows, image, columns, optimize=True)
     return result
 
 
 def filter_matrix(old: int, new: int) -> np.ndarray:
-    """(new, old) float32 weights, each row's sum 1."""
+    """Return (new, old) float32 weights; each row's sum is 1."""
     if old == new:
         return np.eye(new, dtype=np.float32)
     ratio = old / new

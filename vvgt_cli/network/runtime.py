@@ -26,7 +26,7 @@ POINTS = 160_000  # Gaussians of one run of the second graph: the paper's 150,00
 
 
 def views_of_round(views: Sequence[int], number: int, rounds: int) -> list[int]:
-    """The views of round ``number``: every ``rounds``-th, all of them where there are fewer than rounds."""
+    """Return the views of round ``number``: every ``rounds``-th, or all if there are fewer than rounds."""
     return list(views[number::rounds]) if len(views) >= rounds else list(views)
 
 
@@ -35,7 +35,7 @@ class Model:
     """An exported model, ready to run.
 
     Attributes:
-        card: what it is.
+        card: its description.
         sessions: onnxruntime's, by "image" and "geometry".
     """
 
@@ -44,10 +44,10 @@ class Model:
 
     @classmethod
     def open(cls, folder: Path, threads: int = 0, provider: str = "cpu") -> Model:
-        """Load a model; its files, names and axes are checked.
+        """Load a model and check its files, names and axes.
 
         Args:
-            folder: with card and graphs, see `vvgt_cli.network.card.find_model`.
+            folder: with card and graphs, from `vvgt_cli.network.card.find_model`.
             threads: of the CPU provider; 0 for onnxruntime's own choice.
             provider: one of `PROVIDERS`.
 
@@ -78,16 +78,17 @@ class Model:
         progress: ProgressCallback | None = None,
         rule: Rule = INRIA,
     ) -> Gaussians:
-        """The network's Gaussians, in the order of the given.
+        """Return the network's Gaussians, in the given order.
 
-        Views beyond the number that the model is made for are thinned out (`farthest_cameras`); each round reads others
-        of them. More Gaussians than ``points`` go through it in equal parts along the Z-order, each as a scene of its
-        own.
+        Of more views than the model is made for, a subset is read (`farthest_cameras`), another part of it in each
+        round. More Gaussians than ``points`` are divided along the Z-order into equal parts, each treated as a scene of
+        its own.
 
         Args:
-            gaussians: where it starts, unit frame.
-            cameras, images: views, (n, h, w, 4) float32 premultiplied.
-            points: of one part, at most.
+            gaussians: start, unit frame.
+            cameras: of the views.
+            images: (n, h, w, 4) float32 premultiplied.
+            points: largest number in one part.
             progress: called after each part.
             rule: by which the views are drawn.
 
@@ -101,12 +102,12 @@ class Model:
             scene = prepare(gaussians, [cameras[i] for i in shown], images[shown], config, rule)
             rows = self.run_rows(scene, points, progress)
             if not np.isfinite(rows).all():
-                raise DataError(f"model {self.card.name}: its output is not finite; these Gaussians are beyond it")
+                raise DataError(f"model {self.card.name}: its output for these Gaussians is not finite")
             gaussians = scene.accept(rows, [cameras[i] for i in shown], images[shown], rule)
         return gaussians
 
     def run_rows(self, scene: Prepared, points: int = POINTS, progress: ProgressCallback | None = None) -> np.ndarray:
-        """Both graphs on a prepared scene: rows (K, 14) in its order."""
+        """Run both graphs on a prepared scene; return rows (K, 14) in its order."""
         views = dict(scene.views)
         if "image" in self.sessions:
             maps = self._run("image", {name: views.pop(name) for name in ("images", "poses")})
@@ -153,10 +154,10 @@ def _session(path: Path, threads: int, provider: str) -> Any:
 
 
 def _check_names(path: Path, session: Any, record: dict[str, Any], config: NetworkConfig) -> None:
-    """The graph's names are the card's, its inputs are among those that this version makes, its outputs those it reads.
+    """Check that a graph's names match the card, and that this version knows its inputs and outputs.
 
     Raises:
-        DataError: they are not.
+        DataError: they do not.
     """
     image = path.stem == "image"
     made = {*IMAGE_INPUTS} if image else {"gaussians", "gradients", "matrices", "eyes", *MAPS}
@@ -167,7 +168,7 @@ def _check_names(path: Path, session: Any, record: dict[str, Any], config: Netwo
         if has != expected:
             raise DataError(f"{path}: {side} {', '.join(has)}; its card says {', '.join(expected)}: {_AGAIN}")
     if unknown := set(found[0]) - made:
-        raise DataError(f"{path}: wants {', '.join(sorted(unknown))}, which this version does not make: {_AGAIN}")
+        raise DataError(f"{path}: needs {', '.join(sorted(unknown))}, which this version does not provide: {_AGAIN}")
     if found[1] != (MAPS if image else [OUTPUT]):
         raise DataError(
             f"{path}: gives {', '.join(found[1])}; expected {', '.join(MAPS if image else [OUTPUT])}: {_AGAIN}"

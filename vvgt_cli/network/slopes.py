@@ -1,7 +1,7 @@
-"""What a network that predicts a step is told: how the error of the images changes with each Gaussian.
+"""Gradients of the image error by each Gaussian, as input of a network that predicts a step.
 
-Gradients are taken in a Gaussian's own frame, ``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, so that they mean the
-same at any size and in any direction.
+They are taken in a Gaussian's own axes, ``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, so that they mean the same at
+any size and in any direction.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from vvgt_cli.splat.half import halved
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
 
 
-def own_frame(
+def own_axes_gradients(
     quaternions: np.ndarray, axes: np.ndarray, scales: np.ndarray, gradients: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """(K, 13) gradients by a step in the own frame, from those by the fields of `Gaussians`, in their order.
+    """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in their order.
 
     Args:
         quaternions: (K, 4) of norm 1.
@@ -43,13 +43,12 @@ def own_frame(
 
 
 def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
-    """(K, `SLOPES`) float32 of Gaussians with unit quaternions; L is the sum of squared RGBA errors of a view, halved.
+    """Return (K, `SLOPES`) float32 of Gaussians with unit quaternions; L is half a view's sum of squared RGBA errors.
 
-    Columns, g_v the (13,) gradient of view v's L in the own frame, n views:
-
+    Columns, g_v the (13,) gradient of view v's L in the own axes, n views:
     - 13: ``sum g / sqrt(n sum g^2)`` in [-1, 1]: the direction, and how far the views agree on it;
-    - 5, a field each: log of ``sqrt(sum g^2 / n)``, its mean over the field, per pixel of blending weight and error;
-    - log of the blending weight a view (pixels), log of the error below it, over that of the scene;
+    - 5, one per field: log of ``sqrt(sum g^2 / n)``, its mean over the field, per pixel of blending weight and error;
+    - log of the blending weight per view (pixels), log of the error below it, over that of the scene;
     - log of the scene's RMS error; log of a pixel's width at the origin, less that of a standard deviation.
     """
     from vvgt_cli.splat import gather, project, render, render_backward
@@ -67,7 +66,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
         rest = image - view
         slope = render_backward(g, camera, projection, image, 2 * rest)
         fields = slope.means, slope.log_scales, slope.quaternions, slope.opacity_logits, slope.colors
-        own = own_frame(g.quaternions, axes, scales, fields)
+        own = own_axes_gradients(g.quaternions, axes, scales, fields)
         total += own
         squares += own * own
         size = np.sqrt((rest**2).mean(axis=2))  # (h, w) RMS over RGBA

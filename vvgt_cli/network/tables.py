@@ -1,6 +1,6 @@
 """Integer tables of the geometry transformer, in numpy: order, windows, pooling, neighbours (PTV3, Sec. 4).
 
-They depend on where the Gaussians are and on nothing that is learned, so they stay out of the graphs.
+They depend only on the positions of the Gaussians, not on learned values, so they are not part of the graphs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class StagePoints:
 
 
 def block_curves(config: GeometryConfig) -> list[list[str]]:
-    """Curve of each block: nine lists, encoder stages 0 to 4, then decoder stages 3 to 0; block i takes i mod 4."""
+    """Return the curves of blocks, i mod 4 for block i, in nine lists: encoder stages 0 to 4, decoder stages 3 to 0."""
     depths = [*config.depths, *config.decoder_depths[::-1]]
     curves, block = [], 0
     for depth in depths:
@@ -43,21 +43,21 @@ def block_curves(config: GeometryConfig) -> list[list[str]]:
 
 
 def stages_of_blocks() -> list[int]:
-    """Stage of each of the nine groups of blocks."""
+    """Return the stage of each of the nine groups of blocks."""
     return [*range(STAGES), *reversed(range(STAGES - 1))]
 
 
 def quantise(means: np.ndarray) -> np.ndarray:
-    """Cells (n, 3) int64 of the finest grid: 2^16 an axis over the cube around the unit frame and all means."""
+    """Return cells (n, 3) int64 of the finest grid: 2^16 per axis over the cube around the unit frame and all means."""
     bound = max(1.0, float(np.abs(means).max(initial=0)))
     cells = np.floor((means.astype(np.float64) / bound + 1) * (1 << BITS - 1)).astype(np.int64)
     return np.clip(cells, 0, (1 << BITS) - 1)
 
 
 def canonical_order(rows: np.ndarray) -> np.ndarray:
-    """Permutation (K,) that sorts Gaussians along the Z-order curve; ties by all parameters, in full precision.
+    """Return the permutation (K,) that sorts Gaussians along the Z-order; ties by all parameters, in full precision.
 
-    Whatever order the rows come in, they go on in one order (exact duplicates aside, which nothing can tell apart).
+    The result does not depend on the order of the rows (exact duplicates aside).
 
     Args:
         rows: (K, n) float32, mean first.
@@ -77,7 +77,7 @@ def canonical_order(rows: np.ndarray) -> np.ndarray:
 
 
 def pool(stage: StagePoints) -> tuple[StagePoints, np.ndarray]:
-    """The next stage and the parent (n,) of each point: the finest grid that has no more than half the points.
+    """Return the next stage, the finest grid with at most half the points, and the parent (n,) of each point.
 
     PTV3 halves the resolution each time; the cells of the closed form have many sizes, and so may need more.
     """
@@ -101,7 +101,7 @@ def pool(stage: StagePoints) -> tuple[StagePoints, np.ndarray]:
 
 
 def neighbours(stage: StagePoints) -> np.ndarray:
-    """(n, 27) int64: which point is in each of the cells around a point's own; n where none is."""
+    """Return (n, 27) int64: the point in each of the cells around a point's own; n if there is none."""
     count, side = len(stage.cells), 1 << stage.bits
     codes = interleave(stage.cells)  # ascending and distinct
     table = np.full((count, 27), count, np.int64)
@@ -120,10 +120,10 @@ def neighbours(stage: StagePoints) -> np.ndarray:
 
 
 def windows(order: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Windows along an order of n points: members (p, w) int64, and (n,) the slot in them that each point reads.
+    """Return windows along an order of n points: members (p, w) int64, and the slot (n,) that each point reads.
 
-    The last window begins early where n is no multiple of ``size``: its first points attend twice and the slot
-    takes the earlier result. Padding would need a mask.
+    The last window begins early if n is no multiple of ``size``: its first points attend twice and the slot takes the
+    earlier result. Padding would need a mask.
     """
     n = len(order)
     width = min(size, n)
@@ -138,10 +138,11 @@ def windows(order: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
-    """All tables of a scene.
+    """Return all tables of a scene.
 
     Args:
         means: (K, 3) float32, already in `canonical_order`.
+        config: of the geometry side.
 
     Returns:
         By name: ``positions`` (n, 3) float32 of the epipolar stage; ``parents_I`` (n_I,) into stage I + 1;

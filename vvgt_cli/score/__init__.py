@@ -1,1 +1,1 @@
-"""Error against run time: runs read from reports, tables, charts, plots and one page that opens offline."""
+"""Scores of Gaussians, records of runs, and their tables, charts and page."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.files import atomic_write
-from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, Series, cost, front, psnr, short, stage_names
+from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, Series, cost, pareto, psnr, short, stage_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00", "#7a6a00", "#333333")  # o
 INK, SOFT, GRID = "#1c1f23", "#5d656f", "#e3e5e8"
 VARIABLES = {color: f"var(--k{n})" for n, color in enumerate(COLORS)}  # of the page's style sheet
 VARIABLES |= {INK: "var(--ink)", SOFT: "var(--soft)", GRID: "var(--line)"}
-TITLE = "title: "  # begins the name of what a pointer that rests on it is told about
+TITLE = "title: "  # prefix of the ids of elements with a tooltip
 STYLE: dict[Any, Any] = {
     "font.size": 9.5, "xtick.labelsize": 9, "ytick.labelsize": 9, "legend.fontsize": 8.5, "text.parse_math": False,
     "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": SOFT, "xtick.color": SOFT, "ytick.color": SOFT,
@@ -63,7 +63,7 @@ class Chart:
         _, _, text = stream.getvalue().partition("<svg")
         head, _, body = text.partition(">")
         body = re.sub(f'<g id="{TITLE}(.*?)">', r"<g><title>\1</title>", body)
-        body = re.sub(r' id="\w[^"]*_\d+"', "", body)  # which nothing refers to, and other charts have too
+        body = re.sub(r' id="\w[^"]*_\d+"', "", body)  # unused ids, which other charts repeat
         for color, variable in VARIABLES.items():
             body = body.replace(color, variable)
         (box,) = re.findall('viewBox="[^"]*"', head)
@@ -113,11 +113,11 @@ def log_ticks(lo: float, hi: float) -> list[float]:
 
 
 def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float]) -> None:
-    """Draw a mark for each run; what no run beats in seconds is ringed and joined."""
+    """Draw a mark for each run; runs on the Pareto front are ringed and joined."""
     several, used, labels = len(series) > 1, set(), []
     for n, one in enumerate(series):
         runs = [run for run in one.scored() if value(run) > 0]
-        best = front(runs) if value is cost else []
+        best = pareto(runs) if value is cost else []
         color = COLORS[n % 4] if several else INK
         axes.plot(
             [cost(run) for run in best], [float(psnr(run) or 0) for run in best], color=color, alpha=0.6, zorder=1
@@ -135,7 +135,7 @@ def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float])
     if several:
         for kind in sorted({KINDS.index(run["kind"]) for one in series for run in one.scored()}):
             axes.plot([], [], MARKS[kind], color=SOFT, label=KINDS[kind])
-    elif (vtk := series[0].document.get("vtk_psnr")) is not None:  # no file needs to exceed it
+    elif (vtk := series[0].document.get("vtk_psnr")) is not None:  # an upper bound for files
         axes.axhline(vtk, color=SOFT, linewidth=1, linestyle="--", zorder=0, label="VTK")
     axes.margins(0.08)
     ticks = log_ticks(*axes.get_xlim())

@@ -1,4 +1,4 @@
-"""`Views`: cameras and what they see, whole or of blocks of pixels."""
+"""Views to judge by: cameras and their pictures, whole or in blocks of pixels."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
 
-VIEW_BYTES = 2 * 16  # of memory a pixel: float32 RGBA, and as much again while views are stacked
+VIEW_BYTES = 2 * 16  # bytes per pixel: float32 RGBA, twice while views are stacked
 
 
 @dataclass(frozen=True)
 class Views:
-    """Cameras and what they see, (n, h, w, 4) float32 premultiplied; with ``blocks``, only those of each view."""
+    """Cameras and their pictures, (n, h, w, 4) float32 premultiplied; with ``blocks``, only those of each view."""
 
     cameras: list[Camera]
     images: np.ndarray
     blocks: list[Blocks] | None = None
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self.cameras)
 
     def take(self, index: Sequence[int] | np.ndarray) -> Views:
-        """Some of them."""
+        """Return the views at ``index``."""
         blocks = None if self.blocks is None else [self.blocks[i] for i in index]
         return Views([self.cameras[i] for i in index], self.images[list(index)], blocks)
 
     def pictures(self, gaussians: Gaussians, rule: Rule = INRIA) -> Iterator[np.ndarray]:
-        """Gaussians drawn as the views are: whole or their blocks."""
+        """Draw Gaussians in each view, whole or in its blocks."""
         from vvgt_cli.splat import render
 
         for i, camera in enumerate(self.cameras):
@@ -46,10 +47,10 @@ class Views:
             yield image if blocks is None else blocks.pick(image)
 
     def psnr(self, gaussians: Gaussians, rule: Rule = INRIA) -> float:
-        """Mean dB of RGB over black of Gaussians drawn as the views are, of views that show something if any does.
+        """Return the mean PSNR (dB) of RGB over black, of the views that show something, or of all if none does.
 
         Raises:
-            DataError: a picture that is not finite.
+            DataError: a picture is not finite.
         """
         from vvgt_cli.images.metrics import FOREGROUND, psnr
 
@@ -59,18 +60,18 @@ class Views:
         return float(found[seen | ~seen.any()].mean())
 
 
-def judged(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:
-    """Cameras, each with the blocks of its picture that are judged by, None for all of it."""
+def check_blocks(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:
+    """List cameras, each with the blocks of its picture to judge by, None for all of it."""
     return [(camera, spread_blocks(camera.width, camera.height, i, FEW)) for i, camera in enumerate(cameras)]
 
 
-def judging_views(scene: Scene | Viewed, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
-    """Views to judge by, of `FEW` blocks where they have more."""
+def render_check_views(scene: Scene | Viewed, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
+    """Render views to judge by, of `FEW` blocks where they have more."""
     from vvgt_cli.dvr import render_view
 
     images, known = [], []
-    for camera, part in judged(cameras):
-        image = render_view(scene, camera, settings, part)
-        images.append(image if part is None else part.pick(image))
-        known += [] if part is None else [part]
+    for camera, blocks in check_blocks(cameras):
+        image = render_view(scene, camera, settings, blocks)
+        images.append(image if blocks is None else blocks.pick(image))
+        known += [] if blocks is None else [blocks]
     return Views(list(cameras), np.stack(images), known or None)

@@ -1,4 +1,4 @@
-"""Runs as reports hold them: what they cost, which of them nothing beats, and as a table.
+"""Runs of reports: their costs, their Pareto front, and their table.
 
 A run is a plain dict with the fields of a `vvgt-conversion` document (docs/report.md), and ``name`` and ``kind``.
 """
@@ -19,13 +19,13 @@ from vvgt_cli.errors import DataError
 
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
-SCORING = ("test views", "seats", "certificate")  # stages that only measure, or write what has been measured
+SCORING = ("test views", "conditions", "certificate")  # stages that only measure, or write measurements
 KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
-STAGES = {  # colours of the stages that are known, in order
+STAGES = {  # colours of known stages, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
     "judge": "#e3b5cd", "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
-    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8", "certificate": "#c4c4c4",
+    "write": "#777c83", "test views": "#dddddd", "conditions": "#e8e8e8", "certificate": "#c4c4c4",
 }  # fmt: skip
 OTHER = "#a05d3b"
 SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
@@ -33,12 +33,12 @@ SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
 
 @dataclass(frozen=True)
 class Series:
-    """Runs of one report.
+    """The runs of one report.
 
     Attributes:
-        name: of the report, for legends.
-        runs: in its order.
-        document: the whole of it.
+        name: name of the report, for legends.
+        runs: runs in the order of the report.
+        document: the whole report.
     """
 
     name: str
@@ -46,27 +46,27 @@ class Series:
     document: dict[str, Any] = field(default_factory=dict)
 
     def scored(self) -> list[Run]:
-        """Runs that have scores and took time."""
+        """List the runs that have scores and took time."""
         return [run for run in self.runs if psnr(run) is not None and cost(run) > 0]
 
 
 def cost(run: Run) -> float:
-    """Wall seconds to the file: every stage but those that score."""
+    """Return the wall seconds to the file, of all stages except scoring."""
     return float(sum(stage["seconds"] for stage in run["stages"] if stage["name"] not in SCORING))
 
 
 def psnr(run: Run) -> float | None:
-    """PSNR on the test views, whole frame over black, dB; None without."""
+    """Return the PSNR (dB) on the test views, whole frame over black; None without scores."""
     return None if not run.get("scores") else run["scores"]["psnr"]
 
 
-def worst_seat(run: Run) -> float | None:
-    """PSNR where the run looks least like the volume (`vvgt_cli.score.viewing`), dB; None without."""
-    return min((seat["psnr"] for seat in run.get("seats") or ()), default=None)
+def worst_condition(run: Run) -> float | None:
+    """Return the PSNR (dB) under the worst viewing condition (`vvgt_cli.score.viewing`); None without scores."""
+    return min((condition["psnr"] for condition in run.get("conditions") or ()), default=None)
 
 
-def front(runs: Sequence[Run]) -> list[Run]:
-    """Runs that none beats in both time and PSNR, by time (the Pareto front)."""
+def pareto(runs: Sequence[Run]) -> list[Run]:
+    """Return the Pareto front by time: runs that no other beats in both time and PSNR."""
     best, kept = -math.inf, []
     for run in sorted(runs, key=lambda run: (cost(run), -(psnr(run) or 0))):
         found = psnr(run)
@@ -77,8 +77,8 @@ def front(runs: Sequence[Run]) -> list[Run]:
 
 
 def knee(runs: Sequence[Run]) -> Run | None:
-    """Of the front, the run farthest above the line from its first to its last, over the logarithm of seconds."""
-    ends = front(runs)
+    """Return the run farthest above the line from the first to the last of the front, over the logarithm of seconds."""
+    ends = pareto(runs)
     if len(ends) < 3:
         return ends[-1] if ends else None
     x = [math.log(cost(run)) for run in ends]
@@ -89,9 +89,9 @@ def knee(runs: Sequence[Run]) -> Run | None:
 
 
 def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
-    """Medians over runs of what a stage costs a unit of its work; stages without runs are left out.
+    """Return the medians over runs of the seconds of a stage per unit of its work.
 
-    Keys say the unit: a training view, a step of refinement, a megabyte, a run.
+    Keys name the unit: a training view, a step of refinement, a megabyte, a run.
     """
     found: dict[str, list[float]] = {}
 
@@ -114,7 +114,7 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
 
 
 def table(runs: Sequence[Run]) -> str:
-    """CSV, a row a run: name, kind, seconds, Gaussians, bytes, scores, and a column a stage."""
+    """Return CSV with a row per run: name, kind, seconds, Gaussians, bytes, scores, and a column per stage."""
     stages = stage_names(runs)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -125,16 +125,16 @@ def table(runs: Sequence[Run]) -> str:
         "gaussians",
         "bytes",
         *SCORES,
-        "worst_seat",
+        "worst_condition",
         "pareto",
         *(f"seconds: {s}" for s in stages),
     ]
     writer.writerow(heads)
-    best = {id(run) for run in front(runs)}
+    best = {id(run) for run in pareto(runs)}
     for run in runs:
         scores = run.get("scores") or {}
         row = [run["name"], run["kind"], f"{cost(run):.4f}", run["gaussians"], run["bytes"]]
-        numbers = [*(scores.get(key) for key in SCORES), worst_seat(run)]
+        numbers = [*(scores.get(key) for key in SCORES), worst_condition(run)]
         row += ["" if number is None else f"{number:.4f}" for number in numbers]
         seconds = _seconds(run)
         row += [int(id(run) in best), *(f"{seconds[s]:.4f}" if s in seconds else "" for s in stages)]
@@ -143,13 +143,13 @@ def table(runs: Sequence[Run]) -> str:
 
 
 def stage_names(runs: Sequence[Run]) -> list[str]:
-    """Names of the stages of any run: those that are known in their order, then others."""
+    """List the stages of all runs: known ones in their order, then others."""
     found = {stage["name"] for run in runs for stage in run["stages"]}
     return [name for name in STAGES if name in found] + sorted(found - set(STAGES))
 
 
 def _seconds(run: Run) -> dict[str, float]:
-    """Seconds by stage; stages of one name are added."""
+    """Return seconds by stage; stages of one name are added."""
     found: dict[str, float] = {}
     for stage in run["stages"]:
         found[stage["name"]] = found.get(stage["name"], 0.0) + float(stage["seconds"])
@@ -157,10 +157,10 @@ def _seconds(run: Run) -> dict[str, float]:
 
 
 def read_series(path: str) -> Series:
-    """Runs of a `report.json`, or the one run of a `--report` of convert.
+    """Read the runs of a `report.json`, or the one run of a `--report` of convert.
 
     Raises:
-        DataError: neither, or one without runs that have scores.
+        DataError: the file is neither, or has no runs with scores.
     """
     try:
         document = json.loads(Path(path).read_text("utf-8"))
@@ -181,7 +181,7 @@ def read_series(path: str) -> Series:
 
 
 def _check(run: Run) -> None:
-    """Raise where what tables and charts read of a run is missing or of another type."""
+    """Raise ValueError or TypeError where a field of a run that tables and charts use is invalid."""
     if run["kind"] not in KINDS:
         raise ValueError(f"a run of kind {run['kind']!r}")
     if not (isinstance(run["name"], str) and isinstance(run["gaussians"], int) and isinstance(run["bytes"], int)):
@@ -197,13 +197,13 @@ def _named(document: dict[str, Any]) -> Run:
 
 
 def _title(path: str, document: dict[str, Any]) -> str:
-    """The file's name; that of its folder for a report.json, which are all called so."""
+    """Return the name of a file, or of the folder of a report.json."""
     own = Path(path)
     return own.resolve().parent.name if own.name == "report.json" else own.stem
 
 
 def short(number: float) -> str:
-    """1536 -> 1.5k, 100000 -> 100k, 2500000 -> 2.5M."""
+    """Abbreviate a number: 1536 to 1.54k, 100000 to 100k, 2500000 to 2.5M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if number >= size:
             return f"{number / size:.3g}{suffix}"

@@ -1,4 +1,4 @@
-"""One HTML page that needs nothing else: charts, bars, a table, and pictures to compare."""
+"""A self-contained HTML page of reports: charts, a table, and pictures to compare."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from html import escape
 from typing import Any
 
 from vvgt_cli.score.charts import Chart
-from vvgt_cli.score.curves import Run, Series, cost, front, knee, psnr, short, worst_seat
+from vvgt_cli.score.curves import Run, Series, cost, knee, pareto, psnr, short, worst_condition
 from vvgt_cli.score.style import CSS, SCRIPT
 
-GAIN = 8  # of the difference at first
+GAIN = 8  # initial gain of the difference
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the page compares: PNG files as bytes.
+    """The pictures that the page compares, PNG files as bytes.
 
     Attributes:
-        views: their numbers among the test views.
-        reference: a file a view.
-        ours: of each run, a file a view.
+        views: numbers of the test views.
+        reference: one file per view.
+        ours: for each run, one file per view.
     """
 
     views: list[int]
@@ -35,9 +35,9 @@ def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures
 
     Args:
         series: the reports.
-        charts: of their runs.
+        charts: charts of their runs.
         title: the heading.
-        pictures: to compare, of the runs of one report.
+        pictures: pictures to compare, for one report.
     """
     notes = dict.fromkeys([chart.title for chart in charts], "") | {charts[0].title: FRONT_NOTE}
     drawn = [f"<section><h2>{one.title}</h2>{one.svg()}{notes[one.title]}</section>" for one in charts]
@@ -54,8 +54,8 @@ def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures
 
 
 FRONT_NOTE = (
-    "<p><small>Ringed and joined: no run is both faster and nearer. Seconds are those to the file: reading, views, "
-    "every stage, writing; not the scoring. PSNR: ten test views, whole frame over black.</small></p>"
+    "<p><small>Ringed and joined: no run is both faster and more accurate. Seconds to the file: reading, views, "
+    "every stage, writing; without scoring. PSNR: ten test views, whole frame over black.</small></p>"
 )
 
 
@@ -73,7 +73,7 @@ def _head(series: Sequence[Series], title: str) -> str:
 
 
 def _facts(series: Sequence[Series]) -> str:
-    """Return the best run of each report; of one report alone also the quickest and the knee."""
+    """Return the best run of each report; for a single report also the quickest and the knee."""
     chosen = [("nearest", max(one.scored(), key=lambda run: psnr(run) or 0)) for one in series]
     if len(series) == 1:
         runs = series[0].scored()
@@ -95,7 +95,7 @@ def _unit_costs(series: Sequence[Series]) -> str:
             rows.append(f"<tr><td>{escape(own + key)}</td><td>{text}</td></tr>")
     if not rows:
         return ""
-    return f"<section><h2>What a stage costs</h2><table>{''.join(rows)}</table><p><small>Medians.</small></p></section>"
+    return f"<section><h2>Costs of stages</h2><table>{''.join(rows)}</table><p><small>Medians.</small></p></section>"
 
 
 def _uri(png: bytes) -> str:
@@ -116,7 +116,7 @@ def _compare(runs: Sequence[Run], pictures: Pictures) -> str:
             for run, own in zip(runs, pictures.ours, strict=True)
         ],
     }
-    held = json.dumps(data).replace("<", "\\u003c")  # no name ends the script
+    held = json.dumps(data).replace("<", "\\u003c")  # so that no name ends the script
     chosen = runs.index(max(runs, key=lambda run: psnr(run) or 0))
     options = "".join(
         f'<option value="{n}"{" selected" if n == chosen else ""}>{escape(run["name"])} ({psnr(run):.1f} dB)</option>'
@@ -148,15 +148,15 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def _table(series: Sequence[Series]) -> str:
-    heads = ("run", "seconds", "PSNR", "foreground", "worst seat", "SSIM", "FLIP", "Gaussians", "MB")
+    heads = ("run", "seconds", "PSNR", "foreground", "worst condition", "SSIM", "FLIP", "Gaussians", "MB")
     rows = []
     for one in series:
-        best = {id(run) for run in front(one.scored())}
+        best = {id(run) for run in pareto(one.scored())}
         for run in one.runs:
             scores = run.get("scores") or {}
             cells = [
                 f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
-                _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
+                _cell(worst_condition(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
                 f"{run['gaussians']:,}",
                 f"{run['bytes'] / 1e6:.2f}",
             ]  # fmt: skip
@@ -165,8 +165,8 @@ def _table(series: Sequence[Series]) -> str:
     head = "".join(f"<th>{name}</th>" for name in heads)
     return (
         f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-        "<p><small>Bold: nothing is both faster and nearer. Worst seat: the lowest PSNR of every rule of drawing, "
-        "at the size made for and on the next larger screen, in one view.</small></p></section>"
+        "<p><small>Bold: nothing is both faster and more accurate. Worst condition: the lowest PSNR of all rules, "
+        "at the target size and on the next larger screen, in one view.</small></p></section>"
     )
 
 

@@ -1,4 +1,4 @@
-"""The record of a run: what was asked, what came of it, and on which machine (docs/report.md)."""
+"""The record of a run: its options, results and machine (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SCHEMA = 1  # of the JSON documents; raised when a field changes its meaning
 
 @dataclass
 class StageRecord:
-    """One stage of a run.
+    """The record of one stage of a run.
 
     Attributes:
-        name: what was done.
+        name: name of the stage.
         seconds: wall time.
-        psnr: dB on the check views after it, None where none was rendered; ``psnr_before`` before it, where measured.
-        kept: False where the stage did not lower the error and was dropped.
-        note: what else there is to say, one line.
+        psnr, psnr_before: dB on the check views after and before it, None where not measured.
+        kept: False where the result was dropped because the error was not lower.
+        note: further details, one line.
     """
 
     name: str
@@ -39,7 +39,7 @@ class StageRecord:
     psnr_before: float | None = None
 
     def detail(self) -> str:
-        """The stage's result as the console shows it."""
+        """Return the result of the stage as a message."""
         parts = [self.note] if self.note else []
         if self.psnr is not None:
             parts.append(f"check views {self.psnr:.2f} dB")
@@ -50,20 +50,20 @@ class StageRecord:
 
 @dataclass
 class ConversionReport:
-    """What `vvgt convert`, `vvgt init` and `vvgt optimize` did; `to_json` is the `--report` file.
+    """The report of `vvgt convert`, `vvgt init` or `vvgt optimize`; `to_json` is the `--report` file.
 
     Attributes:
         command: "convert", "init" or "optimize".
-        volume, transfer_function, options: what went in, plain values.
-        stages: in the order they ran.
-        gaussians, bytes: of the file written.
-        scores: on the test views, None for `init`.
-        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.score.viewing`), worst first.
-        texture: of `convert`, on smooth areas of its `glance_cameras`.
-        plan: estimates of `convert` (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
-        left_out: (stage, why) of what was not done.
-        refinement: what gradient descent did (`vvgt_cli.refine.OptimizeRecord`), None without it.
-        seconds: wall time of the whole run, without the interpreter's start.
+        volume, transfer_function, options: inputs, plain values.
+        stages: stages in the order they ran.
+        gaussians, bytes: counts of the written file.
+        scores: scores on the test views, None for `init`.
+        conditions: `convert`'s scores under each viewing condition (`vvgt_cli.score.viewing`), worst first.
+        texture: `convert`'s texture on smooth areas in its `texture_cameras`.
+        plan: `convert`'s plan (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
+        skipped: (stage, reason) of skipped stages.
+        refinement: record of gradient descent (`vvgt_cli.refine.OptimizeRecord`), None without it.
+        seconds: wall time of the whole run, without the start of the interpreter.
     """
 
     command: str
@@ -74,31 +74,31 @@ class ConversionReport:
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
-    seats: list[dict[str, Any]] | None = None
+    conditions: list[dict[str, Any]] | None = None
     texture: dict[str, Any] | None = None
     refinement: dict[str, Any] | None = None
     plan: dict[str, Any] | None = None
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
     seconds: float = 0.0
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C ended gradient descent early."""
+        """Return whether Ctrl-C ended gradient descent early."""
         return self.refinement is not None and self.refinement["reason"] == "interrupted"
 
     def to_json(self) -> str:
-        """JSON with the machine and the versions beside the numbers; see docs/report.md."""
+        """Return the report, machine and versions as JSON; see docs/report.md."""
         return document("vvgt-conversion", asdict(self))
 
 
 def document(kind: str, body: dict[str, Any]) -> str:
-    """A JSON document of this program: kind, schema, body, machine, versions; values not finite become null."""
+    """Return a JSON document of kind, schema, body, machine and versions; values that are not finite become null."""
     whole = {"format": kind, "schema": SCHEMA, **body, "machine": machine(), "versions": versions()}
     return json.dumps(plain(whole), indent=2, allow_nan=False) + "\n"
 
 
 def plain(value: Any) -> Any:
-    """``value`` with dataclasses, tuples and numpy numbers made JSON's own; floats not finite become None."""
+    """Convert dataclasses, tuples and numpy numbers to JSON types; floats that are not finite become None."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, dict):
@@ -121,7 +121,7 @@ def _cpu() -> str:
 
 
 def peak_memory() -> int | None:
-    """Largest resident size of this process so far in bytes, None where the system does not tell."""
+    """Return the peak resident size of this process in bytes, None where the system does not report it."""
     try:
         import resource
     except ImportError:
@@ -131,7 +131,7 @@ def peak_memory() -> int | None:
 
 
 def machine() -> dict[str, Any]:
-    """What times depend on: CPU, threads, load. No host name."""
+    """Return what times depend on: CPU, threads, load; never the host name."""
     threads = os.environ.get("NUMBA_NUM_THREADS")
     if "numba" in sys.modules:
         import numba
@@ -149,7 +149,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of this program and of what its numbers depend on; only what has been imported."""
+    """Return the versions of this program and of imported libraries that its numbers depend on."""
     found = {"vvgt": VERSION, "python": platform.python_version()}
     for name in ("numpy", "numba", "vtkmodules"):
         module = sys.modules.get(name)
@@ -161,7 +161,7 @@ def versions() -> dict[str, str]:
 
 @dataclass
 class Run:
-    """Times stages, tells the console, and keeps the report."""
+    """A run, which times stages, prints messages and fills the report."""
 
     console: Console
     report: ConversionReport
@@ -169,7 +169,7 @@ class Run:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[StageRecord]:
-        """Time a block; the block sets psnr, kept and note of the stage that it is given."""
+        """Time a block as a stage; the block sets psnr, kept and note of the yielded record."""
         stage = StageRecord(name)
         begin = time.perf_counter()
         yield stage
@@ -178,11 +178,11 @@ class Run:
         self.console.stage(name, stage.seconds, stage.detail())
 
     def compile(self, kernels: Collection[str], volume: str | None = None) -> None:
-        """Have kernels compiled whose code does not lie on disk: a stage of a first run, nothing in later ones.
+        """Compile kernels that are not cached on disk: a stage of a first run, nothing in later ones.
 
         Args:
-            kernels: of `vvgt_cli.jit.ahead`.
-            volume: type of the volume's values, where kernels read any.
+            kernels: kernels of `vvgt_cli.jit.ahead`.
+            volume: type of the volume's values, where kernels read them.
         """
         from vvgt_cli.jit.compile import VOLUMES, compile_in_subprocess, missing, usual_jobs
 
@@ -193,15 +193,15 @@ class Run:
                 stage.note = f"{len(todo)} kernels, on a first run (vvgt warmup does it beforehand)"
 
     def elapsed(self) -> float:
-        """Wall seconds since the run began."""
+        """Return the wall seconds since the run began."""
         return time.perf_counter() - self.start
 
-    def leave_out(self, stage: str, why: str) -> None:
-        """Say and record that a stage is not done."""
-        self.report.left_out.append((stage, why))
-        self.console.say(f"left out: {stage} ({why})")
+    def skip(self, stage: str, why: str) -> None:
+        """Report that a stage is skipped, and why."""
+        self.report.skipped.append((stage, why))
+        self.console.message(f"skipped: {stage} ({why})")
 
     def finish(self) -> ConversionReport:
-        """Close the report with the whole run's time."""
+        """Set the time of the whole run, and return the report."""
         self.report.seconds = self.elapsed()
         return self.report

@@ -1,4 +1,4 @@
-"""Style sheet and script of the page: no font, no library, nothing fetched."""
+"""Style sheet and script of the page, without fonts, libraries or requests."""
 
 CSS = """
 :root{color-scheme:light dark;--paper:#fbfbfa;--card:#fff;--ink:#1c1f23;--soft:#5d656f;--line:#e3e5e8;

@@ -1,4 +1,4 @@
-"""Where a file is looked at: every rule of `vvgt_cli.gaussians.rules`, several sizes, from afar and close up."""
+"""Viewing conditions: every rule of `vvgt_cli.gaussians.rules`, several sizes, from afar and close up."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Texture
 
 SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
-CLOSE = 10.0  # degrees: a quarter of the default views' field
-NEAR = 14.0  # degrees, of the pictures in which texture is measured: faces fill them, and cells are some pixels wide
+CLOSE = 10.0  # degrees: a quarter of the default field of view
+NEAR = 14.0  # degrees, for texture: faces fill the picture, and cells are some pixels wide
 VIEWS = (0, 4, 9)  # test views: above, side, below
-SIDE = (4,)  # enough to find the worst seat
-PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a report: above, side, below
+SIDE = (4,)  # one view is enough to find the worst condition
+PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of scores without a report: above, side, below
 
 
 @dataclass(frozen=True)
 class ViewingCondition:
-    """One place to look from.
+    """A drawing rule, a size and a field of view, with the PSNR measured there.
 
     Attributes:
-        rule: by which the splats are drawn.
+        rule: drawing rule of the splats.
         size: pixels along the picture's edge.
         field_of_view: degrees.
-        psnr: dB, over black, mean of the views.
+        psnr: mean dB of the views, over black.
     """
 
     rule: str
@@ -45,34 +45,34 @@ class ViewingCondition:
     psnr: float
 
     def name(self) -> str:
-        """As tables and messages have it."""
+        """Return the name in tables and messages."""
         return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
 
 
 def viewing_conditions(size: int) -> list[tuple[int, float]]:
-    """(size, field of view) from which a file made for ``size`` px is scored."""
+    """List the (size, field of view) at which a file made for ``size`` px is scored."""
     return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
 
 
-def from_above(size: int) -> list[tuple[int, float]]:
-    """The size made for, and the next larger screen."""
+def screens(size: int) -> list[tuple[int, float]]:
+    """List (size, field of view) of the target size and of the next larger screen."""
     return [(size, FIELD_OF_VIEW), (2160 if size < 2160 else 2 * size, FIELD_OF_VIEW)]
 
 
 def zoomed(camera: Camera, field_of_view: float) -> Camera:
-    """The same place with another field of view, degrees; square pixels."""
+    """Return a camera at the same place with another field of view in degrees and square pixels."""
     focal = camera.height / 2 / float(np.tan(np.radians(field_of_view) / 2))
     return replace(camera, fx=focal, fy=focal)
 
 
 @dataclass(frozen=True)
 class ConditionView:
-    """What is to be seen from a seat in one view.
+    """The reference of a viewing condition in one view.
 
     Attributes:
-        size, field_of_view: of the seat, pixels and degrees.
-        camera: of the view; ``blocks`` of it that are scored, None for all.
-        reference: (h, w, 3) float32 of the blocks, or of the whole.
+        size, field_of_view: pixels and degrees of the condition.
+        camera, blocks: camera of the view, and its blocks that are scored, None for all.
+        reference: (h, w, 3) float32 picture of the blocks, or of the whole.
     """
 
     size: int
@@ -82,10 +82,10 @@ class ConditionView:
     reference: np.ndarray
 
 
-def seat_pictures(
+def condition_pictures(
     places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
 ) -> list[tuple[tuple[int, float], Camera, Blocks | None]]:
-    """Every place with the camera of each view from there, and the blocks of its picture that are scored."""
+    """List every place with the camera of each view, and the blocks of its picture that are scored."""
     found = []
     for size, field_of_view in places:
         cameras = default_views("test", size=size)
@@ -104,19 +104,19 @@ def condition_views(
     enough: int = ENOUGH,
     progress: ProgressCallback | None = None,
 ) -> Iterator[ConditionView]:
-    """References of every place, one at a time.
+    """Render the references of every place, one at a time.
 
     Args:
-        scene: what is looked at.
+        scene: the volume.
         places: (size in pixels, field of view in degrees).
-        settings: of the reference; the renderer's default without.
+        settings: settings of the reference; the renderer's default without.
         views: numbers of the test views.
-        enough: blocks of a view, about.
+        enough: approximate number of blocks per view.
         progress: called after each view of a place.
     """
     from vvgt_cli.dvr import render_view
 
-    wanted = seat_pictures(places, views, enough)
+    wanted = condition_pictures(places, views, enough)
     for done, (place, camera, blocks) in enumerate(wanted, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
         yield ConditionView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
@@ -133,15 +133,16 @@ def score_texture(
     progress: ProgressCallback | None = None,
     cameras: Sequence[Camera] | None = None,
 ) -> Texture:
-    """Texture on smooth areas, in the `VIEWS` seen from near (`NEAR`), whole, or by other ``cameras``.
+    """Measure texture on smooth areas, by ``cameras``.
 
     Args:
-        scene, gaussians: what is compared.
+        scene: the volume.
+        gaussians: Gaussians to compare with it.
         size: pixels along a picture's edge.
-        rule: by which Gaussians are drawn.
-        settings: of the reference; the renderer's default without.
+        rule: drawing rule of the Gaussians.
+        settings: settings of the reference; the renderer's default without.
         progress: called after each view.
-        cameras: `near_cameras` without.
+        cameras: cameras; None: `near_cameras`.
     """
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images.metrics import texture
@@ -158,13 +159,13 @@ def score_texture(
 
 
 def near_cameras(size: int) -> list[Camera]:
-    """Those of `score_texture`."""
+    """Return the default cameras of `score_texture`: the `VIEWS`, close up (`NEAR`)."""
     cameras = default_views("test", size=size)
     return [zoomed(cameras[i], NEAR) for i in VIEWS]
 
 
-def glance_cameras(size: int) -> list[Camera]:
-    """What a conversion measures texture in: the middle half of each edge of the near view from the side."""
+def texture_cameras(size: int) -> list[Camera]:
+    """Return the cameras of a conversion's texture: the middle half of the close view from the side."""
     found = []
     for i in SIDE:
         whole = zoomed(default_views("test", size=size)[i], NEAR)
@@ -175,7 +176,7 @@ def glance_cameras(size: int) -> list[Camera]:
 
 
 def texture_note(found: Texture) -> str:
-    """Texture as messages have it."""
+    """Return texture as a message."""
     if found.ours is None:
         return "nothing in it is opaque and smooth"
     return (
@@ -187,12 +188,12 @@ def texture_note(found: Texture) -> str:
 def score_conditions(
     gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES)
 ) -> list[ViewingCondition]:
-    """Every rule at every place, on blocks of the test views; worst first.
+    """Score every rule at every place, on blocks of the test views; worst first.
 
     Args:
-        gaussians: that are drawn.
-        seen: of `condition_views`.
-        rules: names.
+        gaussians: Gaussians to draw.
+        seen: references of `condition_views`.
+        rules: names of drawing rules.
     """
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render

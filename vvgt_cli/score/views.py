@@ -1,4 +1,4 @@
-"""Gaussians against the volume on the test views: one view in memory at a time."""
+"""Scores of Gaussians against the volume on the test views, with one view in memory at a time."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.images.metrics import Scores, ViewScore
 
-WHOLE = (0, 4, 9)  # test views of which large ones are drawn whole, for what blocks cannot tell
+WHOLE = (0, 4, 9)  # test views drawn whole, for measures that blocks do not suffice for
 
 
-def scored(size: int, perceptual: bool, only: Collection[int] | None = None) -> list[tuple[int, Camera, Blocks | None]]:
-    """Number and camera of each test view that is scored, with the blocks of it that are drawn, None for all of it."""
+def scored_views(
+    size: int, perceptual: bool, only: Collection[int] | None = None
+) -> list[tuple[int, Camera, Blocks | None]]:
+    """List number and camera of each scored test view, and the blocks of it that are drawn, None for all of it."""
     cameras = default_views("test", size=size)
     found = []
     for i in sorted(range(len(cameras)) if only is None else only):
@@ -43,14 +45,15 @@ def score_test_views(
     only: Collection[int] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Scores:
-    """Scores on the test views at ``size`` px (docs/conventions.md, "Units of a report").
+    """Score Gaussians on the test views at ``size`` px (docs/conventions.md, "Units of a report").
 
     Args:
-        scene, gaussians: what is compared.
+        scene: the volume.
+        gaussians: Gaussians to compare with it.
         size: pixels along an image's edge.
-        settings: of the reference.
-        rule: by which Gaussians are drawn.
-        perceptual: SSIM and FLIP too, of the whole of `WHOLE` views; all else of blocks where views are large.
+        settings: settings of the reference.
+        rule: drawing rule of the Gaussians.
+        perceptual: SSIM and FLIP too, of whole pictures of the `WHOLE` views; other scores use blocks of large views.
         only: numbers of the views to score; None for all ten.
         progress: called after each view.
     """
@@ -58,25 +61,26 @@ def score_test_views(
     from vvgt_cli.images.metrics import mean_scores
     from vvgt_cli.splat import render
 
-    views, wanted = [], scored(size, perceptual, only)
-    for done, (i, camera, part) in enumerate(wanted):
-        reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
+    views, wanted = [], scored_views(size, perceptual, only)
+    for done, (i, camera, drawn) in enumerate(wanted):
+        reference, ours = render_view(scene, camera, settings, drawn), render(gaussians, camera, rule, blocks=drawn)
         blocks = spread_blocks(camera.width, camera.height, i)
-        views.append(score_seen(reference, ours, blocks, part is None, perceptual))
+        views.append(score_drawn_view(reference, ours, blocks, drawn is None, perceptual))
         if progress:
             progress(done + 1, len(wanted))
     return mean_scores(views)
 
 
-def score_seen(
+def score_drawn_view(
     reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True, perceptual: bool = True
 ) -> ViewScore:
-    """One view: errors of its blocks, where it has such; SSIM and FLIP of the whole, where it was drawn.
+    """Score one view: errors of its blocks, if any; SSIM and FLIP of the whole, where it was drawn.
 
     Args:
-        reference, ours: (h, w, 4) float32 premultiplied.
-        blocks: of the view, or None for all of it.
-        whole: whether more than the blocks was drawn.
+        reference: (h, w, 4) float32 premultiplied picture of the volume.
+        ours: the same of the Gaussians.
+        blocks: blocks of the view, or None for all of it.
+        whole: whether the whole view was drawn.
         perceptual: SSIM and FLIP too.
     """
     from vvgt_cli.images.metrics import score_view
@@ -91,6 +95,6 @@ def score_seen(
 
 
 def psnr_note(scores: Scores) -> str:
-    """PSNR as stages print it."""
+    """Return PSNR as a message."""
     foreground = scores.psnr_foreground
     return f"PSNR {scores.psnr:.2f} dB" + ("" if foreground is None else f" (foreground {foreground:.2f} dB)")

@@ -148,7 +148,7 @@ def chunks_of(volume: Volume) -> tuple[int, ...]:
 
 def is_file_backed(volume: Volume) -> bool:
     """Tell whether a volume's values lie in a file, mapped or `Stored`."""
-    return isinstance(volume.data, Stored) or _map_under(volume.data) is not None
+    return isinstance(volume.data, Stored) or _mapping_of(volume.data) is not None
 
 
 def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
@@ -175,21 +175,21 @@ def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
     Pages of a mapped file that it came from are given back to the system.
     """
     (x0, y0, z0), (z1, y1, x1) = lo, np.asarray(lo)[::-1] + out.shape
-    under = _map_under(data)
-    if under is None or not hasattr(mmap, "MADV_DONTNEED"):
+    mapped = _mapping_of(data)
+    if mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
         out[...] = data[z0:z1][:, y0:y1, x0:x1]  # bricks are laid out slab by slab
         return
     slab = max(MAPPED // max(out[0].nbytes, 1), 1)
     for z in range(0, len(out), slab):
         out[z : z + slab] = data[z0 + z : min(z0 + z + slab, z1), y0:y1, x0:x1]
-        under.madvise(mmap.MADV_DONTNEED)
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def give_back(data: np.ndarray) -> None:
     """Give the pages of an array's mapped file back to the system."""
-    under = _map_under(data)
-    if under is not None and hasattr(mmap, "MADV_DONTNEED"):
-        under.madvise(mmap.MADV_DONTNEED)
+    mapped = _mapping_of(data)
+    if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
@@ -219,7 +219,7 @@ def planes(volume: Volume) -> Iterator[np.ndarray]:
         yield from read_block(volume, np.array([0, 0, z]), np.array([nx, ny, min(z + depth, nz)]))
 
 
-def _map_under(data: Any) -> mmap.mmap | None:
+def _mapping_of(data: Any) -> mmap.mmap | None:
     """Return the read-only map that an array is a view of, None where there is none."""
     while data is not None and not isinstance(data, mmap.mmap):
         if isinstance(data, np.memmap) and data.mode != "r":

@@ -1,1 +1,1 @@
-"""The closed form of volumes that no memory holds: block by block, in any order, on any number of workers."""
+"""The closed form of volumes larger than memory: block by block, in any order, by any number of workers."""

@@ -1,4 +1,4 @@
-"""A pyramid that is cut: Gaussians of the cells that a threshold leaves, in batches."""
+"""Cuts of a tiled pyramid by a threshold, as Gaussians in batches."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from vvgt_cli.field.tiled_tree import TiledTree
     from vvgt_cli.gaussians import Gaussians
 
-BATCH = 1 << 16  # Gaussians that are made at once
+BATCH = 1 << 16  # Gaussians in a batch
 Node = tuple[list["Gaussians"], list[np.ndarray]]  # by level
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A pyramid, where bodies are opaque, and the plan that it is cut for."""
+    """A pyramid with opaque regions, light and the plan that it is cut for."""
 
     tiled_tree: TiledTree
     opaque: Opaque
@@ -34,22 +34,19 @@ class Cut:
     light: Light | None = None
 
     def gaussians(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
-        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches.
-
-        With their normals (n, 3), None where nothing is lit.
-        """
+        """Yield batches of a threshold's Gaussians, box frame, and of normals (n, 3), None without a light."""
         from vvgt_cli.closed_form.lit import MEAN, directions
         from vvgt_cli.field.tiled_tree import batches
 
         for leaves in batches(self.tiled_tree.leaves(threshold), BATCH):
             lit = self._lit(leaves)
-            yield self.made(leaves), None if lit is None else directions(lit[:, MEAN])
+            yield self.make(leaves), None if lit is None else directions(lit[:, MEAN])
 
     def nodes(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Node]]:
-        """Of each tile from ``begin`` on, for each of its ``thresholds`` (tiles, n): Gaussians, `spread_of` cells.
+        """Yield groups of tiles from ``begin`` on: Gaussians and `spread_of` cells for each of their thresholds.
 
-        They are made some tiles at a time: the colours of neighbours matter to each other. So ``begin`` is 0, or where
-        some of an earlier call ended.
+        Tiles are made in groups, since the colours of neighbours depend on each other. So ``begin`` is 0, or where a
+        group of an earlier call ended. ``thresholds`` is (tiles, n).
         """
         from vvgt_cli.closed_form.tree import spread_of
         from vvgt_cli.field.tiled_tree import joined
@@ -59,17 +56,17 @@ class Cut:
             waiting.append(leaves)
             if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.tiled_tree.tiles):
                 continue
-            sizes = np.array([[len(part) for part in node] for node in waiting])
-            whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            sizes = np.array([[len(leaves) for leaves in node] for node in waiting])
+            whole = [self.make(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
             made = []
             for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
-                parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
-                made.append((parts, [spread_of(part) for part in node]))
+                gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
+                made.append((gaussians, [spread_of(leaves) for leaves in node]))
             yield made
             waiting = []
 
-    def made(self, leaves: Leaves) -> Gaussians:
-        """Those of some cells, one each, in their order."""
+    def make(self, leaves: Leaves) -> Gaussians:
+        """Make the Gaussians of cells, one each, in their order."""
         from vvgt_cli.closed_form.columns import MASS, SEEN
         from vvgt_cli.closed_form.lit import colored
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
@@ -84,5 +81,5 @@ class Cut:
         return as_stored(made)
 
     def _lit(self, leaves: Leaves) -> np.ndarray | None:
-        """What `TiledTree` has put after their moments; None where nothing is lit."""
+        """Return the columns of light that the pyramid appends to moments; None without a light."""
         return None if self.light is None else leaves.moments[:, COLUMNS:]

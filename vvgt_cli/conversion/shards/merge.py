@@ -1,4 +1,4 @@
-"""From blocks to a file: visibility through the coarse grid, a threshold for the budget, Gaussians in batches."""
+"""The merge of blocks to a file: visibility by the coarse grid, a threshold for the budget, Gaussians in batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,11 +17,11 @@ from vvgt_cli.conversion.shards.cut import Cut
 from vvgt_cli.conversion.shards.plan import Plan, load_light
 from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
 from vvgt_cli.conversion.shards.streamed import write_streamed
-from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.block_store import BlockStore
-from vvgt_cli.files import atomic_write, check_room, is_stream
+from vvgt_cli.field.store import BlockStore
+from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -42,11 +42,11 @@ SCRATCH = "scores"
 
 
 def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool) -> None:
-    """Cut the pyramid over all parts for the plan's budget and write it; fills the report in.
+    """Cut the pyramid of all blocks for the plan's budget, write the file and fill in the report.
 
     Raises:
-        DataError: parts are missing or damaged, or nothing is visible.
-        UsageError: an output that may not be written.
+        DataError: blocks are missing or damaged, or nothing is visible.
+        UsageError: the output may not be written.
     """
     plan = Plan.load(store)
     report = run.report
@@ -64,21 +64,21 @@ def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool) -> N
 
 
 def _write_ply(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:
-    """One file; how many Gaussians and bytes it has, and its scores where it is drawn, into the report."""
+    """Write a `.ply`, and record its Gaussians, bytes and, where memory allows drawing it, scores."""
     plan, size = cut.plan, cut.plan.size
     with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
-        made, spared = _write(cut, sink, output)
+        made, removed = thin(plan.budget, lambda budget: _write(cut, budget, sink, output))
         count, written = made.total, sink.tell()
         stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB"
-        if not spared and count < NEARLY * plan.budget:
+        if not removed and count < NEARLY * plan.budget:
             base = cut.tiled_tree.base
-            stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
-    if spared:
-        run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+            stage.note += f", no more: {base} cells suffice for the screen and {plan.budget} Gaussians"
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
     run.report.gaussians, run.report.bytes = count, written
     if made.batches is None:
         need = drawing_bytes(count, size)
-        run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
+        run.skip("test views", f"drawing {count} Gaussians needs about {need / 2**30:.1f} GiB of memory")
     else:
         with run.stage("test views") as stage:
             found = score_gaussians(concatenate(made.batches), store, plan, plan.ply.rule or INRIA)
@@ -86,11 +86,11 @@ def _write_ply(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bo
 
 
 def pyramid(store: BlockStore, plan: Plan, light: Light | None = None) -> tuple[TiledTree, Opaque]:
-    """The pyramid over all parts, and where bodies are opaque.
+    """Return the pyramid of all blocks, and the regions where bodies are opaque.
 
     Raises:
-        NothingVisible: from no view.
-        DataError: parts are missing or damaged.
+        NothingVisible: nothing is visible from any view.
+        DataError: blocks are missing or damaged.
     """
     from vvgt_cli.cameras import default_views
     from vvgt_cli.closed_form.closed_form import MARCH_SIZE
@@ -117,44 +117,39 @@ def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
 
 
 class Made(NamedTuple):
-    """What was written: how many Gaussians, and themselves in the box frame, None where the memory holds no drawing."""
+    """A written cut: number of Gaussians, and the Gaussians, box frame; None where memory is too small to draw them."""
 
     total: int
     batches: list[Gaussians] | None
 
 
-def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
-    """Write the file; what it has, and how many Gaussians are left out since they would be too faint."""
+def _write(cut: Cut, budget: int, sink: IO[bytes], output: str) -> tuple[Made, int, bool]:
+    """Write the cut for a budget; return it, the number of its Gaussians, and whether most are faint (see `thin`)."""
     from vvgt_cli.closed_form.lit import directions
 
-    plan, first, free = cut.plan, 0, free_memory()
+    plan, free, threshold = cut.plan, free_memory(), cut.tiled_tree.threshold(budget)
     axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
     degree = plan.degree if plan.ply.sh_degree is None else plan.ply.sh_degree
-    while True:
-        threshold = cut.tiled_tree.threshold(plan.budget)
-        count = cut.tiled_tree.count(threshold)
-        first = first or count
-        if output != STDOUT:
-            check_room(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
-        sink.seek(0)
-        sink.truncate()
-        sink.write(ply_header(count, degree, plan.ply))
-        kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
-        faint = 0
-        for gaussians, normals in cut.gaussians(threshold):
-            normals = None if normals is None else directions(normals @ turned)
-            sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
-            faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
-            if kept is not None:
-                kept.append(gaussians)
-        if 2 * faint <= count or plan.budget < 2 * FEWEST:
-            return Made(count, kept), first - count
-        plan = replace(plan, budget=plan.budget // 2)
+    count = cut.tiled_tree.count(threshold)
+    if output != STDOUT:
+        check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
+    sink.seek(0)
+    sink.truncate()
+    sink.write(ply_header(count, degree, plan.ply))
+    kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
+    faint = 0
+    for gaussians, normals in cut.gaussians(threshold):
+        normals = None if normals is None else directions(normals @ turned)
+        sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
+        faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
+        if kept is not None:
+            kept.append(gaussians)
+    return Made(count, kept), count, 2 * faint > count
 
 
 @contextmanager
 def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
-    """A file to write to, which takes the output's place, or goes down its pipe, when it is whole."""
+    """Yield a file to write to; once complete, it replaces the output or is copied to its pipe."""
     if output != STDOUT and not is_stream(output):
         with atomic_write(output, overwrite) as temporary, open(temporary, "w+b") as sink:
             yield sink

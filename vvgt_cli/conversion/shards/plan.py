@@ -1,5 +1,4 @@
-"""What the blocks of a run have in common and its file depends on, beside them on disk: enough to merge without the
-volume."""
+"""The plan that the blocks of a run share, stored beside them, so that they can be merged without the volume."""
 
 from __future__ import annotations
 
@@ -21,24 +20,24 @@ from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import plain
 
 PLAN, LIGHT = "plan.json", "light.npz"
-A_SCORE, A_RAY = 20, 20  # bytes: of a base cell's scores with those above it, of what a block shows of a ray
-A_NORMAL = 24  # bytes of a base cell, where there is light
-A_GAUSSIAN = 8  # base cells there may be a Gaussian, where the budget is so large that it decides
+A_SCORE, A_RAY = 20, 20  # bytes of the scores of a base cell and its ancestors, and of a ray within a block
+A_NORMAL = 24  # bytes of the normal of a base cell under a light
+A_GAUSSIAN = 8  # base cells per Gaussian, for large budgets
 
 
 @dataclass(frozen=True)
 class Plan:
-    """See the module.
+    """The grid of cells, the budget and the layout of the output.
 
     Attributes:
-        grid: the cells.
-        budget, size: most Gaussians, and pixels of the screen that they are made for.
+        grid: grid of the cells.
+        budget, size: maximal number of Gaussians, and pixels of the screen that they are made for.
         axes: (9,) row-major world directions of the index axes, as `Volume.direction`.
-        ply: how the file is written.
-        volume, function: as reports show them.
-        rays: name of the file of the rays that it is scored by.
-        labels: it is one of labels alone.
-        degree: of the harmonics that colours have under a light.
+        ply: layout of the file.
+        volume, function: entries of the report.
+        rays: name of the file of the rays for scoring.
+        labels: whether the volume is a label map alone.
+        degree: degree of the harmonics of colours under a light.
     """
 
     grid: CellGrid
@@ -53,7 +52,7 @@ class Plan:
     degree: int = 0
 
     def save(self, store: BlockStore, light: Light | None) -> None:
-        """Write it beside the parts, and before it what falls on the volume."""
+        """Write the light, if any, and then the plan store_beside the blocks."""
         if light is not None:
             with atomic_write(store.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, allow_pickle=False, **light._asdict())
@@ -62,10 +61,10 @@ class Plan:
 
     @classmethod
     def load(cls, store: BlockStore) -> Plan:
-        """The plan beside parts.
+        """Read the plan store_beside blocks.
 
         Raises:
-            DataError: there is none, or it is damaged.
+            DataError: the plan is missing or damaged.
         """
         path = store.folder / PLAN
         try:
@@ -80,14 +79,14 @@ class Plan:
             return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
         except FileNotFoundError:
             raise DataError(
-                f"{path}: is missing: not all shards have counted their blocks; run the same array again"
+                f"{path}: missing, since not all shards have counted their blocks; run the same array again"
             ) from None
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
 
 
 def load_light(store: BlockStore, plan: Plan) -> Light | None:
-    """What falls on the volume, None for nothing.
+    """Read the light store_beside a plan, None for none.
 
     Raises:
         DataError: the file beside the plan is missing or damaged.
@@ -107,16 +106,16 @@ def _tupled(value: Any) -> Any:
 
 
 def most_cells(budget: int) -> int:
-    """Base cells that a budget has use for, on disk: as many as in memory, more where there are more Gaussians."""
+    """Return the maximal number of base cells on disk: that in memory, or more for large budgets."""
     from vvgt_cli.closed_form.closed_form import most_cells as in_memory
 
     return max(in_memory(budget), A_GAUSSIAN * budget)
 
 
 def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool, degree: int) -> int:
-    """What parts and output take on disk, about, where ``voxels`` are visible and ``rays`` are marched.
+    """Estimate the bytes of blocks and output on disk, for ``voxels`` that are visible and ``rays`` that are marched.
 
-    ``lit``: cells have normals, ``degree``: of the Gaussians' harmonics.
+    With ``lit`` cells have normals; ``degree`` is that of the Gaussians' harmonics.
     """
     cells = voxels / float(grid.cell.prod())
     met = rays * max(grid.blocks.shape) / 2  # blocks along a ray, half of which show something of it

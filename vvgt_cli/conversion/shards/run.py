@@ -1,4 +1,4 @@
-"""`vvgt init` in blocks: count, choose the cells' size, integrate, cut, write; as a whole, or by shards and a merge."""
+"""`vvgt init` in blocks: count, choose the size of cells, integrate, cut, write; at once, or by shards and a merge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vvgt_cli.conversion.convert import degree_of, ply_options
-from vvgt_cli.conversion.place import remarks
+from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.shards.merge import write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
@@ -21,7 +21,7 @@ from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.open import FieldNeeds, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import tf_record, volume_record
-from vvgt_cli.files import check_room
+from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
@@ -30,37 +30,36 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 
-def streams(request: ConvertRequest) -> bool:
-    """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
+def writes_streaming(request: ConvertRequest) -> bool:
+    """Return whether the closed form is written batch by batch, without all Gaussians in memory."""
     options = request.blocks
     if is_streamed(request.output):
         if request.fit.init != "vbm" or (options is not None and options.shard):
             raise UsageError(
-                f"-o {request.output} is made of moments: leave out --init and --shard, whose blocks 'vvgt merge' "
-                "takes (docs/scale.md)"
+                f"-o {request.output} needs moments: remove --init, and --shard, whose blocks 'vvgt merge' "
+                "reads (docs/scale.md)"
             )
         return True
     other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
     if options is not None and options.shard is not None:
         if other:
             raise UsageError(
-                "--shard writes blocks of moments: leave out --init and other formats, or convert it as a whole "
-                "(docs/scale.md)"
+                "--shard writes blocks of moments: remove --init and other formats, or convert at once (docs/scale.md)"
             )
         return True
     return options is not None and not other
 
 
 def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Volume to `.ply` by the closed form, of which only blocks are ever in memory.
+    """Convert a volume to a `.ply` by the closed form, with only blocks of it in memory.
 
-    With ``shard`` of ``request.blocks`` the output is a folder of blocks, which `merge` puts together.
+    With ``shard`` of ``request.blocks`` the output is a folder of blocks for `merge`.
 
     Raises:
-        UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; shards that do not fit the rest.
+        UsageError, DataError: see `vvgt_cli.conversion.convert.initialise_only`; shards with other options.
     """
     options = request.blocks or BlockOptions()
-    _refuse(request, options)
+    _check_options(request, options)
     run = Run(console or Console(), ConversionReport("init"))
     if options.shard is not None:
         assert request.output is not None
@@ -71,7 +70,7 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         claimed(outputs, request.inputs(), request.overwrite),
         store_beside(request.output) as store,
     ):
-        make_parts(run, request, options, store)
+        make_blocks(run, request, options, store)
         write_merged(run, store, request.output or STDOUT, request.overwrite)
         run.finish()
         if request.report:
@@ -81,10 +80,10 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
 
 
 def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
-    """Make a `.ply`, or streamed SOG, of the blocks that shards have left in a folder.
+    """Make a `.ply`, or streamed SOG, of the blocks that shards have written into a folder.
 
     Raises:
-        UsageError: not such a folder, or an output that may not be written.
+        UsageError: the folder has no blocks, or the output may not be written.
         DataError: blocks are missing or damaged.
     """
     run = Run(console or Console(), ConversionReport("merge"))
@@ -97,7 +96,7 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
 
 @contextmanager
 def _written(output: str | None, request: ConvertRequest | None = None) -> Iterator[list[Output]]:
-    """What will be written; the folder of a streamed SOG is made."""
+    """Yield the files that will be written; make the folder of a streamed SOG."""
     if output is not None and is_streamed(output):
         more = [] if request is None else replace(request, output=None).outputs()
         with folder_of(output):
@@ -108,29 +107,29 @@ def _written(output: str | None, request: ConvertRequest | None = None) -> Itera
         yield [Output("-o", output or STDOUT, (".ply",), splats=True)]
 
 
-def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
-    """What does not go together."""
+def _check_options(request: ConvertRequest, options: BlockOptions) -> None:
+    """Check that options do not contradict each other."""
     if options.shard is not None and options.scheduler is not None:
-        raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
+        raise UsageError("--shard and --scheduler both distribute the blocks; give one of them")
     if options.shard is not None and (request.output in (None, STDOUT) or request.report):
-        raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
+        raise UsageError("--shard: expected a folder of blocks as -o and no --report; 'vvgt merge' makes the .ply")
 
 
 def _shard(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
-    """Do a shard's share of what can be done now, and say what is left."""
+    """Process the blocks of a shard that can be processed now, and report what remains."""
     try:
-        make_parts(run, request, options, store)
+        make_blocks(run, request, options, store)
     except MissingBlocks as later:
-        run.console.say(
-            f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
-            "again when they are"
+        run.console.message(
+            f"{later.what}: this shard is done, {later.missing} blocks of other shards are missing; run the same array "
+            "again once they are complete"
         )
     else:
-        run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
+        run.console.message(f"all blocks are complete; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
-    """Every block's part, those that are there taken as they are; and the plan of the file.
+def make_blocks(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
+    """Make all blocks, reusing existing ones, and the plan of the file.
 
     Raises:
         MissingBlocks: other shards' blocks are missing.
@@ -139,8 +138,8 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, store: 
     wanted = FieldNeeds(budget, size, request.ply.sh_degree, most_cells(budget))
     with blocked(run, request.source, options, store, wanted) as field:
         source, ply = field.source, ply_options(request, field.source)
-        for line in remarks(source.volume, ply):
-            run.console.say(line)
+        for line in placement_warnings(source.volume, ply):
+            run.console.message(line)
         degree = degree_of(request, source)
         run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
         field.views.expect(scored_views(size))
@@ -158,15 +157,15 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, store: 
 
 
 def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree: int) -> None:
-    """Say what the blocks will take on disk.
+    """Report the bytes that the blocks will take on disk.
 
     Raises:
-        DataError: more than is free.
+        DataError: the disk is too small.
     """
     assert cells.rays is not None
     rays = sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
     store = cells.store
     need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - store.bytes(CELLS)
     if need > 0 and store.missing(CELLS, range(len(cells))):
-        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
-        check_room(store.folder, need)
+        run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
+        check_disk_space(store.folder, need)

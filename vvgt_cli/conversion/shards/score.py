@@ -1,4 +1,4 @@
-"""The error of Gaussians cut from blocks, against rays through all voxels: what a merge needs no volume for."""
+"""Scores of a merge: Gaussians against stored rays through all voxels, without the volume."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Scores
 
 FEW = 64  # blocks of 16 x 16 px of each test view
-RAYS = 2  # along a pixel's edge
-A_GAUSSIAN = 400  # bytes that drawing one takes
+RAYS = 2  # rays along a pixel's edge
+A_GAUSSIAN = 400  # bytes to draw a Gaussian
 
 
 def scored_views(size: int) -> list[Picture]:
-    """Blocks of three test views of ``size`` px."""
+    """List the blocks of three test views of ``size`` px."""
     from vvgt_cli.dvr import RenderSettings
 
     cameras = default_views("test", size=size)
@@ -34,10 +34,10 @@ def scored_views(size: int) -> list[Picture]:
 
 
 def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
-    """Gaussians of the box frame, drawn by a rule, against the volume's views.
+    """Score Gaussians (box frame), drawn by a rule, against the stored views of the volume.
 
     Raises:
-        DataError: a part is missing or damaged.
+        DataError: a block is missing or damaged.
     """
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render
@@ -57,12 +57,12 @@ def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: s
 
 
 def score_text(scores: Scores, size: int) -> str:
-    """What there is to say of them."""
+    """Return the scores as a message."""
     from vvgt_cli.score.views import psnr_note
 
     return f"{psnr_note(scores)}, blocks of {scores.views} views of {size} px, through all voxels"
 
 
 def drawing_bytes(gaussians: int, size: int) -> int:
-    """Memory that scoring so many Gaussians takes."""
+    """Return the bytes of memory for scoring a number of Gaussians."""
     return A_GAUSSIAN * gaussians + 2 * 16 * size**2

@@ -1,8 +1,8 @@
-"""Streamed SOG: nodes by place, each in levels by measured error, in files of SOG's images; and `lod-meta.json`.
+"""Streamed SOG: spatial nodes in levels by measured error, in files of SOG images, with `lod-meta.json`.
 
-As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
-(`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.tiled_tree`); what its levels are is
-measured (`ladder`).
+The format is that of PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and
+splat-transform 3.7.0 (`writers/write-lod.ts`). A node is a tile of the pyramid (`vvgt_cli.field.tiled_tree`), with
+levels by `level_selection`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.shards.ladder import measured
+from vvgt_cli.conversion.shards.level_selection import measure_cuts
 from vvgt_cli.conversion.shards.plan import PLAN
 from vvgt_cli.conversion.shards.streamed_files import Files, Level, files_of
 from vvgt_cli.errors import UsageError
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
     from vvgt_cli.field.block_store import BlockStore
 
-# Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
+# Scale of the unit frame. The engine shows level 0 within 5 (`lodBaseDistance`) and level 1 within 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
-REACH = 2.0  # standard deviations that a node's bounds lie beyond its centres
+REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
 @contextmanager
 def folder_of(output: str) -> Iterator[None]:
-    """Make the folder of a manifest; it goes again where nothing was left in it."""
+    """Make the folder of a manifest, and remove it after the block if it is empty."""
     folder = Path(output).absolute().parent
     made = not folder.exists() and folder.parent.is_dir()
     if made:
@@ -57,32 +57,32 @@ def folder_of(output: str) -> Iterator[None]:
 
 
 def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:
-    """Write the files and, last of all, the manifest.
+    """Write the files and, last, the manifest.
 
-    What is done of it is noted in ``store``: errors by some nodes at a time, and files that are whole.
+    Progress is recorded in ``store``: errors of groups of nodes, and complete files.
 
     Raises:
-        UsageError: a frame in which distances are not the engine's.
+        UsageError: the frame is not the unit frame.
     """
     if cut.plan.ply.frame != "unit":
-        raise UsageError(f"-o {output}: levels go by distances in the unit frame; leave out --frame")
+        raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
         key = digest((store.folder / PLAN).read_text("utf-8"))[:16]
-        ladder = measured(cut, store, f"errors-{key}")
-        choices = ladder.levels()
+        errors = measure_cuts(cut, store, f"errors-{key}")
+        choices = errors.levels()
         levels = [Level(number) for number in range(len(choices))]
         stage.note = f"{len(levels)} levels of {len(tiled_tree.tiles)} nodes"
     before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
     files = Files(folder, store, f"written-{digest(key, str(folder))[:16]}")
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
-        for some in cut.nodes(ladder.thresholds[np.stack(choices, axis=1)]):
+        for some in cut.nodes(errors.thresholds[np.stack(choices, axis=1)]):
             for made, spreads in some:
-                rungs = [choice[len(nodes)] for choice in choices]
-                nodes.append(_node(cut, files, levels, made, spreads) | ladder.facts(len(nodes), rungs))
+                own = [choice[len(nodes)] for choice in choices]
+                nodes.append(_node(cut, files, levels, made, spreads) | errors.facts(len(nodes), own))
         for level in levels:
             files.write(level)
-        facts = [ladder.rms(choice) for choice in choices]
+        facts = [errors.rms(choice) for choice in choices]
         temporary.write_text(
             json.dumps(plain(_manifest(cut, levels, files.names, nodes, facts)), separators=(",", ":"))
         )
@@ -90,7 +90,7 @@ def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite
         stage.note = f"{output}: {len(nodes)} nodes, {len(files.names)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
         if levels[0].gaussians < cut.plan.budget // 2:
-            stage.note += f", no more: {tiled_tree.base} cells that the screen, or {cut.plan.budget}, have use for"
+            stage.note += f", no more: {tiled_tree.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
     files.remove_others(before)
     run.report.gaussians, run.report.bytes = levels[0].gaussians, total
 
@@ -98,7 +98,7 @@ def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite
 def _node(
     cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
 ) -> dict[str, Any]:
-    """Put a node into the files; its entry in the manifest."""
+    """Add a node to the files, and return its entry in the manifest."""
     axes, options = (
         np.array(cut.plan.axes).reshape(3, 3),
         replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),

@@ -1,4 +1,4 @@
-"""The files of a streamed SOG: Gaussians of neighbouring nodes, a level each, as SOG's images in a folder."""
+"""The files of a streamed SOG: Gaussians of neighbouring nodes in one level, as SOG images in a folder."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order
 from vvgt_cli.gaussians.formats.streamed import read_manifest
 
-A_FILE = 1 << 17  # Gaussians of a file, or a node more
+A_FILE = 1 << 17  # Gaussians in a file, except for those of its last node
 
 
 @dataclass
 class Level:
-    """What is written of a level.
+    """The state of writing a level.
 
     Attributes:
-        number: 0 is the finest.
-        waiting: Gaussians of the next file.
-        rows: how many.
-        files: that are full.
-        gaussians, bytes: of all of it, so far.
-        spread: sums over Gaussians of opacity x area of their cells, and of that x variance in them.
+        number: number of the level, 0 the finest.
+        waiting: Gaussians for the next file.
+        rows: number of waiting Gaussians.
+        files: number of files written.
+        gaussians, bytes: totals so far.
+        spread: sums over Gaussians of opacity x area of their cells, and of that x variance within.
     """
 
     number: int
@@ -43,20 +43,21 @@ class Level:
 
 
 class Files:
-    """Those of all levels; ``names`` of their `meta.json`, as the manifest has them.
+    """The files of all levels; ``names`` are those of their `meta.json` in the manifest.
 
-    A part ``kind`` of ``store`` says of each file that it is whole, its bytes and when it was written: it is not
-    written again, unless another run has written there since.
+    ``store`` records, under ``kind``, the bytes and time of each complete file, which is then not written again unless
+    another run has changed it.
     """
 
     def __init__(self, folder: Path, store: BlockStore, kind: str) -> None:
+        """Start without files."""
         self._folder, self._store, self._kind = folder, store, kind
         store.prepare(kind)
         self.names: list[str] = []
         self._begun: dict[int, int] = {}  # number of the name of each level's next file
 
     def add(self, level: Level, splats: Splats) -> dict[str, int]:
-        """Put a node's Gaussians into the next file of a level; where they are."""
+        """Add the Gaussians of a node to the next file of a level, and return their place."""
         if level.number not in self._begun:
             self._begun[level.number] = len(self.names)
             self.names.append(f"{level.number}_{level.files}/{META}")
@@ -69,7 +70,7 @@ class Files:
         return place
 
     def write(self, level: Level) -> None:
-        """Write the file that is waiting, if there is one."""
+        """Write the waiting Gaussians, if any."""
         if not level.rows:
             return
         number = self._begun.pop(level.number)
@@ -78,7 +79,7 @@ class Files:
         level.waiting, level.rows, level.files = [], 0, level.files + 1
 
     def _kept(self, number: int, target: Path) -> int:
-        """Bytes of a file that is as this run, interrupted, has written it; else 0."""
+        """Return the bytes of a file that this run wrote before an interruption, else 0."""
         if not target.is_file() or self._store.missing(self._kind, [number]):
             return 0
         size, written = self._store.load(self._kind, number)["size"].tolist()
@@ -90,7 +91,7 @@ class Files:
         return size
 
     def remove_others(self, before: Sequence[str]) -> None:
-        """Remove what a manifest that was there ``before`` names and this one does not; nothing else in the folder."""
+        """Remove the files of an earlier manifest, ``before``, that this one does not name."""
         for name in set(before) - set(self.names):
             path = self._folder / name
             for file in (path, *(path.with_name(f"{image}.webp") for image in IMAGES)):
@@ -100,7 +101,7 @@ class Files:
 
 
 def files_of(manifest: Path) -> list[str]:
-    """What a manifest names; nothing where there is none, or it is damaged."""
+    """List the files of a manifest; none where it is missing or damaged."""
     try:
         return list(read_manifest(manifest)["filenames"])
     except (DataError, OSError):
@@ -108,7 +109,7 @@ def files_of(manifest: Path) -> list[str]:
 
 
 def _written(target: Path, splats: Splats) -> int:
-    """Write `meta.json` and, before it, its images; their bytes."""
+    """Write the images and then `meta.json`, and return their bytes."""
     images, meta = images_of(splats)
     target.parent.mkdir(exist_ok=True)
     size = sum(_put(target.with_name(name), webp(image)) for name, image in images.items())

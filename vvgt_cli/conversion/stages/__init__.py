@@ -1,4 +1,4 @@
-"""The stages, a file each with what it costs. A new one is a file here and a line in `vvgt_cli.conversion.plan`."""
+"""The stages of a conversion and their costs, one file each; `vvgt_cli.conversion.plan` chooses among them."""
 
 from vvgt_cli.conversion.stages.back_projection import BackProjection
 from vvgt_cli.conversion.stages.cells import CellsByError

@@ -1,4 +1,4 @@
-"""Back-projection: cells split and colours solved by views, without moving anything."""
+"""Back-projection: splitting of cells and solving of colours by views, without moving Gaussians."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from vvgt_cli.conversion.stages.refinement import step_seconds
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.jit.ahead import BACK_PROJECT
 
-STEPS = 105.0  # of gradient descent on whole views that take as long
+STEPS = 105.0  # steps of gradient descent on whole views that take as long
 
 
 @dataclass(frozen=True)
 class BackProjection(Stage):
-    """Kept if the check views agree."""
+    """Back-projection of training views, kept if the check views agree."""
 
     name: ClassVar[str] = "back-projection"
     improves: ClassVar[bool] = True
 
-    def cost(self, case: Workload) -> Cost:
-        """As so many steps."""
-        return Cost(STEPS * step_seconds(case, small=False))
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost of as many steps of descent."""
+        return Cost(STEPS * step_seconds(workload, small=False))
 
     def run(self, work: Work) -> None:
-        """Split and solve."""
+        """Split cells and solve colours."""
         from vvgt_cli.closed_form import backproject
 
         assert work.start is not None

@@ -1,4 +1,4 @@
-"""Cells by error: the closed form's pyramid cut once more, where pictures of the first cut are wrong."""
+"""Cells by error: a second cut of the closed form's pyramid, finer where pictures of the first have errors."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
 from vvgt_cli.field.workload import Workload
 
-VIEWS = 24  # of the training views: half as many lose 0.1 to 0.3 dB (docs/log/closed-form.md)
+VIEWS = 24  # training views: half as many lose 0.1 to 0.3 dB (docs/log/closed-form.md)
 A_VIEW, ALWAYS = 1.1, 12.0  # in steps of gradient descent: a view, and the second cut with a look at the check views
 
 
 @dataclass(frozen=True)
 class CellsByError(Stage):
-    """As many Gaussians of other cells; kept if the check views agree.
+    """A second cut with as many Gaussians, kept if the check views agree.
 
     Attributes:
-        small: the training views are small.
-        keep: what is chosen is kept, for a run that goes on.
+        small: whether the training views are small.
+        keep: whether the result goes to the checkpoint.
     """
 
     name: ClassVar[str] = "cells by error"
@@ -29,12 +29,12 @@ class CellsByError(Stage):
     small: bool = False
     keep: bool = True
 
-    def cost(self, case: Workload) -> Cost:
-        """As so many steps."""
-        return Cost((VIEWS * A_VIEW + ALWAYS) * step_seconds(case, self.small))
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost of as many steps of descent."""
+        return Cost((VIEWS * A_VIEW + ALWAYS) * step_seconds(workload, self.small))
 
     def run(self, work: Work) -> None:
-        """Cut, or take what is kept of it."""
+        """Cut the pyramid, or load the result from the checkpoint."""
         from vvgt_cli.closed_form import cut_by_error
 
         assert work.train is not None
@@ -44,11 +44,11 @@ class CellsByError(Stage):
         kept = work.checkpoint.load(CELLS) if self.keep else None
         if kept:
             with run.stage(self.name) as stage:
-                stage.note = f"{len(kept[0])} Gaussians, as kept in {work.checkpoint.folder}"
+                stage.note = f"{len(kept[0])} Gaussians, from {work.checkpoint.folder}"
             work.gaussians = kept[0]
             return
         with run.stage(self.name) as stage:
-            chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth would stand in bands
+            chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
             before = work.psnr(work.made())
             found = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)

@@ -1,10 +1,11 @@
-"""The closed form: moments, pyramid, choice of cells."""
+"""The closed-form stage: moments, pyramid, choice of cells."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
@@ -16,35 +17,37 @@ from vvgt_cli.field.workload import Workload
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start
 
-SECONDS = 0.4, 0.62, 0.03, 2.8  # always, per 10^6 cells, 10^6 voxels in bricks that are not empty, 10^6 Gaussians
-MEMORY = 294.0, 1240.0  # bytes: a cell, a Gaussian (with what later stages keep of it)
+SECONDS = 0.4, 0.62, 0.03, 2.8  # fixed, per 10^6 cells, per 10^6 voxels of non-empty bricks, per 10^6 Gaussians
+MEMORY = 294.0, 1240.0  # bytes per cell, and per Gaussian (with what later stages keep of it)
 FAINT = 0.02  # opacity
 FAINT_LOGIT = math.log(FAINT / (1 - FAINT))
-NEARLY = 0.99  # of the budget: cells are split by eights, so that a few are always missing
-FEWEST = 5000  # Gaussians that a fog keeps
+NEARLY = 0.99  # share of the budget: cells are split by eights, so that a few are always missing
+FEWEST = 5000  # Gaussians that faint volumes keep at least
+TOO_FAINT = "so faint that viewers differ in what they draw of them"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class ClosedFormStage(Stage):
-    """Volume to Gaussians without a picture.
+    """The closed form of Gaussians from a volume, without drawing pictures.
 
     Attributes:
-        anew: a stage after it may cut the cells anew: nothing is kept of it, since only Gaussians are.
-        cut: a stage after it cuts the cells by error: only where that has been done is no pyramid needed again.
+        recut: a later stage may cut the pyramid again, which checkpoints do not hold: none is written.
+        recut_by_error: a later stage cuts the pyramid by error; a checkpoint is read only where that has been done.
     """
 
     name: ClassVar[str] = "closed form"
-    anew: bool = False
-    cut: bool = False
+    recut: bool = False
+    recut_by_error: bool = False
 
-    def cost(self, case: Workload) -> Cost:
-        """By cells, voxels and Gaussians."""
-        counts = 1e6, case.cells, case.voxels, case.gaussians
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost by cells, voxels and Gaussians."""
+        counts = 1e6, workload.cells, workload.voxels, workload.gaussians
         seconds = sum(each * count for each, count in zip(SECONDS, counts, strict=True)) / 1e6
-        return Cost(case.pace * seconds, MEMORY[0] * case.cells + MEMORY[1] * case.gaussians)
+        return Cost(workload.pace * seconds, MEMORY[0] * workload.cells + MEMORY[1] * workload.gaussians)
 
     def run(self, work: Work) -> None:
-        """Make the Gaussians, or take what is kept of them: without the pyramid.
+        """Make the Gaussians, or load them from the checkpoint, without the pyramid.
 
         Raises:
             NothingVisible: nothing is visible from any view.
@@ -53,11 +56,11 @@ class ClosedFormStage(Stage):
         from vvgt_cli.closed_form.closed_form import bound
 
         run, fit, source = work.run, work.fit, work.field.source
-        whole = self.anew or (self.cut and work.checkpoint.load(CELLS) is None)
+        whole = self.recut or (self.recut_by_error and work.checkpoint.load(CELLS) is None)
         kept = None if whole else work.checkpoint.load(CLOSED_FORM)
         if kept:
             with run.stage(self.name) as stage:
-                stage.note = f"{len(kept[0])} Gaussians, as kept in {work.checkpoint.folder}"
+                stage.note = f"{len(kept[0])} Gaussians, from {work.checkpoint.folder}"
             work.start, work.gaussians = Start(kept[0], None), kept[0]
             return
         options = VbmOptions(
@@ -68,26 +71,46 @@ class ClosedFormStage(Stage):
             if not len(start.gaussians):
                 raise NothingVisible(source.volume.name, source.name)
             found = len(start.gaussians)
-            start, spared = thinned(start)
+            start, removed = thinned(start)
             stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
-            if start.form is not None and not spared and found < NEARLY * fit.max_gaussians:
+            if start.form is not None and not removed and found < NEARLY * fit.max_gaussians:
                 stage.note += f", no more: {bound(start.form)}"
-        if spared:
-            run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
-        if not self.anew:
+        if removed:
+            run.skip(f"{removed} Gaussians", TOO_FAINT)
+        if not self.recut:
             work.checkpoint.save(CLOSED_FORM, start.gaussians)
         work.start, work.gaussians = start, start.gaussians
 
 
 def thinned(start: Start) -> tuple[Start, int]:
-    """Half the budget, again and again, while the median opacity is below `FAINT`; and how many Gaussians that spares.
+    """Return a closed form with fewer Gaussians where they are faint (`thin`), and the number removed."""
 
-    Programs leave out what is below 1/255, 1/510 or 1/100 in a pixel: of a fog of faint splats each shows another part.
+    def cut(budget: int) -> tuple[Start, int, bool]:
+        found, form = start, start.form
+        if form is not None and budget < form.budget:
+            form = replace(form, budget=budget)
+            found = replace(start, form=form, gaussians=form.gaussians())
+        return found, len(found.gaussians), bool(np.median(found.gaussians.opacity_logits) < FAINT_LOGIT)
+
+    return thin(0 if start.form is None else start.form.budget, cut)
+
+
+def thin(budget: int, cut: Callable[[int], tuple[T, int, bool]]) -> tuple[T, int]:
+    """Cut a pyramid for a budget, and for half of it again and again while most Gaussians are faint.
+
+    Viewers discard what is below 1/255, 1/510 or 1/100 in a pixel: each shows another part of a fog of faint splats.
+
+    Args:
+        budget: number of Gaussians.
+        cut: returns, for a budget, a cut, the number of its Gaussians, and whether most are fainter than `FAINT`.
+
+    Returns:
+        The last cut, and how many Gaussians fewer than the first it has.
     """
-    before = len(start.gaussians)
-    while start.form is not None and start.form.budget >= 2 * FEWEST:
-        if np.median(start.gaussians.opacity_logits) >= FAINT_LOGIT:
-            break
-        form = replace(start.form, budget=start.form.budget // 2)
-        start = replace(start, form=form, gaussians=form.gaussians())
-    return start, before - len(start.gaussians)
+    first = 0
+    while True:
+        made, count, faint = cut(budget)
+        first = first or count
+        if not faint or budget < 2 * FEWEST:
+            return made, first - count
+        budget //= 2

@@ -1,4 +1,4 @@
-"""One pass of a trained network."""
+"""The stage of one pass of a trained network."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import ClassVar
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.workload import Workload
 
-SECONDS = 0.2, 2.1  # always, per 100,000 Gaussians (docs/network.md)
+SECONDS = 0.2, 2.1  # fixed, per 100,000 Gaussians (docs/network.md)
 
 
 @dataclass(frozen=True)
 class Network(Stage):
-    """Kept if the check views agree.
+    """One pass of a trained network, kept if the check views agree.
 
     Attributes:
-        model: folder, or name of a shipped one.
+        model: folder of the model, or name of a shipped one.
     """
 
     name: ClassVar[str] = "network"
     improves: ClassVar[bool] = True
     model: str = ""
 
-    def cost(self, case: Workload) -> Cost:
-        """By Gaussians."""
-        return Cost(case.pace * (SECONDS[0] + SECONDS[1] * case.gaussians / 1e5))
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost by the number of Gaussians."""
+        return Cost(workload.pace * (SECONDS[0] + SECONDS[1] * workload.gaussians / 1e5))
 
     def run(self, work: Work) -> None:
-        """Let it improve the Gaussians.
+        """Improve the Gaussians by the network.
 
         Raises:
             UsageError: no such model.
-            DataError: a model that is not what it must be.
+            DataError: an invalid model.
         """
         import numba
 
@@ -44,7 +44,7 @@ class Network(Stage):
         run, given, train = work.run, work.made(), work.train
         with run.stage(self.name) as stage:
             model = Model.open(find_model(self.model), numba.get_num_threads())
-            bar, plain = run.console.bar(self.name), given.of_degree(0)  # it knows nothing of harmonics
+            bar, plain = run.console.bar(self.name), given.of_degree(0)  # the network takes no harmonics
             better = model.improve(plain, train.cameras, train.images, progress=bar, rule=work.train_rule)
             better = replace(better, harmonics=given.harmonics)
             before, after = work.psnr(given), work.psnr(better)

@@ -1,4 +1,4 @@
-"""Gradient descent on the training views, and what viewers would leave out of its result."""
+"""The refinement stage: gradient descent on the training views, without Gaussians that viewers would discard."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import Run
 
 STEP = 0.027, 0.0275  # seconds per 400 x 400 px, per 100,000 Gaussians
-HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
-WIDER = 1.1  # times as wide along surfaces: what that blurs is sharp again after some steps, the lattice stays away
-LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
-SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
-MOST = 0.99  # of the Gaussians: as many are left where small ones are widened, as a rule
+HARMONICS = 1.0, 1.1, 1.25, 1.4  # factors of the time with harmonics of degree 0 to 3
+WIDER = 1.1  # factor of widths along surfaces: some steps undo the blur, while the lattice of cells stays hidden
+CHECK_EVERY = 25  # steps between checks where a target ends the run; else one check is in the middle
+SMALLEST = 0.5  # standard deviation of the longest axis, in screen pixels, below which viewers drop or fade splats
+MOST = 0.99  # share of the Gaussians that usually remain where small ones are widened
 REASONS = {
-    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no gain any more",
+    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no more gain",
     "interrupted": "interrupted",
 }  # fmt: skip
 
 
-def step_seconds(case: Workload, small: bool) -> float:
-    """Of a step with its share of the looks at check views."""
-    one = case.pace * (STEP[0] * (view_edge(case.size, small) / 400) ** 2 + STEP[1] * case.gaussians / 1e5)
-    return HARMONICS[case.degree] * one
+def step_seconds(workload: Workload, small: bool) -> float:
+    """Return the seconds of a step, with its share of the checks."""
+    one = workload.pace * (STEP[0] * (view_edge(workload.size, small) / 400) ** 2 + STEP[1] * workload.gaussians / 1e5)
+    return HARMONICS[workload.degree] * one
 
 
 @dataclass(frozen=True)
 class Refinement(Stage):
-    """Never to something worse, as the check views see it.
+    """Gradient descent that never returns worse Gaussians, by the check views.
 
     Attributes:
-        steps: that there should be time for.
-        most: where there is more time than that.
-        small: its training views are small.
-        overlap: the Gaussians stand on the lattice of cells: descent begins with wider ones (`WIDER`).
+        steps: number of steps that the plan has time for.
+        most: number of steps where there is more time.
+        small: whether the training views are small.
+        overlap: whether descent begins with wider Gaussians (`WIDER`), since they lie on the lattice of cells.
     """
 
     name: ClassVar[str] = "refinement"
@@ -55,53 +55,59 @@ class Refinement(Stage):
     small: bool = False
     overlap: bool = False
 
-    def cost(self, case: Workload) -> Cost:
-        """By steps."""
-        return Cost(self.steps * step_seconds(case, self.small))
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost by steps."""
+        return Cost(self.steps * step_seconds(workload, self.small))
 
     def label(self) -> str:
-        """With the number of steps."""
+        """Return the number of steps."""
         return f"{self.steps} steps"
 
     def run(self, work: Work) -> None:
-        """Descend, and leave out what viewers do."""
+        """Descend, and remove Gaussians that viewers would discard."""
         from vvgt_cli.closed_form.shape import widened
 
         assert work.train is not None
         assert work.check is not None
         assert work.train_rule is not None
-        left = None
+        remaining = None
         if work.limits.time_budget is not None:
-            left = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
+            remaining = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
         target = work.limits.target_psnr
         options = OptimizeOptions.of(
-            "frame", steps=self.most, time_budget=left, target_psnr=target, rule=work.train_rule, judge=work.rule,
+            "frame", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule, judge=work.rule,
             seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
-            check_every=LOOK if target is not None else max(LOOK, self.most // 2),
+            check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.made()
         begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
-        work.gaussians = _seen(work, refine(work.run, start, work.train, work.check, options, begin))
+        work.gaussians = _drop_undrawn(work, refine(work.run, start, work.train, work.check, options, begin))
 
 
-def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
-    """`drawn_by_all`; where that leaves out many, the mass is counted as the check views agree."""
-    kept = drawn_by_all(gaussians, work.fit.size)
+def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
+    """Apply `without_undrawn`; where that removes many, count the mass in the way that the check views prefer."""
+    kept = without_undrawn(gaussians, work.fit.size)
     if len(kept) >= MOST * len(gaussians):
         return kept
-    return max(kept, drawn_by_all(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
+    return max(kept, without_undrawn(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
 
 
 def refine(
     run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions,
     begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None,
 ) -> Gaussians:  # fmt: skip
-    """The stage: the best that the check views have seen, as a file holds it; ``start`` where nothing was better.
+    """Run the stage and return the best Gaussians by the check views, as a file holds them.
 
-    Descent begins with the Gaussians of ``begin``, where they are given, with the dB of ``start`` on the check views;
-    of ``free`` (K,) bool only those move.
+    Args:
+        run: gets the stage.
+        start: Gaussians to improve, returned where nothing was better.
+        train: views to fit to.
+        check: views to judge by.
+        options: options of descent.
+        begin: wider Gaussians that descent begins with, and the dB of ``start`` on the check views.
+        free: (K,) bool, the Gaussians that may move; None for all.
     """
-    with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
+    with run.stage("refinement") as stage, run.console.interruption(run.console.message) as stop:
         descend = partial(
             optimize,
             start if begin is None else begin[0],
@@ -135,37 +141,37 @@ def _on_its_device(
         try:
             if (reason := unfit(descend.args[0], options)) is None:
                 return descend(options=options)
-            run.console.say(f"{reason}: steps are taken on the CPU")
+            run.console.message(f"{reason}: steps are taken on the CPU")
         except DeviceFailed as failed:
-            run.console.say(f"the GPU failed ({failed}); steps are taken on the CPU")
+            run.console.message(f"the GPU failed ({failed}); steps are taken on the CPU")
     return descend(options=replace(options, device="cpu"))
 
 
 def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
-    parts = [f"{record.steps} steps ({options.method})"]
+    notes = [f"{record.steps} steps ({options.method})"]
     if 0 < record.kept < record.steps:
-        parts.append(f"best after {record.kept}")
+        notes.append(f"best after {record.kept}")
     if REASONS[record.reason]:
-        parts.append(REASONS[record.reason])
-    return ", ".join(parts) + f"; from {record.psnr_before:.2f} dB on the check views"
+        notes.append(REASONS[record.reason])
+    return ", ".join(notes) + f"; from {record.psnr_before:.2f} dB on the check views"
 
 
-def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
-    """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
+def without_undrawn(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
+    """Remove splats that viewers discard, which never reach 1/255; small ones are widened first, keeping their mass.
 
-    Arguments as of `widened_small`.
+    Arguments are those of `widen_small`.
     """
-    found, kept = widened_small(gaussians, size, dilation)
+    found, kept = widen_small(gaussians, size, dilation)
     return found.take(kept) if kept.any() else gaussians
 
 
-def widened_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians of which small ones are widened with their mass kept, and (K,) bool whether they reach 1/255.
+def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
+    """Widen small Gaussians, keeping their mass, and return them with (K,) bool whether each reaches 1/255.
 
     Args:
         gaussians: in the unit frame.
-        size: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
-        dilation: px^2 that the mass is counted with; 0 as viewers count it that compensate theirs.
+        size: pixels along the edge of the screen that the file is made for; `SMALLEST` is the least width there.
+        dilation: px^2 of dilation that the mass includes; 0 for viewers that compensate theirs.
     """
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     camera = default_views("check", 1, size=size)[0]

@@ -1,4 +1,4 @@
-"""How near the result is: on the test views, and from the seats."""
+"""The scoring stages: test views and viewing conditions."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from vvgt_cli.field.workload import Workload
 from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
+    condition_pictures,
     condition_views,
-    from_above,
-    glance_cameras,
     score_conditions,
     score_texture,
-    seat_pictures,
+    screens,
+    texture_cameras,
 )
-from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored
+from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_views
 
-SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
-TEXTURE = 0.05  # seconds beside the reference per 400 x 400 px
-SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
+SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones, extra seconds per 400 x 400 px
+TEXTURE = 0.05  # extra seconds per 400 x 400 px
+CONDITIONS = 2, 0.15, 0.155  # check views, and extra seconds: fixed, per 100,000 Gaussians
 
 
 @dataclass(frozen=True)
 class TestViews(Stage):
-    """Views that nothing was fitted to.
+    """Scores on views that nothing was fitted to.
 
     Attributes:
-        whole: all ten, by SSIM and FLIP too.
+        whole: whether to score all ten views, by SSIM and FLIP too.
     """
 
     __test__ = False  # not pytest's
@@ -40,21 +40,23 @@ class TestViews(Stage):
     scores: ClassVar[bool] = True
     whole: bool = False
 
-    def cost(self, case: Workload) -> Cost:
-        """By pixels."""
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost by pixels."""
         views, whole, beside = SCORE_ALL if self.whole else SCORE
-        pixels = whole * case.size**2 + (views - whole) * case.test_view_pixels
-        return Cost(case.reference_seconds(pixels) + case.pace * beside * pixels / 400**2)
+        pixels = whole * workload.size**2 + (views - whole) * workload.test_view_pixels
+        return Cost(workload.reference_seconds(pixels) + workload.pace * beside * pixels / 400**2)
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """What is scored."""
+        """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
         only = None if self.whole else PREVIEW_VIEWS
-        return [Picture(camera, RenderSettings(), part) for _, camera, part in scored(fit.size, self.whole, only)]
+        return [
+            Picture(camera, RenderSettings(), blocks) for _, camera, blocks in scored_views(fit.size, self.whole, only)
+        ]
 
     def run(self, work: Work) -> None:
-        """Score."""
+        """Score the Gaussians."""
         from vvgt_cli.dvr import RenderSettings
 
         fit, run = work.fit, work.run
@@ -75,38 +77,42 @@ class TestViews(Stage):
 
 @dataclass(frozen=True)
 class ViewingConditions(Stage):
-    """Every rule at the size made for and above, and texture on smooth areas; left out where time is up."""
+    """Scores by every rule at the target size and above, and of texture on smooth areas; skipped where time is up."""
 
-    name: ClassVar[str] = "seats"
+    name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
 
-    def cost(self, case: Workload) -> Cost:
-        """By pixels and Gaussians."""
-        near = (case.size // 2) ** 2
-        beside = SEATS[1] + SEATS[2] * case.gaussians / 1e5 + TEXTURE * near / 400**2
-        return Cost(SEATS[0] * case.check_view_seconds + case.reference_seconds(near) + case.pace * beside)
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost by pixels and Gaussians."""
+        near = (workload.size // 2) ** 2
+        store_beside = CONDITIONS[1] + CONDITIONS[2] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
+        return Cost(
+            CONDITIONS[0] * workload.check_view_seconds
+            + workload.reference_seconds(near)
+            + workload.pace * store_beside
+        )
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """What is scored."""
+        """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = seat_pictures(from_above(fit.size), SIDE, FEW)
-        seats = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
-        return [*seats, *(Picture(camera, RenderSettings()) for camera in glance_cameras(fit.size))]
+        wanted = condition_pictures(screens(fit.size), SIDE, FEW)
+        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+        return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
     def run(self, work: Work) -> None:
-        """Score."""
+        """Score the Gaussians."""
         from vvgt_cli.dvr import RenderSettings
 
         run, budget, fit = work.run, work.limits.time_budget, work.fit
         if budget is not None and run.elapsed() > budget:
-            run.leave_out(self.name, "time is up")
+            run.skip(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = condition_views(work.field.views, from_above(fit.size), settings, views=SIDE, enough=FEW)
-            seats = score_conditions(made, seen)
-            run.report.seats = [asdict(seat) for seat in seats]
-            near, views = glance_cameras(fit.size), work.field.views
+            seen = condition_views(work.field.views, screens(fit.size), settings, views=SIDE, enough=FEW)
+            conditions = score_conditions(made, seen)
+            run.report.conditions = [asdict(condition) for condition in conditions]
+            near, views = texture_cameras(fit.size), work.field.views
             run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))
-            stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+            stage.note = f"worst of {len(conditions)}: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"

@@ -122,8 +122,8 @@ def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
     length = np.exp(first + (last - first) * share[:, 2])
     gradient = (stream[:, 4:7].astype(np.float64) - 128) / 127
     labelled = any(layer["labels"] for layer in layers) or len(layers) > 1
-    carried = [value, spread, length, gradient, *([row - rows[number]] if labelled else [])]
-    found: np.ndarray = np.column_stack([*carried, *([number] if len(layers) > 1 else [])]).astype(np.float32)
+    columns = [value, spread, length, gradient, *([row - rows[number]] if labelled else [])]
+    found: np.ndarray = np.column_stack([*columns, *([number] if len(layers) > 1 else [])]).astype(np.float32)
     return found
 
 

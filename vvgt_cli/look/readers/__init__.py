@@ -1,4 +1,4 @@
-"""Transfer functions from files and names: `read_transfer_function`."""
+"""`read_transfer_function`: transfer functions from files and names."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["read_transfer_function"]
 
 
 def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -> TransferFunction:
-    """Read a transfer function; the format of a file is told by its content.
+    """Read a transfer function; a file's format is recognised by its content.
 
     Args:
-        source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
-            which formats), or a name (`vvgt_cli.look.readers.names`): one of ours, or a matplotlib colour map with an
-            opacity ramp, ``NAME[:LO,HI[:MAX]]``; or the parsed content of such a JSON file.
+        source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room list the
+            formats), or a name (`vvgt_cli.look.readers.names`): one of ours, or a matplotlib colour map with an opacity
+            ramp, ``NAME[:LO,HI[:MAX]]``; or the parsed content of such a JSON file.
 
     Returns:
-        The function; `vvgt_cli.look.resolve.resolve` puts it on the data.
+        The function; `vvgt_cli.look.resolve.resolve` maps it to the data.
 
     Raises:
         DataError: the file is not a transfer function, or a faulty one.
@@ -62,7 +62,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
 
 
 def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
-    """The function of a parsed file, by the first format that matches."""
+    """Return the function of a parsed file, by the first format that matches."""
     for reader in FORMATS:
         if reader.matches(parsed):
             result: TransferFunction = reader.read(parsed, what, pick)

@@ -1,4 +1,4 @@
-"""Files parsed as JSON, XML or lines, and checked access to what they hold: every error names file and field."""
+"""Parsing of JSON, XML and lines with checked access to their fields: every error names file and field."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_BYTES = 16 * 2**20
 
 @dataclass(frozen=True)
 class Elements:
-    """The elements of an XML file in the order of their start tags: names in lower case, attributes."""
+    """Elements of an XML file in the order of their start tags: names in lower case, attributes."""
 
     root: str
     items: list[tuple[str, dict[str, str]]]
@@ -28,16 +28,16 @@ class Elements:
 
 @dataclass(frozen=True)
 class Lines:
-    """The lines of a text file, stripped, without blank ones."""
+    """Lines of a text file, stripped, without blank ones."""
 
     items: list[str]
 
 
 def load(path: Path) -> Any:
-    """Parse a UTF-8 file of at most 16 MiB: `Elements` if it begins as XML, `Lines` if with a line of numbers, or JSON.
+    """Parse a UTF-8 file of at most 16 MiB: `Elements` if it starts as XML, `Lines` if with numbers, or JSON.
 
     Raises:
-        DataError: too large, not readable, not UTF-8, neither of the three.
+        DataError: too large, not readable, not UTF-8, or none of the three.
     """
     text = text_of(path)
     if text.lstrip()[:1] == "<":
@@ -53,7 +53,7 @@ def _elements(text: str, path: Path) -> Elements:
     parser = expat.ParserCreate("utf-8")  # whatever the text calls itself
 
     def refuse(*_: Any) -> None:
-        raise DataError(f"{path}: XML that declares entities; expected a transfer function without")
+        raise DataError(f"{path}: XML that declares entities; expected a transfer function without them")
 
     parser.StartElementHandler = lambda tag, attributes: items.append((tag.lower(), attributes))
     parser.EntityDeclHandler = refuse
@@ -65,7 +65,7 @@ def _elements(text: str, path: Path) -> Elements:
 
 
 def text_of(path: Path, what: str = "a transfer function") -> str:
-    """The text of a UTF-8 file of at most 16 MiB; ``what`` is expected there.
+    """Return the text of a UTF-8 file of at most 16 MiB; ``what`` is expected there.
 
     Raises:
         DataError: too large, not readable, not UTF-8.
@@ -88,7 +88,7 @@ def text_of(path: Path, what: str = "a transfer function") -> str:
 
 
 def json_of(text: str, path: Path, what: str = "a ParaView preset or a minimal transfer function") -> Any:
-    """What a JSON text holds; ``what`` is expected there.
+    """Return the content of a JSON text; ``what`` is expected there.
 
     Raises:
         DataError: not JSON.
@@ -104,7 +104,7 @@ def json_of(text: str, path: Path, what: str = "a ParaView preset or a minimal t
 
 
 def number(what: str, value: Any) -> float:
-    """A finite float, or DataError."""
+    """Return a finite float, or raise DataError."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DataError(f"{what}: {_shown(value)}; expected a number")
     try:
@@ -117,7 +117,7 @@ def number(what: str, value: Any) -> float:
 
 
 def floats(what: str, text: str) -> list[float]:
-    """The numbers of a text, separated by white space; finite, or DataError."""
+    """Return the finite numbers of a text, separated by white space, or raise DataError."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
@@ -128,7 +128,7 @@ def floats(what: str, text: str) -> list[float]:
 
 
 def attribute(what: str, attributes: dict[str, str], key: str) -> float:
-    """A number of an XML element's attributes, or DataError."""
+    """Return the number in an XML attribute, or raise DataError."""
     values = floats(f"{what} {key}", attributes.get(key, ""))
     if len(values) != 1:
         raise DataError(f"{what} {key}: {_shown(attributes[key])}; expected one number")
@@ -136,7 +136,7 @@ def attribute(what: str, attributes: dict[str, str], key: str) -> float:
 
 
 def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:
-    """A flat list of numbers as rows of ``width``, (n, width) float64, n >= 1.
+    """Return a flat list of numbers as rows of ``width``, (n, width) float64, n >= 1.
 
     Raises:
         DataError: not a list, empty, a length that ``width`` does not divide, an entry that is no finite number.
@@ -148,7 +148,7 @@ def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:
 
 
 def rgb(what: str, value: Any) -> tuple[float, float, float]:
-    """Three numbers in [0, 1], or DataError."""
+    """Return three numbers in [0, 1], or raise DataError."""
     if not isinstance(value, list) or len(value) != 3:
         raise DataError(f"{what}: {_shown(value)}; expected three numbers in [0, 1]")
     red, green, blue = (number(what, v) for v in value)
@@ -158,7 +158,7 @@ def rgb(what: str, value: Any) -> tuple[float, float, float]:
 
 
 def named(what: str, error: DataError) -> DataError:
-    """The same error with the file's name in front."""
+    """Return the same error with the file's name in front."""
     return DataError(f"{what}: {error}")
 
 

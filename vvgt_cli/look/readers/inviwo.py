@@ -19,18 +19,18 @@ REFERENCE_STEP = 1 / 150
 
 
 def matches(parsed: Any) -> bool:
-    """Whether it is XML of Inviwo's with points."""
+    """Return whether it is Inviwo's XML with points."""
     return isinstance(parsed, Elements) and parsed.root.startswith("inviwo")
 
 
 def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
-    """The function of the file; of versions before 2 too, which write ``dataPoints`` and positions with x and y.
+    """Return the function of the file; versions before 2, with ``dataPoints`` and positions x and y, are read too.
 
     Raises:
-        DataError: no points, a field that is not what it must be, ``pick`` of a preset by name.
+        DataError: no points, an invalid field, ``pick`` of a preset by name.
     """
     if pick:
-        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+        raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     places, colors, facts = [], [], {"maskmin": 0.0, "maskmax": 1.0, "type": 0.0}
     for tag, attributes in parsed.items:
         if tag in facts:
@@ -56,7 +56,7 @@ def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
 
 
 def _masked(opacity: PiecewiseOpacity, lo: float, hi: float, fraction: bool) -> PiecewiseOpacity:
-    """The opacity cut to nothing outside of [lo, hi] by steps; a mask of everything changes nothing."""
+    """Cut the opacity to zero outside [lo, hi]; a mask of the whole range changes nothing."""
     if (lo <= 0 and hi >= 1) if fraction else (lo, hi) == (0, 1):  # the defaults, which are fractions
         return opacity
     if not lo < hi:

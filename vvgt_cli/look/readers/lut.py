@@ -61,17 +61,17 @@ def _clut(text: str, path: Path) -> dict[str, Any]:
         columns = dict(zip("RGBA", map(list, zip(*nodes, strict=True)), strict=True))
         return columns | {"I": places} | {key: float(found.get(key, 0)) for key in ("min", "max")}
     except (configparser.Error, KeyError, ValueError) as error:
-        said = " ".join(str(error).split())[:80]
-        raise DataError(f"{path}: {said}; expected numnodes, nodeintensity0=0, nodergba0=R|G|B|A, ...") from None
+        reason = " ".join(str(error).split())[:80]
+        raise DataError(f"{path}: {reason}; expected numnodes, nodeintensity0=0, nodergba0=R|G|B|A, ...") from None
 
 
 def matches(parsed: Any) -> bool:
-    """Tell whether it is a colour map of niivue, or one that `load` returned."""
+    """Return whether it is a colour map of niivue, or one that `load` returned."""
     return isinstance(parsed, dict) and {"R", "G", "B"} <= set(parsed)
 
 
 def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
-    """Make the function of a colour map; without ``A`` its opacity is niivue's, 0 at the first node and 64 at others.
+    """Return the function of a colour map; without ``A`` opacity is niivue's, 0 at the first node and 64 at others.
 
     Raises:
         DataError: lists of different lengths, positions that do not ascend from 0, values outside of 0 to 255,

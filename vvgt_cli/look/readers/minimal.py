@@ -39,18 +39,18 @@ POINT_KEYS = {"x", "rgb", "opacity"}
 
 
 def matches(parsed: Any) -> bool:
-    """Whether parsed JSON is an object with points."""
+    """Return whether parsed JSON is an object with points."""
     return isinstance(parsed, dict) and "points" in parsed
 
 
 def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
-    """The function that the object describes (see the module).
+    """Return the function that the object describes.
 
     Raises:
-        DataError: an unknown key, a field that is not what it must be, ``pick`` of a preset by name.
+        DataError: an unknown key, an invalid field, ``pick`` of a preset by name.
     """
     if pick:
-        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+        raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     unknown = sorted(set(parsed) - KEYS)
     if unknown:
         raise DataError(f"{what}: unknown key {unknown[0]!r}; expected {', '.join(sorted(KEYS))}")
@@ -87,7 +87,7 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
 
 
 def _otherwise(parsed: dict[str, Any], what: str) -> TransferFunction | None:
-    """The function of points in another range, that is otherwise the same."""
+    """Return the function for data that are not in Hounsfield units: other points and range, all else the same."""
     inner = parsed.get("otherwise")
     if inner is None:
         return None
@@ -106,7 +106,7 @@ def _lighting(value: Any, what: str) -> Lighting | None:
 
 
 def _range(value: Any, what: str) -> tuple[str, float, float]:
-    """Domain of the points and the range they are fractions of ((0, 0): none)."""
+    """Return the domain of the points and the range that they are fractions of ((0, 0): none)."""
     if value is None:
         return "data", 0.0, 0.0
     if value in DOMAINS:
@@ -120,7 +120,7 @@ def _range(value: Any, what: str) -> tuple[str, float, float]:
 
 
 def _points(value: Any, what: str) -> tuple[list[tuple[float, float]], list[tuple[float, tuple[float, float, float]]]]:
-    """(x, opacity) and (x, rgb) of the points."""
+    """Return (x, opacity) and (x, rgb) of the points."""
     if not isinstance(value, list) or not value or not all(isinstance(p, dict) for p in value):
         raise DataError(f"{what}: points; expected a list of objects with x, rgb and opacity")
     opacities, colors = [], []

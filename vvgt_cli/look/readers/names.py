@@ -33,7 +33,7 @@ def _entries() -> dict[str, dict[str, Any]]:
 
 
 def names() -> dict[str, str]:
-    """Return what each named function shows, by name."""
+    """Return a description of each named function, by name."""
     return {name: str(entry["shows"]) for name, entry in _entries().items()}
 
 
@@ -41,7 +41,7 @@ def named_function(name: str) -> TransferFunction:
     """Return one of our functions; its opacity is per a share of the box's longest edge.
 
     Raises:
-        KeyError: none has that name.
+        KeyError: no function has that name.
     """
     return minimal.read(_entries()[name]["function"], name)
 

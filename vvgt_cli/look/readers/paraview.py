@@ -26,7 +26,7 @@ SPACE_OF = {name.lower(): name for name in SPACES} | OTHER_NAMES
 
 
 def matches(parsed: Any) -> bool:
-    """Tell whether it is a preset, an array of presets, or XML with a ColorMap."""
+    """Return whether it is a preset, an array of presets, or XML with a ColorMap."""
     if isinstance(parsed, Elements):
         return any(tag == "colormap" for tag, _ in parsed.items)
     presets = parsed if isinstance(parsed, list) else [parsed]
@@ -38,11 +38,10 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
 
     ``RGBPoints`` is flat (x, r, g, b), ``Points`` flat (x, opacity, midpoint, sharpness), ``OpacityPoints`` of vtk.js
     flat (x, opacity). Without either (opacity was not exported) it is a linear ramp from 0 to 1 over the range, and the
-    name says so. HSV goes the short way round only with ``HSVWrap``: ParaView writes it where it is not 0.
+    name says so. HSV takes the short way round only with ``HSVWrap``: ParaView writes it where it is not 0.
 
     Raises:
-        DataError: several presets and no ``pick``, a categorical preset, an indexed map, a field that is not what it
-            must be.
+        DataError: several presets and no ``pick``, a categorical preset, an indexed map, or an invalid field.
     """
     presets = _of_xml(parsed, what) if isinstance(parsed, Elements) else parsed
     preset = choose(presets if isinstance(presets, list) else [presets], what, pick)
@@ -57,7 +56,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
     if stated not in SPACE_OF:
         raise DataError(f"{what}: ColorSpace {preset['ColorSpace']!r}; expected one of {', '.join(SPACES)}")
     if unused := [key for key in UNUSED if preset.get(key)]:
-        warnings.warn(f"{what}: {', '.join(unused)} not used; expected colours from RGBPoints alone", stacklevel=2)
+        warnings.warn(f"{what}: {', '.join(unused)} not used; colours come from RGBPoints alone", stacklevel=2)
     name = str(preset.get("Name", "")).strip() or "ParaView preset"
     if "OpacityPoints" in preset:
         opacity_nodes = table(f"{what}: OpacityPoints", preset["OpacityPoints"], 2, "x, opacity")
@@ -85,7 +84,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
 
 
 def _of_xml(parsed: Elements, what: str) -> list[dict[str, Any]]:
-    """Return the colour maps of an XML file as presets; ``indexed`` says which are."""
+    """Return the colour maps of an XML file as presets, those that are ``indexed`` marked."""
     presets: list[dict[str, Any]] = []
     for tag, cased in parsed.items:
         attributes = {key.lower(): value for key, value in cased.items()}
@@ -111,6 +110,7 @@ def _of_xml(parsed: Elements, what: str) -> list[dict[str, Any]]:
 
 
 def choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any]:
+    """Return the preset that ``pick`` names, or the only one."""
     names = [str(p.get("Name", "")) for p in presets]
     if pick:
         if pick not in names:

@@ -30,7 +30,7 @@ _LIGHT = {"ambient": "ambient", "diffuse": "diffuse", "specular": "specular", "s
 
 
 def matches(parsed: Any) -> bool:
-    """Whether it is a volume property of any of the forms."""
+    """Return whether it is a volume property in any of the forms."""
     if isinstance(parsed, Lines):
         return True
     if isinstance(parsed, Elements):
@@ -42,15 +42,15 @@ def matches(parsed: Any) -> bool:
 
 
 def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
-    """The function of a volume property.
+    """Return the function of a volume property.
 
     Raises:
-        DataError: too few lines, a count that is not that of the numbers, a field that is not what it must be, several
-            presets and no ``pick``, or ``pick`` where there are none.
+        DataError: too few lines, a count that is not that of the numbers, an invalid field, several presets and no
+            ``pick``, or ``pick`` where there are none.
     """
     several = isinstance(parsed, list | Elements) or "colorTransfer" in getattr(parsed, "keys", dict)()
     if pick and not several:
-        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+        raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     try:
         if isinstance(parsed, Lines):
             if len(parsed.items) < 9:
@@ -72,7 +72,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
 
 
 def _counted(what: str, line: str, width: int) -> np.ndarray:
-    """A line of a count and as many numbers, as rows."""
+    """Return the numbers of a line, after their count, as rows."""
     count, *values = floats(what, line)
     if count != len(values) or not values or len(values) % width:
         raise DataError(f"{what}: {len(values)} numbers after the count {count:g}; expected that many, {width} a node")
@@ -80,13 +80,13 @@ def _counted(what: str, line: str, width: int) -> np.ndarray:
 
 
 def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunction:
-    """The function of a preset whose ``scalarOpacity``, ``gradientOpacity``, ``colorTransfer`` are lines of numbers."""
+    """Return the function of a preset with ``scalarOpacity``, ``gradientOpacity``, ``colorTransfer`` as lines."""
     opacity, gradient, color = (fields.get(key, "") for key in ("scalarOpacity", "gradientOpacity", "colorTransfer"))
     if not all(isinstance(field, str) for field in (opacity, gradient, color)):
         raise DataError("scalarOpacity, gradientOpacity and colorTransfer; expected text, a count and numbers each")
     nodes, colors = _counted("scalar opacity", opacity, 2), _counted("colours", color, 4)
     slopes = _counted("gradient opacity", gradient, 2)[:, 1] if gradient.strip() else np.ones(1)
-    _say_unused(what, bool((slopes != 1).any()))
+    _warn_unused(what, bool((slopes != 1).any()))
     distance = fields.get("scalarOpacityUnitDistance")
     label = "file" if distance is not None else DEFAULT
     return TransferFunction(
@@ -99,14 +99,14 @@ def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunct
     )
 
 
-def _say_unused(what: str, gradient: bool) -> None:
-    """Say once what a file asks for and is not done."""
+def _warn_unused(what: str, gradient: bool) -> None:
+    """Warn that a file's gradient opacity is not used."""
     if gradient:
         warnings.warn(f"{what}: gradient opacity not used", stacklevel=3)
 
 
 def _lighting(what: str, fields: Mapping[str, Any]) -> Lighting | None:
-    """The light of a volume property that is shaded."""
+    """Return the light of a shaded volume property, else None."""
     shade = str(fields.get("shade", "")).strip().lower() in ("1", "true")
     given = {name: floats(key, str(fields[key]))[0] for key, name in _LIGHT.items() if key in fields} if shade else {}
     return preset_lighting(what, shade, given)
@@ -116,36 +116,36 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
     properties = parsed["volumeProperties"]
     first = properties[0] if isinstance(properties, list) and properties else None
     first = first if isinstance(first, dict) else {}
-    parts = first.get("components")
-    if not isinstance(parts, list) or not parts or not isinstance(parts[0], dict):
+    components = first.get("components")
+    if not isinstance(components, list) or not components or not isinstance(components[0], dict):
         raise DataError("volumeProperties; expected a list of objects with components")
-    part = parts[0]
-    opacity = [(_x(p), number("scalarOpacity y", p.get("y")), *_bend(p)) for p in _points(part, "scalarOpacity")]
-    key = "rgbTransferFunction" if "rgbTransferFunction" in part else "grayTransferFunction"
-    points = _points(part, key)
+    component = components[0]
+    opacity = [(_x(p), number("scalarOpacity y", p.get("y")), *_bend(p)) for p in _points(component, "scalarOpacity")]
+    key = "rgbTransferFunction" if "rgbTransferFunction" in component else "grayTransferFunction"
+    points = _points(component, key)
     if key == "rgbTransferFunction":
         colors = [rgb(f"{key} color", p.get("color")) for p in points]
     else:
         colors = [(grey, grey, grey) for grey in (number(f"{key} y", p.get("y")) for p in points)]
     bends = np.array([_bend(p) for p in points])
-    gradient = part.get("gradientOpacity") and not part.get("disableGradientOpacity")
-    slopes = [p.get("y") for p in _points(part, "gradientOpacity")] if gradient else []
-    lighting = part.get("lighting")
-    light = {**(lighting if isinstance(lighting, dict) else {}), "shade": part.get("shade")}
-    _say_unused(what, any(y != 1 for y in slopes))
-    distance = number("scalarOpacityUnitDistance", part.get("scalarOpacityUnitDistance", UNIT_DISTANCE))
+    gradient = component.get("gradientOpacity") and not component.get("disableGradientOpacity")
+    slopes = [p.get("y") for p in _points(component, "gradientOpacity")] if gradient else []
+    lighting = component.get("lighting")
+    light = {**(lighting if isinstance(lighting, dict) else {}), "shade": component.get("shade")}
+    _warn_unused(what, any(y != 1 for y in slopes))
+    distance = number("scalarOpacityUnitDistance", component.get("scalarOpacityUnitDistance", UNIT_DISTANCE))
     return TransferFunction(
         "volume property",
         PiecewiseOpacity(*np.array(opacity).T),
         ColorMap(np.array([_x(p) for p in points]), np.array(colors), bends[:, 0], bends[:, 1]),
         distance,
-        opacity_unit_label="file" if "scalarOpacityUnitDistance" in part else DEFAULT,
+        opacity_unit_label="file" if "scalarOpacityUnitDistance" in component else DEFAULT,
         lighting=_lighting(what, light),
     )
 
 
-def _points(part: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    function = part.get(key)
+def _points(component: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    function = component.get(key)
     points = function.get("points") if isinstance(function, dict) else None
     if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
         raise DataError(f"{key}; expected an object with points")

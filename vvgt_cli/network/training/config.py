@@ -1,4 +1,4 @@
-"""What a training run does, in one dataclass, and its YAML file."""
+"""Configuration of a training run, as a dataclass and as YAML."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ GROWTH = 1.3  # of Gaussians with the size of images
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Which scenes are made of the volumes.
+    """Scenes to make from the volumes.
 
     Attributes:
         size: pixels along an image's edge, or several, of which each scene gets one.
-        gaussians: fewest and most Gaussians of a scene at the first size, drawn evenly by their logarithm; as many more
-            as the size is larger, to the power `GROWTH`.
-        start: what the network is given, a method of `vvgt_cli.closed_form`; "uniform" for the ablation "wo_vbm".
-        back_projection: improve it by back-projection of the views, as `vvgt convert` does; without, the closed form
-            alone.
-        functions: transfer functions suggested a volume.
+        gaussians: smallest and largest number of Gaussians of a scene at the first size, drawn log-uniformly; it grows
+            with the size to the power `GROWTH`.
+        start: initial Gaussians, a method of `vvgt_cli.closed_form`; "uniform" for the ablation "wo_vbm".
+        back_projection: improve them by back-projection of the views, as `vvgt convert` does.
+        functions: transfer functions suggested per volume.
         held_functions: those of them (from 0) that are never trained on.
-        per_volume: scenes to train on of each volume, each with a function of its own.
-        bands: fewest and most of the suggested functions in a scene's function.
-        densities: least and largest factor of a band's extinction, drawn evenly by its logarithm: fog and solid bodies.
-        inputs: views that the network may be shown, the default training set.
-        targets: other views, that the loss is taken on.
+        per_volume: training scenes per volume, each with a function of its own.
+        bands: smallest and largest number of suggested functions in a scene's function.
+        densities: smallest and largest factor of a band's extinction, drawn log-uniformly: fog and solid bodies.
+        inputs: views that the network may read, the default training set.
+        targets: other views, for the loss.
         held: scenes of held-out volumes, and as many of held-out functions.
-        seed: of what is drawn here.
+        seed: random seed of the scenes.
     """
 
     size: int | tuple[int, ...] = 256
@@ -52,6 +51,7 @@ class SceneConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         for name in ("gaussians", "held_functions", "bands", "densities"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not isinstance(self.size, int):
@@ -72,21 +72,21 @@ class SceneConfig:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """All sizes of images."""
+        """Return all sizes of images."""
         return (self.size,) if isinstance(self.size, int) else self.size
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the loss, of one rendered view.
+    """Weights of the loss of a rendered view.
 
     Attributes:
         l1: mean absolute difference of RGBA.
         ssim: 1 - SSIM of RGB.
         decibel: minus a tenth of the gain in PSNR over the Gaussians that the network was given (not in the paper):
             scenes of 30 and of 45 dB count alike.
-        lpips: LPIPS of RGB (the paper: 0.05), where both its files are given.
-        lpips_backbone: VGG-16 as torchvision has it.
+        lpips: LPIPS of RGB (the paper: 0.05), which needs both its files.
+        lpips_backbone: VGG-16 as torchvision stores it.
         lpips_linear: LPIPS' linear weights for it, version 0.1.
     """
 
@@ -98,6 +98,7 @@ class LossConfig:
     lpips_linear: str = ""
 
     def __post_init__(self) -> None:
+        """Check the weights."""
         weights = self.l1, self.ssim, self.decibel, self.lpips
         if min(weights) < 0 or not sum(weights) > 0:
             raise UsageError("loss: weights must be at least 0, one of them above")
@@ -107,20 +108,20 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A run: everything but the folders.
+    """A training run, without its folders.
 
     Attributes:
-        network, scenes, loss: see there.
+        network, scenes, loss: configurations.
         steps: of the optimiser.
-        batch: scenes a step, over all processes.
-        views: target views that the loss of a scene is taken on.
-        view_sets: choices of views to show, drawn once for each scene; images and slopes of each are made once.
+        batch: scenes per step, over all processes.
+        views: target views in the loss of a scene.
+        view_sets: sets of input views, drawn once for each scene; images and slopes of each are made once.
         keep: inputs kept in memory, a few megabytes each.
         rate, last_rate: AdamW's, from the end of the warm-up down to the last step along a cosine.
         warmup: steps of a linear rise.
         weight_decay: AdamW's.
         clip: largest norm of the gradient; a longer one is shortened.
-        check_every: steps between two looks at the held-out scenes.
+        check_every: steps between two validations.
         save_every: steps between two checkpoints.
         seed: of weights, scenes and views.
     """
@@ -143,6 +144,7 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         counts = ("steps", "batch", "views", "view_sets", "keep", "check_every", "save_every")
         if min(getattr(self, name) for name in counts) < 1 or self.warmup < 0:
             raise UsageError(f"train config: {', '.join(counts)} must be at least 1, warmup at least 0")
@@ -159,19 +161,19 @@ class TrainConfig:
         if self.loss.lpips and min(self.scenes.sizes) < SMALLEST_LPIPS:
             raise UsageError(f"loss.lpips: pictures of {min(self.scenes.sizes)} px; expected {SMALLEST_LPIPS} or more")
         if not self.network.has_geometry and self.loss.decibel:
-            raise UsageError("loss.decibel compares with the Gaussians given; the variant wo_3dt is given none")
+            raise UsageError("loss.decibel compares with the Gaussians given; the variant wo_3dt gets none")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
-        """Defaults, with ``values`` in their place; ``network`` may be the name of a configuration.
+        """Return the defaults updated by ``values``; ``network`` may be the name of a configuration.
 
         Raises:
-            DataError: a field that is unknown, or of a value that makes no run.
-            UsageError: values that do not go together.
+            DataError: an unknown field, or an invalid value.
+            UsageError: values that do not fit together.
         """
         values = dict(values)
         network = values.pop("network", "small")
@@ -189,7 +191,7 @@ class TrainConfig:
 
 
 def read_config(path: str | Path) -> TrainConfig:
-    """A configuration from YAML; fields that are left out have their defaults.
+    """Read a configuration from YAML; missing fields have their defaults.
 
     Raises:
         UsageError: no such file, or PyYAML is missing.
@@ -211,13 +213,13 @@ def read_config(path: str | Path) -> TrainConfig:
 
 
 def config_text(config: TrainConfig) -> str:
-    """The YAML that `read_config` reads."""
+    """Return the YAML that `read_config` reads."""
     plain = lists(config.to_dict())
     return str(_yaml().safe_dump(plain, sort_keys=False))
 
 
 def lists(value: Any) -> Any:
-    """Without tuples: YAML's safe form has none, checkpoints and cards do not tell them from lists."""
+    """Replace tuples by lists: YAML's safe form has no tuples."""
     if isinstance(value, dict):
         return {key: lists(entry) for key, entry in value.items()}
     return [lists(entry) for entry in value] if isinstance(value, tuple | list) else value

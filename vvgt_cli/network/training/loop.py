@@ -1,4 +1,4 @@
-"""The loop: AdamW along a cosine, checkpoints, runs that go on where they ended to the bit."""
+"""Training loop: AdamW along a cosine, checkpoints, and runs that resume with bitwise identical results."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Scenes = dict[str, list[TrainingScene]]
 
 @dataclass
 class Progress:
-    """What changes from step to step beside weights and optimiser; saved with them.
+    """State of a run beside weights and optimiser, saved with them.
 
     Attributes:
         step: steps done.
-        skipped: of them, those without an update because something was not finite.
+        skipped: steps without an update because something was not finite.
         best: largest mean gain on held-out scenes so far, dB.
         seconds: of training, over all resumptions.
-        found: the last scores of the held-out scenes.
+        found: latest scores of the held-out scenes.
     """
 
     step: int = 0
@@ -50,14 +50,13 @@ class Progress:
 
 
 def train(config: TrainConfig, data: str, output: str, console: Console, ended: Sequence[int] = ()) -> int:
-    """Train to the end of the run in folder ``output``, from its last checkpoint if there is one.
+    """Train the run in folder ``output`` to its end, from its last checkpoint if there is one.
 
-    ``ended``: numbers of signals that somebody notes while it runs: the step ends first, and is saved.
-
-    Returns the exit status: 0, or 128 + the signal's number where one ended it (a checkpoint is written first).
+    The exit status is 0, or 128 + a signal's number if one ended the run; the checkpoint is written first. ``ended``
+    receives numbers of signals while it runs: the current step is completed and saved.
 
     Raises:
-        UsageError: folders that are not what they must be, or a run with another configuration.
+        UsageError: invalid folders, or a run with another configuration.
         DataError: volumes or a checkpoint that cannot be read.
     """
     folder, lpips = Path(output), load_lpips(config.loss)  # fails before the work, not after
@@ -75,7 +74,7 @@ def train(config: TrainConfig, data: str, output: str, console: Console, ended: 
 
 
 def _open_run(folder: Path, config: TrainConfig) -> None:
-    """Make the folder and its configuration, or see that the run there has the same one."""
+    """Create the folder and its configuration, or check that the existing run has the same one."""
     if not folder.parent.is_dir():
         raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
     if folder.exists() and not folder.is_dir():
@@ -93,7 +92,7 @@ def _open_run(folder: Path, config: TrainConfig) -> None:
 
 
 def rate(step: int, config: TrainConfig) -> float:
-    """Of step ``step``, from 0: a linear rise, then a cosine from ``rate`` to ``last_rate`` at the last step."""
+    """Return the rate of step ``step``, from 0: a linear rise, then a cosine from ``rate`` to ``last_rate``."""
     if step < config.warmup:
         return config.rate * (step + 1) / config.warmup
     share = (step - config.warmup) / max(config.steps - 1 - config.warmup, 1)
@@ -122,12 +121,12 @@ class _Run:
         self.progress = Progress()
         if (folder / LAST).exists():
             self._resume()
-            console.say(f"goes on from step {self.progress.step} of {config.steps}")
+            console.message(f"resuming at step {self.progress.step} of {config.steps}")
         self.recorder = Recorder(folder, self.progress.step, config.steps, console) if here.first else None
         self.console = console
 
     def to_the_end(self, ended: Sequence[int]) -> int:
-        """All steps that are left; the exit status."""
+        """Do the remaining steps; return the exit status."""
         config, state = self.config, self.progress
         stop = 0
         while state.step < config.steps and not stop:
@@ -141,11 +140,11 @@ class _Run:
         if self.recorder is not None:
             self.recorder.close()
         if stop:
-            self.console.say(f"ended by signal {stop} after step {state.step}; the same command goes on from there")
+            self.console.message(f"stopped by signal {stop} after step {state.step}; run the same command to resume")
         return 128 + stop if stop else 0
 
     def _step(self, ended: Sequence[int]) -> int:
-        """One step; a signal that some process has heard, else 0: all end after the same step."""
+        """Do one step; return a signal that any process received, else 0, so that all end after the same step."""
         config, state, here = self.config, self.progress, self.here
         self.optimizer.zero_grad(set_to_none=True)
         pace = rate(state.step, config)
@@ -159,7 +158,7 @@ class _Run:
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip))
         if bad or not math.isfinite(norm):
             state.skipped += 1
-            self.console.say(f"step {state.step + 1} skipped: {int(bad)} scenes or the gradient not finite")
+            self.console.message(f"step {state.step + 1} skipped: {int(bad)} scenes or the gradient not finite")
         else:
             for group in self.optimizer.param_groups:
                 group["lr"] = pace
@@ -200,7 +199,7 @@ class _Run:
         self._write(LAST, {"optimizer": self.optimizer.state_dict(), "progress": asdict(self.progress)})
 
     def _write(self, name: str, more: dict[str, Any]) -> None:
-        """A checkpoint that `vvgt export` reads, with ``more`` for the loop itself."""
+        """Write a checkpoint that `vvgt export` reads, with ``more`` for the loop itself."""
         if not self.here.first:
             return
         state = self.progress
@@ -222,11 +221,11 @@ class _Run:
             self.optimizer.load_state_dict(document["optimizer"])
             self.progress = Progress(**document["progress"])
         except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: not a checkpoint of a run ({error}); remove the folder to start afresh") from None
+            raise DataError(f"{path}: not a checkpoint of a run ({error}); remove the folder to start over") from None
 
 
 def commit() -> str:
-    """Of the checkout that this runs from; "unknown" elsewhere."""
+    """Return the commit of the checkout that this runs from; "unknown" outside of one."""
     here = Path(__file__).parent
     try:
         found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10)

@@ -1,4 +1,4 @@
-"""The loss of a rendered view: L1, SSIM and LPIPS as in the paper (Sec. 4.4), and the gain in PSNR."""
+"""Loss of a rendered view: L1, SSIM and LPIPS as in the paper (Sec. 4.4), and the gain in PSNR."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ TINY = 1e-10  # squared error of 100 dB
 def view_loss(
     picture: Tensor, target: Tensor, before: Tensor | None, config: LossConfig, lpips: Lpips | None = None
 ) -> Tensor:
-    """Weighted sum of the terms.
+    """Return the weighted sum of the terms.
 
     Args:
-        picture, target: (h, w, 4) premultiplied RGBA.
+        picture: (h, w, 4) premultiplied RGBA.
+        target: of the same shape.
         before: picture of the Gaussians that the network was given; for ``decibel``.
         config: weights; a term of weight 0 is not computed.
         lpips: network of the ``lpips`` term.
@@ -41,13 +42,13 @@ def view_loss(
 
 
 def decibels(picture: Tensor, target: Tensor, before: Tensor) -> Tensor:
-    """Gain in PSNR over ``before``, RGB, images (h, w, 4)."""
+    """Return the gain in PSNR over ``before``, RGB, images (h, w, 4)."""
     errors = [((image - target)[..., :3] ** 2).mean() + TINY for image in (before, picture)]
     return 10 / math.log(10) * torch.log(errors[0] / errors[1])
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM of (h, w, 3), as `vvgt_cli.images.metrics.ssim` defines it: windows that lie inside the image."""
+    """Return the mean SSIM of (h, w, 3), over windows inside the image as in `vvgt_cli.images.metrics.ssim`."""
     x = torch.arange(-RADIUS, RADIUS + 1, dtype=a.dtype, device=a.device)
     kernel = torch.exp(-0.5 * (x / SIGMA) ** 2)
     kernel = kernel / kernel.sum()

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018) with the VGG-16 backbone, weights from two files: nothing is downloaded."""
+"""LPIPS (Zhang et al. 2018) with the VGG-16 backbone; weights come from two files, nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ LINEAR = "lin{}.model.1.weight"  # of the v0.1 weights that come with the author
 
 
 class Lpips(nn.Module):
-    """Distance of two pictures, 0 for the same: squared differences of normalised features, weighted and averaged."""
+    """Distance of two pictures, 0 for equal ones: squared differences of normalised features, weighted and averaged."""
 
     def __init__(self) -> None:
+        """Create the layers, without gradients."""
         super().__init__()
         widths = [3, *(width for stage in STAGES for width in stage)]
         self.convolutions = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(widths))
@@ -31,7 +32,7 @@ class Lpips(nn.Module):
         self.requires_grad_(False)
 
     def features(self, picture: Tensor) -> list[Tensor]:
-        """(h, w, 3) in [0, 1] to the last features (1, c, h', w') before each pooling and before the end."""
+        """Return the last features (1, c, h', w') before each pooling and at the end, of (h, w, 3) in [0, 1]."""
         shift, scale = picture.new_tensor(SHIFT), picture.new_tensor(SCALE)
         x = ((2 * picture - 1 - shift) / scale).permute(2, 0, 1)[None]
         layers, found = iter(self.convolutions), []
@@ -43,7 +44,7 @@ class Lpips(nn.Module):
         return found
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Pictures (h, w, 3), at least 16 pixels a side."""
+        """Return the distance of pictures (h, w, 3), at least 16 pixels a side."""
         total = a.new_zeros(())
         for x, y, weight in zip(self.features(a), self.features(b), self.linear, strict=True):
             gap = (_unit(x) - _unit(y)) ** 2
@@ -52,12 +53,12 @@ class Lpips(nn.Module):
 
 
 def _unit(x: Tensor) -> Tensor:
-    """Features of length 1 at every place."""
+    """Return features scaled to length 1 at every place."""
     return x / (x.square().sum(dim=1, keepdim=True).sqrt() + TINY)
 
 
 def load_lpips(config: LossConfig) -> Lpips | None:
-    """With the weights that ``config`` names, every name and shape checked; None where the loss has no LPIPS.
+    """Return LPIPS with the weights that ``config`` names, names and shapes checked; None if the loss has no LPIPS.
 
     Raises:
         DataError: files that are not torchvision's VGG-16 (``vgg16-397923af.pth``) or not LPIPS' linear weights of it
@@ -73,7 +74,7 @@ def load_lpips(config: LossConfig) -> Lpips | None:
 
 
 def _backbone(path: str | Path) -> dict[str, Tensor]:
-    """VGG-16's convolutions, numbered one after the other; torchvision counts poolings and rectifiers too."""
+    """Read VGG-16's convolutions, numbered consecutively; torchvision counts poolings and rectifiers too."""
     names, place = [], 0
     for stage in STAGES:
         for _ in stage:
@@ -90,7 +91,7 @@ def _linear(path: str | Path) -> dict[str, Tensor]:
 
 
 def _taken(path: str | Path, names: dict[str, str], what: str) -> dict[str, Tensor]:
-    """Tensors of a file under our names."""
+    """Read tensors of a file under our names."""
     state = read_tensors(path)
     missing = [theirs for theirs in names.values() if not isinstance(state.get(theirs), Tensor)]
     if missing:

@@ -1,4 +1,4 @@
-"""Processes that train together: torchrun's, with gradients summed after every step."""
+"""Processes that train together under torchrun, with gradients summed after every step."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torch import Tensor, distributed, nn
 
 @dataclass(frozen=True)
 class World:
-    """This process among all.
+    """A process of a group.
 
     Attributes:
         rank: its number, from 0.
-        size: of all.
-        device: that its network is on.
+        size: number of processes.
+        device: of its network.
     """
 
     rank: int
@@ -27,21 +27,21 @@ class World:
 
     @property
     def first(self) -> bool:
-        """Whether it is the one that writes and prints."""
+        """Return whether this process writes and prints."""
         return self.rank == 0
 
     def total(self, values: Iterable[float]) -> list[float]:
-        """Sums over all processes."""
+        """Return the sums over all processes."""
         tensor = torch.tensor(list(values), dtype=torch.float64, device=self.device)
         if self.size > 1:
             distributed.all_reduce(tensor)
         return [float(value) for value in tensor.cpu()]
 
     def add_gradients(self, network: nn.Module) -> None:
-        """Every parameter's gradient becomes the sum over all processes; a missing one counts as zero.
+        """Replace every parameter's gradient by the sum over all processes; a missing one counts as zero.
 
-        One sum a step in place of torch's DistributedDataParallel: scenes come one at a time, several a step, and a
-        scene that is skipped must not leave the others waiting.
+        One sum per step replaces torch's DistributedDataParallel: scenes come one at a time, several per step, and a
+        skipped scene must not leave the others waiting.
         """
         grads: list[Tensor] = []
         for parameter in network.parameters():
@@ -56,14 +56,14 @@ class World:
             grad.copy_(part.view_as(grad))
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Wait until all processes arrive."""
         if self.size > 1:
             distributed.barrier()
 
 
 @contextmanager
 def world() -> Iterator[World]:
-    """The world that torchrun's environment tells of; one process without it. gloo on CPUs, NCCL on GPUs."""
+    """Yield the group of torchrun's environment, one process without it; gloo on CPUs, NCCL on GPUs."""
     size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     cuda = torch.cuda.is_available()
     device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if cuda else torch.device("cpu")

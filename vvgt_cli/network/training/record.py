@@ -1,4 +1,4 @@
-"""What a run writes of itself: rows of CSV, TensorBoard where it is installed, lines with the time left."""
+"""Records of a run: rows of CSV, TensorBoard if installed, lines with the remaining time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 from vvgt_cli.files import atomic_write
 from vvgt_cli.progress import Console
 
-SAY_EVERY = 20.0  # seconds
+MESSAGE_SECONDS = 20.0  # seconds
 
 
 class Table:
-    """A CSV file that grows; a run that goes on cuts what lies behind its checkpoint."""
+    """A CSV file that grows; a resumed run removes the rows after its checkpoint."""
 
     def __init__(self, path: Path, step: int) -> None:
+        """Remove rows after ``step``."""
         self.path = path
         if not path.exists():
             return
@@ -40,33 +41,34 @@ class Table:
 
 
 class Recorder:
-    """Tables ``metrics.csv`` (a row a step) and ``held.csv`` (a row a validation), TensorBoard, and messages."""
+    """Records of a run: ``metrics.csv`` (row per step), ``held.csv`` (row per validation), TensorBoard, messages."""
 
     def __init__(self, folder: Path, step: int, steps: int, console: Console) -> None:
+        """Open the tables and TensorBoard for a run that continues after ``step``."""
         self.metrics, self.held = Table(folder / "metrics.csv", step), Table(folder / "held.csv", step)
         self.board = _board(folder, step, console)
         self.console, self.first, self.steps = console, step, steps
-        self.began = self.said = time.monotonic()
+        self.began = self.reported = time.monotonic()
 
     def step(self, row: dict[str, Any]) -> None:
-        """A step is done; now and then a line with the time left."""
+        """Record a step; print a line with the remaining time every `MESSAGE_SECONDS` seconds."""
         self.metrics.add(row)
         self._plot("train", row)
         now, done = time.monotonic(), row["step"]
-        if now - self.said >= SAY_EVERY or done == self.steps:
-            self.said = now
+        if now - self.reported >= MESSAGE_SECONDS or done == self.steps:
+            self.reported = now
             left = (now - self.began) / max(done - self.first, 1) * (self.steps - done)
-            self.console.say(
+            self.console.message(
                 f"step {done} of {self.steps}: loss {row['loss']:.4f}, gain {row['gain']:+.3f} dB, "
                 f"{row['skipped']} skipped, {left / 60:.1f} minutes left"
             )
 
     def validation(self, row: dict[str, Any]) -> None:
-        """The held-out scenes have been scored."""
+        """Record the scores of the held-out scenes."""
         self.held.add(row)
         self._plot("held", row)
         found = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)
-        self.console.say(f"step {row['step']}, held out: {found}")
+        self.console.message(f"step {row['step']}, held out: {found}")
 
     def _plot(self, group: str, row: dict[str, Any]) -> None:
         if self.board is not None:
@@ -75,7 +77,7 @@ class Recorder:
                     self.board.add_scalar(f"{group}/{key}", value, row["step"])
 
     def close(self) -> None:
-        """Write what TensorBoard holds back."""
+        """Flush TensorBoard."""
         if self.board is not None:
             self.board.close()
 
@@ -84,6 +86,6 @@ def _board(folder: Path, step: int, console: Console) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        console.say("tensorboard is not installed: metrics go to CSV alone")
+        console.message("tensorboard is not installed: metrics go to CSV only")
         return None
     return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

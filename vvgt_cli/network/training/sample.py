@@ -26,7 +26,7 @@ from vvgt_cli.splat import render
 
 @dataclass
 class Tally:
-    """What a scene adds to a step's record; a scene that fails counts as ``bad`` and adds nothing."""
+    """Contribution of a scene to a step's record; a scene that fails counts as ``bad`` and adds nothing else."""
 
     loss: float = 0.0
     gain: float = 0.0
@@ -34,32 +34,33 @@ class Tally:
 
 
 def tensors(prepared: Prepared) -> dict[str, Tensor]:
-    """The network's input."""
+    """Return the network's input as tensors."""
     return {name: torch.from_numpy(np.array(array)) for name, array in prepared.arrays().items()}
 
 
 def run_network(network: Vvgt, inputs: dict[str, Tensor], device: torch.device) -> Tensor:
-    """Rows (K, 14) float32; bfloat16 within on CUDA."""
+    """Return rows (K, 14) float32, computed in bfloat16 on CUDA."""
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
         rows: Tensor = network({name: tensor.to(device) for name, tensor in inputs.items()})
     return rows.float()
 
 
 class Feeder:
-    """What the network is given of the scenes to train on, made when first asked for and kept.
+    """Network inputs of the training scenes, made on first use and kept.
 
     Slopes cost more than the rest of a step. They depend on Gaussians and views alone, so a scene's first round has
-    ``view_sets`` inputs in all. Those of round r start from what r rounds of the untrained network make of the scene:
-    plain steps downhill for the head "step", nothing for the others.
+    ``view_sets`` inputs in all. Those of round r start from the output of r rounds of the untrained network: plain
+    gradient steps for the head "step", no change for the others.
     """
 
     def __init__(self, scenes: Sequence[TrainingScene], config: TrainConfig) -> None:
+        """Keep up to ``config.keep`` inputs of ``scenes``."""
         self.scenes, self.config = scenes, config
         self.plain = Vvgt(config.network).eval()  # on the host
         self.kept: OrderedDict[tuple[int, int, int], tuple[Prepared, dict[str, Tensor]]] = OrderedDict()
 
     def give(self, scene: int, views: int, number: int) -> tuple[Prepared, dict[str, Tensor]]:
-        """Input of round ``number`` of a scene, with its view set ``views``."""
+        """Return the input of round ``number`` of a scene, with its view set ``views``."""
         key = (scene, views, number)
         if key not in self.kept:
             prepared = self._make(*key)
@@ -86,7 +87,7 @@ class Feeder:
 def accumulate_gradients(
     network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device, lpips: Lpips | None = None
 ) -> Tally:
-    """Add the gradients of the loss of a scene's round, both drawn by ``rng``: mean over views, over the batch."""
+    """Add the gradients of a random scene's loss in a random round: mean over views, over the batch."""
     config = feeder.config
     index, views, number = (int(rng.integers(n)) for n in (len(feeder.scenes), config.view_sets, config.network.rounds))
     scene, (prepared, inputs) = feeder.scenes[index], feeder.give(index, views, number)
@@ -110,7 +111,7 @@ def accumulate_gradients(
 
 @torch.no_grad()
 def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torch.device) -> list[float]:
-    """PSNR on all targets of what the network is given, and after every round."""
+    """Return the PSNR on all targets of the initial Gaussians, and after every round."""
     few, gaussians = farthest_cameras(scene.cameras, config.network.total_views), scene.gaussians
     found = [mean_psnr(gaussians, scene.targets, scene.target_images)]
     for number in range(config.network.rounds):
@@ -124,6 +125,6 @@ def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device
 
 
 def mean_psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> float:
-    """Over views; images uint16."""
+    """Return the mean PSNR over views; images uint16."""
     pairs = zip(cameras, images, strict=True)
     return float(np.mean([psnr(as_float(view)[..., :3], render(gaussians, c)[..., :3]) for c, view in pairs]))

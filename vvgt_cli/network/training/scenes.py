@@ -1,6 +1,6 @@
-"""Scenes to train on: volume x function x views, with the Gaussians to start from; made once and kept in files.
+"""Training scenes: volume x function x views, with initial Gaussians; made once and stored in files.
 
-A folder of data holds volumes in ``train/`` and ``held/``; what is made of them goes to ``scenes/``.
+A data folder holds volumes in ``train/`` and ``held/``; the scenes go to ``scenes/``.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ TARGET_SHIFT = 0.31  # of the targets' Fibonacci sphere: none of the three defau
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene to be made.
+    """A scene to make.
 
     Attributes:
         volume: file.
-        functions: numbers of the suggested functions that are shown at once, from 0.
+        functions: indices of the suggested functions that are shown together, from 0.
         densities: factors of their extinction.
         size: pixels along an image's edge.
         gaussians: budget.
@@ -52,13 +52,13 @@ class Recipe:
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """A scene that was made.
+    """A scene.
 
     Attributes:
         name: volume and function.
         gaussians: to start from.
-        cameras, images: of the views that the network may be shown; (n, h, w, 4) uint16, of a file.
-        targets, target_images: of those that the loss is taken on.
+        cameras, images: of the views that the network may read; (n, h, w, 4) uint16, memory-mapped.
+        targets, target_images: of the views of the loss.
     """
 
     name: str
@@ -70,15 +70,15 @@ class TrainingScene:
 
 
 def as_float(images: np.ndarray) -> np.ndarray:
-    """float32 in [0, 1]."""
+    """Return uint16 images as float32 in [0, 1]."""
     return images.astype(np.float32) / np.float32(FULL)
 
 
 def recipes(folder: Path, config: SceneConfig) -> dict[str, list[Recipe]]:
-    """Scenes by "train", "held volumes" and "held functions".
+    """Return recipes by "train", "held volumes" and "held functions".
 
     Raises:
-        UsageError: folders or volumes that are not there.
+        UsageError: missing folders or volumes.
     """
     rng = np.random.default_rng(config.seed)
     volumes = {part: _volumes(folder / part) for part in ("train", "held")}
@@ -111,15 +111,15 @@ def _volumes(folder: Path) -> list[str]:
 
 
 def _subset(entries: Sequence[str], count: int) -> list[str]:
-    """``count`` of them, evenly spread, again from the first where there are fewer."""
+    """Return ``count`` entries, evenly spread, repeated if there are fewer."""
     return [entries[i * len(entries) // count if len(entries) >= count else i % len(entries)] for i in range(count)]
 
 
 def make_scenes(folder: Path, config: SceneConfig, console: Console, share: tuple[int, int]) -> None:
-    """Make the scenes that are not there yet: of ``share`` (i, n) every n-th, from i.
+    """Make the missing scenes; with ``share`` (i, n) every n-th, from i.
 
     Raises:
-        UsageError, DataError: see `prepare_scenes`.
+        UsageError, DataError: as `prepare_scenes`.
     """
     (folder / "scenes").mkdir(exist_ok=True)
     for part, wanted in recipes(folder, config).items():
@@ -127,14 +127,14 @@ def make_scenes(folder: Path, config: SceneConfig, console: Console, share: tupl
             place = folder / "scenes" / _key(recipe, config)
             if number % share[1] == share[0] and not place.exists():
                 _make(place, recipe, config)
-                console.say(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
+                console.message(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
 
 
 def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[str, list[TrainingScene]]:
-    """All scenes, those made that are not there yet; a scene that shows next to nothing is left out.
+    """Return all scenes, after making missing ones; scenes with fewer than `FEWEST` Gaussians are skipped.
 
     Raises:
-        UsageError: see `recipes`; also data of which no scene is left.
+        UsageError: missing folders or volumes, or no scene that shows enough.
         DataError: a volume that cannot be read.
     """
     make_scenes(folder, config, console, (0, 1))
@@ -143,13 +143,13 @@ def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[
         places = [folder / "scenes" / _key(recipe, config) for recipe in wanted]
         out[part] = [_load(place, config) for place in places if _about(place)["gaussians"] >= FEWEST]
         if not out[part]:
-            raise UsageError(f"--data {folder}: no scene left ({part}); other volumes may show more")
-        console.say(f"{part}: {len(out[part])} scenes, {len(places) - len(out[part])} left out as empty")
+            raise UsageError(f"--data {folder}: no scene shows enough ({part}); try other volumes")
+        console.message(f"{part}: {len(out[part])} scenes, {len(places) - len(out[part])} skipped as empty")
     return out
 
 
 def _key(recipe: Recipe, config: SceneConfig) -> str:
-    """Hash of all that a scene depends on."""
+    """Return a hash of everything that a scene depends on."""
     with open(recipe.volume, "rb") as stream:
         content = hashlib.file_digest(stream, "sha256").hexdigest()
     whole = {
@@ -166,13 +166,13 @@ def _about(place: Path) -> dict[str, Any]:
 
 
 def view_sets(config: SceneConfig, size: int) -> tuple[list[Camera], list[Camera]]:
-    """Cameras to show and cameras of the loss."""
+    """Return the cameras of the input views and those of the loss."""
     shown = default_views("train", config.inputs, size=size)
     return shown, fibonacci_views(config.targets, TARGET_SHIFT, size=size, name="target")
 
 
 def _make(place: Path, recipe: Recipe, config: SceneConfig) -> None:
-    """Write a scene's folder beside its place and move it there."""
+    """Write a scene's folder under a temporary name and move it into place."""
     name, gaussians, images = _render(recipe, config)
     scratch = place.with_name(f".{place.name}.{secrets.token_hex(4)}")
     scratch.mkdir()
@@ -192,7 +192,7 @@ def _make(place: Path, recipe: Recipe, config: SceneConfig) -> None:
 
 
 def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.ndarray]:
-    """Name, Gaussians and images (inputs, then targets) of a scene."""
+    """Return name, Gaussians and images (inputs, then targets) of a scene."""
     from vvgt_cli.closed_form import VbmOptions, backproject, initialise
     from vvgt_cli.dvr import RenderSettings, Scene, render_views
     from vvgt_cli.look.readers import minimal
@@ -222,9 +222,9 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
 
 
 def merge_bands(bands: Sequence[Suggestion], factors: Sequence[float]) -> dict[str, Any]:
-    """One function that shows all ``bands``, extinctions times ``factors``: the minimal JSON form, per their distance.
+    """Return a function that shows all ``bands``, extinctions times ``factors``, in the minimal JSON form.
 
-    Opacities of bands that overlap add up, below 1; colours are means by opacity.
+    Opacities are per the bands' distance; where bands overlap they add up, below 1, and colours are means by opacity.
     """
     x = np.unique(np.concatenate([band.x for band in bands]))
     opacity, light = np.zeros(len(x)), np.zeros((len(x), 3))

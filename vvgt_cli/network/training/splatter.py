@@ -1,4 +1,4 @@
-"""The splatter as a function that torch differentiates: gsplat where the rows are on a GPU, else numba on the host."""
+"""The splatter as a function that torch differentiates: gsplat for rows on a GPU, else numba on the host."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 class Splat(torch.autograd.Function):
-    """`vvgt_cli.splat.render` and `render_backward`; rows as `vvgt_cli.network.prepare.pack` has them."""
+    """Autograd of `vvgt_cli.splat.render` and `render_backward`; rows as in `vvgt_cli.network.prepare.pack`."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, camera: Camera) -> Tensor:
+        """Return the picture (height, width, 4) of ``rows`` (K, 14)."""
         gaussians = unpack(rows.detach().float().cpu().numpy())
         projection = project(gaussians, camera)
         image = render(gaussians, camera, projection=projection)
@@ -28,6 +29,7 @@ class Splat(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        """Return the gradient by the rows."""
         gaussians, camera, projection, image = ctx.kept
         g = render_backward(gaussians, camera, projection, image, grads[0].float().cpu().numpy())
         fields = g.means, g.log_scales, g.quaternions, g.opacity_logits[:, None], g.colors
@@ -35,9 +37,9 @@ class Splat(torch.autograd.Function):
 
 
 def splat(rows: Tensor, camera: Camera) -> Tensor:
-    """Picture (height, width, 4) float32 of Gaussians (K, 14), premultiplied; rows must be finite.
+    """Return the picture (height, width, 4) float32 of Gaussians (K, 14), premultiplied; rows must be finite.
 
-    On a CUDA device with gsplat (extra ``cuda``) that draws, else the numba kernels on the host do.
+    On a CUDA device gsplat (extra ``cuda``) draws it if installed, else the numba kernels on the host.
     """
     if rows.is_cuda and importlib.util.find_spec("gsplat"):
         return gsplat_picture(rows, camera)

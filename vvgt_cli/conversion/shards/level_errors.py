@@ -1,4 +1,4 @@
-"""A node's levels drawn by themselves, against the finest: the error that its manifest says."""
+"""The error of the levels of a node, drawn alone, against the finest."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
 
-SEEN_FROM = ((0.62, 0.54, 0.57), (-0.59, 0.71, -0.38), (0.46, -0.33, -0.82))  # no axis is seen end on
-SIZE = 96  # pixels along an edge: more than a tile has cells
-AWAY, MARGIN = 30.0, 1.1  # the camera's distance, and what its picture holds, in radii of the node
+SEEN_FROM = ((0.62, 0.54, 0.57), (-0.59, 0.71, -0.38), (0.46, -0.33, -0.82))  # directions along no axis
+SIZE = 96  # pixels along an edge, more than the cells of a tile
+AWAY, MARGIN = 30.0, 1.1  # distance of the camera, and half the field of view, in radii of the node
 
 
-def errors_apart(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
-    """How far each cut of a node, coarser ones later, is from the first, in RGBA over nothing.
+def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
+    """Measure the RGBA error of each cut of a node, coarser ones later, against the first.
 
     Returns:
-        (n,) squared differences summed over all pixels of `SEEN_FROM`, never less than that of a finer one; the
-        finest one's squares; the pixels that it covers.
+        (n,) squared differences summed over the pixels of all views, never less than those of a finer cut; the
+        squared values of the finest; the number of pixels that it covers.
     """
     from vvgt_cli.cameras.sets import look_at
     from vvgt_cli.splat import render

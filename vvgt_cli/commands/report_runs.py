@@ -1,4 +1,4 @@
-"""The ladder of `report`: one scene by ever dearer means, each run timed on its own and scored on the same views."""
+"""Runs of `report`: one scene converted by ever costlier methods, each timed alone and scored on the same views."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
-from vvgt_cli.conversion.convert import convert, opened
+from vvgt_cli.conversion.convert import convert, open_field
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
-from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
+from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
 from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -32,11 +32,18 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views, judging_views
+from vvgt_cli.score.checks import Views, render_check_views
 from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions, seat_pictures
-from vvgt_cli.score.views import WHOLE, score_seen
+from vvgt_cli.score.viewing import (
+    SIDE,
+    ConditionView,
+    condition_pictures,
+    condition_views,
+    score_conditions,
+    screens,
+)
+from vvgt_cli.score.views import WHOLE, score_drawn_view
 
 if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Scores
@@ -49,18 +56,18 @@ NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over
 
 
 @dataclass(frozen=True)
-class LadderOptions:
-    """Which rungs there are.
+class RunOptions:
+    """Options of the runs.
 
     Attributes:
         max_gaussians: largest budget K.
         size: pixels along the edge of the screen that files are made for and scored on.
-        steps: of gradient descent, a rung each; the baselines take as many as the longest.
+        steps: lengths of gradient descent, one run each; the baselines take the longest.
         model: folder or name of an exported network, None for none.
-        seed: of whatever draws random numbers.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
-        live: with the live form (docs/live.md), which not every scene has.
-        peers: other trainers, a rung each.
+        seed: random seed.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
+        live: include the live form (docs/live.md), which not every scene has.
+        peers: other trainers, one run each.
     """
 
     max_gaussians: int = MAX_GAUSSIANS
@@ -74,15 +81,15 @@ class LadderOptions:
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One way of making the file.
+class PlannedRun:
+    """One run.
 
     Attributes:
         name: for tables; ``label`` for charts.
         kind: one of `vvgt_cli.score.curves.KINDS`.
-        fit: of a conversion, and what the others take their sizes from.
+        fit: options of the conversion; the other kinds take their sizes from it.
         start: of the baselines: "points" (random in the box) or "samples" (of what the function shows).
-        peer: of kind "peer".
+        peer: other trainer, of kind "peer".
     """
 
     name: str
@@ -93,41 +100,41 @@ class Rung:
     peer: Peer | None = None
 
 
-def rungs(options: LadderOptions) -> list[Rung]:
-    """Other trainers, which may fail, before ours are run; ours from the cheapest on; the baselines."""
+def plan_runs(options: RunOptions) -> list[PlannedRun]:
+    """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines."""
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
-        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
     if options.live:
-        found.append(Rung(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
+        found.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
-        found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
+        found.append(PlannedRun(f"network {Path(options.model).name}", "network", "network", fit))
     for steps in sorted(set(options.steps)):
         fit = FitOptions(most, size, seed=seed, steps=steps)
-        found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
+        found.append(PlannedRun(f"{steps} steps", f"{steps} steps", "steps", fit))
     most_steps = max(options.steps, default=0)
     longest = FitOptions(most, size, seed=seed, steps=most_steps)
     if most_steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
-            found.append(Rung(f"{name}, {most_steps} steps", name, "baseline", longest, start))
-    return [Rung(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
+            found.append(PlannedRun(f"{name}, {most_steps} steps", name, "baseline", longest, start))
+    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What every rung is scored against: test views, rendered once and in no rung's time.
+    """Reference that every run is scored against: test views, rendered once and counted in no run's time.
 
     Attributes:
-        cameras: of the views; ``blocks`` of each that are scored, None for all of it.
-        images: (h, w, 4) float32 each; of those that are not in `WHOLE` only the blocks are drawn.
-        step: voxels; ``rays`` a pixel, at most.
+        cameras: of the views; ``blocks`` of each that are scored, None for the whole view.
+        images: (h, w, 4) float32 each; of views that are not in `WHOLE` only the blocks are drawn.
+        step: sampling distance, voxels; ``rays`` the largest number per pixel.
         axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
         shown: images as `upright` makes them.
-        seats: what is seen from the size made for, and from the next larger.
+        conditions: views at the size made for, and at the next larger.
     """
 
     cameras: list[Camera]
@@ -137,16 +144,16 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
-    seats: list[ConditionView]
+    conditions: list[ConditionView]
 
     @classmethod
     def render(cls, volume: Field, size: int, console: Console) -> Reference:
-        """The test views as `vvgt evaluate` has them."""
+        """Render the test views, as `vvgt evaluate` draws them."""
         from vvgt_cli.dvr import REFERENCE
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = seat_pictures(from_above(size), SIDE)
+        around = condition_pictures(screens(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -155,12 +162,12 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        seats = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, screens(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
-        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 
     def psnr_of(self, renderer: str, field: Field) -> float | None:
-        """Mean PSNR of another renderer's own pictures of the views that are drawn whole; None where it cannot."""
+        """Return another renderer's mean PSNR on the views that are drawn whole, None if it cannot draw them."""
         from vvgt_cli.dvr.backends import view_renderer
         from vvgt_cli.images.metrics import score_view
         from vvgt_cli.volume.vtk.messages import quiet_vtk
@@ -176,7 +183,7 @@ class Reference:
         return float(np.mean(found))
 
     def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
-        """Scores as `vvgt evaluate` has them, and our images."""
+        """Return scores as `vvgt evaluate` measures them, and the images of the Gaussians."""
         from vvgt_cli.images.metrics import mean_scores
         from vvgt_cli.splat import render
 
@@ -184,12 +191,12 @@ class Reference:
         for i, camera in enumerate(self.cameras):
             drawn = _drawn(self.blocks, i)
             ours.append(render(gaussians, camera, blocks=drawn))
-            scores.append(score_seen(self.images[i], ours[i], self.blocks[i], drawn is None))
+            scores.append(score_drawn_view(self.images[i], ours[i], self.blocks[i], drawn is None))
         return mean_scores(scores), ours
 
 
 def _drawn(blocks: Sequence[Blocks | None], view: int) -> Blocks | None:
-    """What of a test view is drawn."""
+    """Return the blocks of a test view that are drawn, None for all of it."""
     return None if view in WHOLE else blocks[view]
 
 
@@ -199,84 +206,88 @@ def upright(
     axes: np.ndarray,
     draw: Callable[[Camera], np.ndarray],
 ) -> list[np.ndarray]:
-    """Images of the box frame for people: those of `PICTURED` drawn anew in the unit frame, where that is another."""
+    """Return box-frame images for people: the `PICTURED` ones are redrawn in the unit frame if it differs."""
     if np.array_equal(axes, np.eye(3)):
         return list(images)
     see = render_in_box(draw, axes)
     return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
 
 
-def run_rungs(
-    source: SourceRequest, options: LadderOptions, reference: Reference, console: Console
+def do_runs(
+    source: SourceRequest, options: RunOptions, reference: Reference, console: Console
 ) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
-    """Each rung's run (a dict, see `vvgt_cli.score.curves`) and its pictures of the reference's views.
+    """Yield each run (a dict, see `vvgt_cli.score.curves`) and its images of the reference's views.
 
     Raises:
         DataError, UsageError: as `vvgt_cli.conversion.convert.convert`.
-        KeyboardInterrupt: a refinement was interrupted; what came after it would not be comparable.
+        KeyboardInterrupt: a refinement was interrupted; later runs would not be comparable.
     """
     from vvgt_cli.splat import render
 
     with tempfile.TemporaryDirectory() as folder:
         views = peer_views(source, options, Path(folder)) if options.peers else None
-        for rung in rungs(options):
-            report, gaussians = _run(source, rung, reference.axes, options.blocks, views)
+        for planned in plan_runs(options):
+            report, gaussians = _run(source, planned, reference.axes, options.blocks, views)
             if report.refinement and report.refinement["reason"] == "interrupted":
                 raise KeyboardInterrupt
             scores, images = reference.score(gaussians)
-            seats = score_conditions(gaussians, reference.seats)
-            report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
-            count = views.count if views is not None and rung.peer is not None else _views_of(report, rung.fit)
-            run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": count}
+            conditions = score_conditions(gaussians, reference.conditions)
+            report.scores, report.conditions = asdict(scores), [asdict(condition) for condition in conditions]
+            count = views.count if views is not None and planned.peer is not None else _views_of(report, planned.fit)
+            run = {"name": planned.name, "label": planned.label, "kind": planned.kind, "views": count}
             run |= asdict(report)
             yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
 
 
-def peer_views(source: SourceRequest, options: LadderOptions, folder: Path) -> PeerViews:
-    """What other trainers read: as many views as our longest run has, of the screen's size."""
-    count = views_of(max(options.steps, default=0), small=False)
+def peer_views(source: SourceRequest, options: RunOptions, folder: Path) -> PeerViews:
+    """Render the views for other trainers: as many as our longest run has, at the screen's size."""
+    count = view_count(max(options.steps, default=0), small=False)
     return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
-def warm_up(source: SourceRequest, options: LadderOptions) -> None:
-    """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
-    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
-    for rung in rungs(few)[-5:]:
-        _run(source, rung, np.eye(3), options.blocks)
+def warm_up(source: SourceRequest, options: RunOptions) -> None:
+    """Run every kind of run once at a tiny size, so that kernels are compiled or loaded before any clock starts."""
+    few = RunOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
+    for planned in plan_runs(few)[-5:]:
+        _run(source, planned, np.eye(3), options.blocks)
 
 
 def _run(
-    source: SourceRequest, rung: Rung, axes: np.ndarray, blocks: BlockOptions | None, views: PeerViews | None = None
+    source: SourceRequest,
+    planned: PlannedRun,
+    axes: np.ndarray,
+    blocks: BlockOptions | None,
+    views: PeerViews | None = None,
 ) -> tuple[ConversionReport, Gaussians]:
-    """What became of it, Gaussians in the box frame; ``axes`` as `Reference` has them."""
-    if rung.kind == "baseline":
-        return _baseline(source, rung, blocks)
-    if rung.peer is not None and views is not None:
-        report, gaussians = train(rung.peer, views)
+    """Do one run; return its report and its Gaussians in the box frame (``axes`` as in `Reference`)."""
+    if planned.kind == "baseline":
+        return _baseline(source, planned, blocks)
+    if planned.peer is not None and views is not None:
+        report, gaussians = train(planned.peer, views)
         return report, transform(gaussians, np.linalg.inv(axes))
     with tempfile.TemporaryDirectory() as folder:
-        path, live = str(Path(folder) / "rung.ply"), rung.kind == "live"
-        request = ConvertRequest(source, path, rung.fit, up="none", blocks=blocks, live=live)
+        path, live = str(Path(folder) / "run.ply"), planned.kind == "live"
+        request = ConvertRequest(source, path, planned.fit, up="none", blocks=blocks, live=live)
         report = convert(request, Console(quiet=True))
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
 
 def _views_of(report: ConversionReport, fit: FitOptions) -> int:
-    """Training views that there were: those of gradient descent, or else of the plan."""
+    """Return the number of training views: of gradient descent, or else of the plan."""
     if report.refinement:
         return int(report.refinement["views"])
     if report.plan is None:
-        return views_of(fit.steps or 0, small=False)
+        return view_count(fit.steps or 0, small=False)
     return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
 
 
 def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
     volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = judging_views(volume.views, default_views("check", size=fit.size), RenderSettings())
+        judges = render_check_views(volume.views, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
         return Views(train, render_views(volume.views, train)), judges
 
@@ -289,15 +300,17 @@ def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians
     return run.finish(), stored
 
 
-def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) -> tuple[ConversionReport, Gaussians]:
-    """3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or samples of the volume."""
+def _baseline(
+    source: SourceRequest, planned: PlannedRun, blocks: BlockOptions | None
+) -> tuple[ConversionReport, Gaussians]:
+    """Run 3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or volume samples."""
     from vvgt_cli.closed_form import VbmOptions
 
-    run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
+    run, fit = Run(Console(quiet=True), ConversionReport("report")), planned.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
+    with open_field(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
         with run.stage("samples"):
-            if rung.start == "points":
+            if planned.start == "points":
                 half = np.array(volume.source.volume.unit_frame().half)
                 start = random_points(half, count, fit.seed)
             else:
@@ -311,9 +324,9 @@ def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) ->
 
 
 def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
-    """What 3DGS begins with where it has no points: ``count`` anywhere in the box, of any colour, round and faint.
+    """Return the random start of 3DGS: ``count`` Gaussians anywhere in the box, of any colour, round and faint.
 
-    Sizes are the mean distance to the three nearest points; ``half`` (3,) are the box's half extents.
+    Sizes are the mean distance to the three nearest points; ``half`` (3,) holds the box's half edges.
     """
     rng = np.random.default_rng(seed)
     scale = NEIGHBOURS * (8 * float(np.prod(half)) / count) ** (1 / 3)
@@ -327,7 +340,7 @@ def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
 
 
 def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:
-    """RGB over black of some views, (h, w, 3) in [0, 1], averaged over squares of pixels to sides of ``limit``."""
+    """Return RGB over black of some views, (h, w, 3) in [0, 1], averaged down to sides of at most ``limit``."""
     found = []
     for n in numbers:
         image = np.clip(images[n][..., :3], 0, 1)

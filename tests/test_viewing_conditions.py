@@ -14,14 +14,14 @@ from vvgt_cli.images.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_views,
-    from_above,
     score_conditions,
     score_texture,
+    screens,
     texture_note,
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import score_seen, score_test_views
+from vvgt_cli.score.views import score_drawn_view, score_test_views
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 
@@ -34,7 +34,7 @@ def pair():
     return scene, initialise(scene, VbmOptions(60, 32)).gaussians
 
 
-def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
+def test_a_condition_close_up_is_the_same_place_with_a_narrower_field():
     camera = default_views("test", size=100)[4]
     near = zoomed(camera, 10.0)
     assert np.array_equal(near.position, camera.position)
@@ -44,25 +44,25 @@ def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
     assert zoomed(camera, 40.0).fy == pytest.approx(camera.fy)
 
 
-def test_seats_are_what_they_say_worst_first(pair):
+def test_conditions_are_scored_by_their_rule_size_and_field_worst_first(pair):
     scene, gaussians = pair
     rules, views = ("inria", "playcanvas"), (4, 9)
     found = score_conditions(gaussians, condition_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
-    assert [seat.psnr for seat in found] == sorted(seat.psnr for seat in found)
+    assert [condition.psnr for condition in found] == sorted(condition.psnr for condition in found)
     assert len(found) == 4
-    for seat in found:
-        cameras = [zoomed(default_views("test", size=seat.size)[i], seat.field_of_view) for i in views]
-        pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, seat.rule)) for c in cameras]
+    for condition in found:
+        cameras = [zoomed(default_views("test", size=condition.size)[i], condition.field_of_view) for i in views]
+        pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, condition.rule)) for c in cameras]
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
-        assert seat.psnr == pytest.approx(expected, abs=1e-6)
+        assert condition.psnr == pytest.approx(expected, abs=1e-6)
     assert ViewingCondition("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
-    assert from_above(1080) == [(1080, 40), (2160, 40)]
-    assert from_above(2160) == [(2160, 40), (4320, 40)]
-    assert from_above(2159) == [(2159, 40), (2160, 40)]
+    assert screens(1080) == [(1080, 40), (2160, 40)]
+    assert screens(2160) == [(2160, 40), (4320, 40)]
+    assert screens(2159) == [(2159, 40), (2160, 40)]
     assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 
-def test_texture_is_of_the_seats_views_from_near(pair):
+def test_texture_is_measured_in_close_views(pair):
     _, gaussians = pair
     scene = scene_of(open_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
     ticks = []
@@ -80,7 +80,7 @@ def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():
     rng = np.random.default_rng(0)
     reference, ours = (rng.random((48, 64, 4)).astype(np.float32) for _ in range(2))
     blocks = Blocks(64, 48, np.array([1, 6]))
-    seen, alone = score_seen(reference, ours, blocks), score_seen(reference, ours, blocks, whole=False)
+    seen, alone = score_drawn_view(reference, ours, blocks), score_drawn_view(reference, ours, blocks, whole=False)
     mask = blocks.mask()
     assert mask.sum() == 2 * 256
     assert seen.psnr == alone.psnr == pytest.approx(psnr(reference[..., :3], ours[..., :3], mask))
@@ -88,7 +88,7 @@ def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():
     assert seen.ssim == pytest.approx(ssim(reference[..., :3], ours[..., :3]))
     assert seen.flip == score_view(reference, ours).flip
     assert (alone.ssim, alone.flip) == (None, None)
-    assert score_seen(reference, ours, None) == score_view(reference, ours)
+    assert score_drawn_view(reference, ours, None) == score_view(reference, ours)
 
 
 def test_scores_are_by_the_rule_of_the_views_asked_for(pair):
