@@ -161,6 +161,7 @@ class DeviceRays:
     """
 
     def __init__(self, scene: Scene, say: Callable[[str], None]) -> None:
+        """Take a scene; nothing is sent to the device before a ray is cast."""
         self.scene, self.say, self.failed = replace(scene, rays=None), say, False
 
     @cached_property

@@ -1,5 +1,4 @@
-"""Descent on a CUDA device: gsplat draws and differentiates, torch steps; the loss, the steps and the schedule of
-`OwnAxes`.
+"""Descent on a CUDA device: gsplat draws and differentiates, torch steps as `OwnAxes` does.
 
 What is computed from the start (the numbers that Gaussians share, the axes' order) is made on the CPU, and so are looks
 at the check views, so that figures mean the same on both.

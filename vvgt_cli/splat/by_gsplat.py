@@ -32,7 +32,9 @@ def picture(
     takes the Jacobian of what lies beside the frustum at the frustum's edge: pictures differ there.
 
     Args:
-        means, opacities, colors: (K, 3), (K,), (K, 3) float32.
+        means: (K, 3) float32.
+        opacities: (K,) float32.
+        colors: (K, 3) float32.
         camera: that sees them.
         rule: one that gsplat `draws` by.
         shape: ``covars`` (K, 6): xx, xy, xz, yy, yz, zz; or ``quats`` (K, 4) and ``scales`` (K, 3).
