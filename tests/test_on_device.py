@@ -12,7 +12,7 @@ from tests.test_dvr_backends import scene, view
 from vvgt_cli import device
 from vvgt_cli.cameras import default_views
 from vvgt_cli.device import on_device
-from vvgt_cli.dvr import RenderSettings, cuda, render_view, render_views
+from vvgt_cli.dvr import RenderSettings, Scene, cuda, render_view, render_views
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.gaussians import Gaussians
@@ -38,9 +38,9 @@ def lit_pixels(data, camera, step, width, places, offsets, out):
         cuda._store(data, data[3], camera, step, width, places, offsets, out, n)
 
 
-@pytest.mark.parametrize("lit", [False, True])
-def test_the_devices_rays_are_the_kernels(lit):
-    made, camera = scene().lit(Lighting()) if lit else scene(), view()
+@pytest.mark.parametrize(("lit", "unit"), [(False, 1.0), (False, 0.02), (True, 1.0)])  # 0.02: steep, sampled finer
+def test_the_devices_rays_are_the_kernels(lit, unit):
+    made, camera = Scene.build(scene().volume, scene().tf, unit, lighting=Lighting() if lit else None), view()
     packed, out = np.zeros((5, 4)), np.zeros((camera.height * camera.width, 4))
     packed[0, :3], packed[1:4, :3], packed[4] = camera_arrays(made, camera)
     every = np.arange(len(out), dtype=np.int32)
