@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate, epoch
-from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.formats import SUFFIXES, read_splats
 from vvgt_cli.gaussians.formats.page_file import dated
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.volume import Volume
@@ -175,7 +175,7 @@ def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
     assert b"sha256" not in (tmp_path / "out.ply").read_bytes()
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".v4.spz", ".sog", ".glb", ".usdc", ".html"])
+@pytest.mark.parametrize("suffix", SUFFIXES[1:])
 def test_every_format_carries_it(vvgt, folder, tmp_path, suffix) -> None:
     if suffix == ".usdc":
         pytest.importorskip("pxr")

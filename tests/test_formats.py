@@ -34,8 +34,7 @@ ROUNDED = {
     ".glb": (0, 1e-6, 1e-6, 1e-6, 1e-6),
     ".usdc": (0, 1e-6, 1e-6, 1e-6, 1e-6),
 }
-HERE = [known for known in FORMATS if known.suffix in ROUNDED]
-suffix = pytest.mark.parametrize("known", HERE, ids=lambda known: known.suffix)
+suffix = pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.suffix)
 
 
 def cloud(count: int = 700) -> Gaussians:

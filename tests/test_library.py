@@ -200,6 +200,9 @@ def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
     with pytest.raises(vvgt.UsageError, match="exists"):
         converted.save(tmp_path / "a.ply", overwrite=False)
+    with pytest.raises(vvgt.UsageError, match="expected a name ending in"):
+        converted.save(tmp_path / "x.obj")
+    assert not (tmp_path / "x.obj").exists()
 
 
 def test_a_goal_that_is_none_is_a_line():

@@ -19,7 +19,7 @@ from tests.test_page_live import PLANES
 from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.live import from_bytes
-from vvgt_cli.gaussians.formats.page_live import renumbered, shared_facts
+from vvgt_cli.gaussians.formats.page_live import shared_facts, with_shared_labels
 
 SMALL = ("--max-gaussians", 90, "--size", 48)
 
@@ -169,12 +169,12 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     assert both.layers == (value, replace(named, labels=LABELS))
     for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
         assert shared_facts([first, other]) is None
-    assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
-    assert renumbered(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    assert with_shared_labels(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
+    assert with_shared_labels(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
     other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
     both = shared_facts([first, replace(value, others=(other,))])
     assert both is not None
     assert [(label.number, label.name) for label in both.others[0].labels] == [
         (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
     ]  # fmt: skip
-    assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    assert with_shared_labels(layered(4), first, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]

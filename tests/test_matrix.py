@@ -10,6 +10,7 @@ import pytest
 
 import vvgt_cli
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.images import read_exr, read_png
 
 nib = pytest.importorskip("nibabel")
@@ -169,7 +170,7 @@ def test_the_bytes_do_not_depend_on_the_blocks(vvgt, at, tmp_path, blocks_of_16,
 class TestEitherWay:
     """What has no error of its own to compare."""
 
-    @pytest.mark.parametrize("ending", [".html", ".spz", ".compressed.ply", ".glb", ".usdc", ".sog"])
+    @pytest.mark.parametrize("ending", SUFFIXES[1:])
     def test_every_format(self, vvgt, at, tmp_path, blocks, ending):
         found = vvgt("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / f"x{ending}")
         assert found.code == 0, found.err

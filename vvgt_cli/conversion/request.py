@@ -31,7 +31,8 @@ class FitOptions:
         rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by.
         seed: seed of random numbers.
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.
-        steps: maximal number of steps of gradient descent; None: as many as the plan finds worth their time.
+        steps: maximal number of steps of gradient descent; None: `STEPS`, or `MOST_STEPS` of
+            `vvgt_cli.conversion.plan` with a target or a time budget.
         device: "cpu", or "cuda" for views and steps.
     """
 

@@ -16,9 +16,10 @@ from vvgt_cli.conversion.place import AUTO, NONE, preview, to_box_frame, up_axis
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.streamed import is_streamed
+from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.score.record import ConversionReport, StageRecord
@@ -87,7 +88,7 @@ class Result:
             Number of bytes written.
 
         Raises:
-            UsageError: the file exists, a value is invalid, or the name is that of streamed levels.
+            UsageError: the file exists, a value is invalid, or no format has the name's ending.
             DataError: a library that the format needs is not installed.
         """
         if is_streamed(os.fspath(path)):
@@ -95,6 +96,7 @@ class Result:
                 f"{os.fspath(path)}: streamed levels need the volume, not finished Gaussians; expected a "
                 ".ply or another format, or 'vvgt convert VOLUME -o FOLDER/lod-meta.json'"
             )
+        check_outputs([Output("save", os.fspath(path), SUFFIXES, splats=True)], [], overwrite)
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
         frame = frame or old.frame
         ply = replace(

@@ -30,8 +30,8 @@ class Format:
 
     Attributes:
         suffix: file ending.
-        write: maps columns and a name for errors to the file's bytes.
-        read: maps bytes and a name for errors to columns.
+        write: maps columns and the file's name, for errors and titles, to the file's bytes.
+        read: maps bytes and the file's name, for errors, to columns.
         needs: given a name for errors, raises DataError if a library is not installed.
         layout: maps the options for a `.ply` to those for this format.
         live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`; None if the
@@ -46,7 +46,7 @@ class Format:
     live: Callable[[Gaussians, PlyOptions, str], bytes] | None = None
 
 
-FORMATS = (
+FORMATS = (  # the first whose ending fits is taken: a longer ending stands before a shorter one
     Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
     Format(".v4.spz", gsply_files.spz_4, gsply_files.read_spz, gsply_files.zstandard),
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
@@ -151,4 +151,4 @@ def _content(place: Path, path: str | Path) -> bytes:
 def _compressed(path: str | Path) -> Format | None:
     """Return the format of a `.compressed.ply` that has another name, else None."""
     with open(seekable(path), "rb") as stream:
-        return FORMATS[0] if b"\nelement chunk " in stream.read(_HEAD) else None
+        return format_of(".compressed.ply") if b"\nelement chunk " in stream.read(_HEAD) else None

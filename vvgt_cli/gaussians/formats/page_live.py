@@ -115,7 +115,7 @@ def live_page_data(
     for gaussians, options in clouds:
         laid = upright(options)
         assert options.live is not None
-        some = renumbered(gaussians, options.live, facts).take(morton_order(turn(gaussians, laid.up).means))
+        some = with_shared_labels(gaussians, options.live, facts).take(morton_order(turn(gaussians, laid.up).means))
         splats.append(splats_of(replace(some, live=None, harmonics=None), replace(laid, live=None, sh_degree=0)))
         ordered.append(some)
     logs, planes = log_lengths(ordered), []
@@ -125,7 +125,7 @@ def live_page_data(
     return splats, planes, _facts(ordered, facts, clouds[0][1])
 
 
-def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
+def with_shared_labels(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
     """Return Gaussians with their label rows changed from those of their ``own`` facts to those of ``facts``."""
     assert gaussians.live is not None
     live = gaussians.live.copy()
