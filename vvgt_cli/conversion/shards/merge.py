@@ -20,7 +20,7 @@ from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.store import BlockStore
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
