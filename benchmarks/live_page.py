@@ -21,7 +21,7 @@ import click
 from closed_form import read_options, scene_rows
 from dvr_scenes import print_table, write_rows
 
-from vvgt_cli.commands.converter_process import Telling, Volume
+from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
 from vvgt_cli.conversion.convert import convert, initialise_only, open_field, ply_options
 from vvgt_cli.conversion.live import convert_live
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -33,7 +33,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 
 FROG = SourceRequest("example:frog", labels="auto")
 QUIET = Console(quiet=True)
-UNHEARD = Telling(lambda message: None)
+UNHEARD = MessageConsole(lambda message: None)
 
 
 def megabytes(source: SourceRequest, gaussians: int) -> float:
@@ -73,18 +73,18 @@ def measured(
             times |= seconds(
                 {
                     "closed form": lambda: initialise_only(file, QUIET),
-                    "first page": lambda: Volume(source, name, UNHEARD).live(UNHEARD),
+                    "first page": lambda: LoadedVolume(source, name, UNHEARD).send_live(UNHEARD),
                 },
                 rounds,
             )
         if rounds and better:
             tf = load(source).tf
-            viewed = Volume(source, name, UNHEARD)
-            viewed.live(UNHEARD)
+            viewed = LoadedVolume(source, name, UNHEARD)
+            viewed.send_live(UNHEARD)
 
             def under() -> None:
                 viewed.last = None  # not going on from the round before
-                viewed.under(tf, UNHEARD)
+                viewed.convert(tf, UNHEARD)
 
             times |= seconds({"convert": lambda: convert(file, QUIET), "better form": under}, rounds)
     return [row | {key: value or None for key, value in times.items()} for row in rows]

@@ -140,7 +140,7 @@ BROKEN = {
     "a tensor": (lambda: torch.zeros(3), "holds a Tensor"),
     "schema": (lambda: _changed(_document(), schema=9), "schema 9"),
     "config": (lambda: _changed(_document(), config={}), "config"),
-    "lost key": (lambda: {k: v for k, v in _document().items() if k != "state"}, "without 'state'"),
+    "lost key": (lambda: {k: v for k, v in _document().items() if k != "state"}, "lacks 'state'"),
     "missing": (lambda: _other_state(lambda s: s.pop("geometry.head.norm.weight")), "1 weights missing"),
     "unknown": (lambda: _other_state(lambda s: s.update(extra=torch.zeros(1))), "1 unknown"),
     "shape": (lambda: _other_state(lambda s: s.update({"geometry.head.norm.weight": torch.zeros(3)})), "norm.weight"),

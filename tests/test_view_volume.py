@@ -28,7 +28,7 @@ from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Start
 from vvgt_cli.commands.live_site import Cloud, PageController, parse_function, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.conversion.live import lit
+from vvgt_cli.conversion.live import apply_light
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
@@ -313,7 +313,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple
     kept = saved()
     assert kept.options.light == side
     assert kept.options.function == "mine"
-    np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
+    np.testing.assert_allclose(kept.gaussians.colors, apply_light(dark, side).colors, atol=1e-5)
     base = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
     again = saved(light=base).options.light
     assert again is not None

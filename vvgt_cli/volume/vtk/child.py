@@ -109,7 +109,7 @@ def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[d
 
 def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | None, int]:
     """Run a request in a process; return its answer, None where it gives none, and its exit status."""
-    paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+    paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]))
     with subprocess.Popen(
         [sys.executable, "-c", START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": paths},
