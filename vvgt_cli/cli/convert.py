@@ -41,7 +41,8 @@ from vvgt_cli.progress import Console
 @rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
-    help="Maximum number of gradient descent steps; 0 for none. Default: 152, or up to 400 with a target or time budget.",
+    help="Maximum number of gradient descent steps; 0 for none. Default: 152, or up to 400 with a target or "
+    "time budget.",
 )  # fmt: skip
 @click.option(
     "--live", is_flag=True,
