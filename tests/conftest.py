@@ -61,13 +61,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def small_conversions() -> Iterator[None]:
     """Spare conversions and reports in this process what takes most of a small one's time.
 
-    They are scored at their size and twice that, not for a 4K screen, and visibility is marched through 64 x 64 pixels,
-    which meet every cell of 30 voxels. `vvgt` in a process of its own does as users have it.
+    They are scored at their size and twice that, not for a 4K screen. `vvgt` in a process of its own does as users
+    have it.
     """
     with pytest.MonkeyPatch.context() as patch:
         for module in ("conversion.stages.scores", "commands.report_runs"):
             patch.setattr(f"vvgt_cli.{module}.screens", lambda size: [(size, 40.0), (2 * size, 40.0)])
-        patch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
         yield
 
 

@@ -37,6 +37,13 @@ def noise(size=(28, 20, 24), seed: int = 2) -> Volume:
     return analytic.random_field(size, cycles=4, seed=seed)
 
 
+@pytest.fixture(autouse=True)
+def small_march(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """March visibility through 64 x 64 pixels, which meet every cell of 30 voxels."""
+    if "quality" not in request.node.name:
+        monkeypatch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
+
+
 # ---- invariants
 
 

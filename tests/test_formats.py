@@ -243,7 +243,7 @@ def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
         result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
         assert result.code == 0, result.err
-        found = re.search(r"([\d.]+|inf) dB from the Gaussians as they were, 3 views of 64 px", result.err)
+        found = re.search(r"([\d.]+|inf) dB from the Gaussians before writing, 3 views of 64 px", result.err)
         assert (found is None) == (least is None)
         assert least is None or float(found[1]) > least, result.err
         assert json.loads(vvgt("info", tmp_path / f"b{ending}", "--json").out)["gaussians"] == 700

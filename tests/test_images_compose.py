@@ -36,7 +36,7 @@ def test_contact_sheet_places_images_row_by_row():
     assert (sheet[6:, 4:] == 1).all()  # the place left over
     assert contact_sheet(images).shape == (2 * 2 + 4, 3 * 3 + 8, 3)
     for bad in ([], [np.zeros((2, 2, 3)), np.zeros((2, 3, 3))]):
-        with pytest.raises(DataError, match="of one size"):
+        with pytest.raises(DataError, match="one size"):
             contact_sheet(bad)
     with pytest.raises(DataError, match="0 columns"):
         contact_sheet(images, columns=0)

@@ -307,7 +307,5 @@ def test_other_lines_are_refused(text):
 
 
 def test_renderers_say_which_light_they_do_not_know():
-    with pytest.raises(UsageError, match="cuda renderer has no lighting"):
-        view_renderer("cuda", blob().lit(Lighting()))
     with pytest.raises(UsageError, match="neither our shadows nor"):
         view_renderer("vtk", blob().lit(LIGHTS["shadows"]))

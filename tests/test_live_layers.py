@@ -179,7 +179,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     done = vvgt("recolor", live, *every, "-o", tmp_path / "x.ply")
     assert (done.code, "not one of" in done.error) == (1, True), done.error
     for more, said in (
-        (("--tf", "viridis"), "3 layers, each with a look of its own"),
+        (("--tf", "viridis"), "3 layers, each with its own look"),
         (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),
         (("--layer", "t,tf=viridis"), "3 layers of that name"),
         (("--layer", "2,tf=viridis"), "carry labels, not values"),

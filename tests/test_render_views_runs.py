@@ -87,7 +87,7 @@ def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch
         raise DataError(f"no device for {renderer}")
 
     monkeypatch.setattr(backends, "view_renderer", refuse)
-    assert "no device for cuda" in vvgt(*BASE, "--renderer", "cuda", "-o", tmp_path / "v").error
+    assert "no device for vtk" in vvgt(*BASE, "--renderer", "vtk", "-o", tmp_path / "v").error
     assert not (tmp_path / "v").exists()
 
 

@@ -289,7 +289,7 @@ def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Pa
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
     found = vvgt("view", tmp_path, folder, "-o", tmp_path / "a.html")
-    assert (found.code, "is shown by itself" in found.error) == (2, True)
+    assert (found.code, "are shown alone" in found.error) == (2, True)
 
 
 @pytest.mark.parametrize(

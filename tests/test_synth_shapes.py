@@ -95,9 +95,9 @@ def test_the_command_writes_what_it_reports(kind, tmp_path, vvgt):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["tubes", "--field", "speed"], "are of isotropic"),
-        (["noise", "--turnovers", 1], "are of isotropic"),
-        (["isotropic", "--field", "temperature"], "stratified turbulence alone"),
+        (["tubes", "--field", "speed"], "apply only to turbulence"),
+        (["noise", "--turnovers", 1], "apply only to turbulence"),
+        (["isotropic", "--field", "temperature"], "applies only to stratified turbulence"),
         (["tubes", "--size", 4], "--size"),
         (["cheese"], "cheese"),
     ],

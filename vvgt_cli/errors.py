@@ -18,6 +18,10 @@ class DataError(VvgtError):
     exit_code = 1
 
 
+class DeviceFailed(DataError):
+    """The GPU is lost, or has too little memory: the same can be done on the CPU."""
+
+
 class Unsuitable(DataError):
     """Readable data that cannot be converted: the same command would fail again."""
 

@@ -9,7 +9,14 @@ import click
 
 from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
+from vvgt_cli.cli.options import (
+    common_options,
+    device_option,
+    light_options,
+    overwrite_option,
+    placed_read_options,
+    tfs_options,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import ASIDE, command_line
 from vvgt_cli.defaults import RULE
@@ -34,7 +41,8 @@ from vvgt_cli.progress import Console
 @rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
-    help="Maximum number of gradient descent steps; 0 for none. Default: 152, or up to 400 with a target or time budget.",
+    help="Maximum number of gradient descent steps; 0 for none. Default: 152, or up to 400 with a target or "
+    "time budget.",
 )  # fmt: skip
 @click.option(
     "--live", is_flag=True,
@@ -52,6 +60,7 @@ from vvgt_cli.progress import Console
     "--split-labels", is_flag=True,
     help="Write one file per label of a label map, named by {} in OUT.ply, and an index.",
 )  # fmt: skip
+@device_option("views are drawn and steps are taken")
 @block_options
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options

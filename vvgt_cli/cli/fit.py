@@ -116,6 +116,7 @@ def convert_request(
     model: str | None = None,
     limits: dict[str, Any] | None = None,
     checkpoint: str | None = None,
+    device: str = "cpu",
 ) -> ConvertRequest:
     """Return the request that the options of `convert` and `init` describe."""
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
@@ -125,7 +126,7 @@ def convert_request(
     return ConvertRequest(
         source_request(volume, read, optics, light),
         output,
-        FitOptions(**fit, rule=rule, steps=steps, model=model),
+        FitOptions(**fit, rule=rule, steps=steps, model=model, device=device),
         Limits(**(limits or {})),
         PlyOptions(**ply),
         up,

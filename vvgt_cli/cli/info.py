@@ -18,7 +18,8 @@ from vvgt_cli.progress import Console
 
 
 @click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
-@click.argument("file")
+@click.argument("file", required=False)
+@click.option("--machine", is_flag=True, help="Describe this machine instead: processors, memory, GPU.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
 @layer_looks_option
@@ -27,7 +28,7 @@ from vvgt_cli.progress import Console
 @placed_read_options
 @common_options
 def command(
-    file: str, as_json: bool, tf: str | None, layers: tuple[str, ...], tf_range: str,
+    file: str | None, machine: bool, as_json: bool, tf: str | None, layers: tuple[str, ...], tf_range: str,
     opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
 ) -> None:  # fmt: skip
     """Describe FILE: a volume, transfer function, label table, view set, .ply of Gaussians, or index of several.
@@ -38,13 +39,21 @@ def command(
       vvgt info example:frog
       vvgt info frog.ply --json | jq .gaussians
       vvgt info presets.xml#CT-AAA
+      vvgt info --machine
     """
-    from vvgt_cli.commands.inspect import inspect
+    from vvgt_cli.commands.inspect import inspect, machine_facts
     from vvgt_cli.commands.recolor import function_of
+    from vvgt_cli.errors import UsageError
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
-    facts = plain(inspect(file, ReadOptions(**read), function_of(tf, tf_range, opacity_unit_distance, layers=layers)))
+    if machine == (file is not None):
+        raise UsageError("expected a file, or --machine")
+    if file is None:
+        facts = machine_facts()
+    else:
+        look = function_of(tf, tf_range, opacity_unit_distance, layers=layers)
+        facts = plain(inspect(file, ReadOptions(**read), look))
     if as_json:
         import json
 

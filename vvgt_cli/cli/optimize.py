@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.options import common_options, device_option, overwrite_option
 from vvgt_cli.progress import Console
 
 
@@ -50,6 +50,7 @@ from vvgt_cli.progress import Console
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
 )
 @click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
+@device_option("steps of --method frame are taken")
 @overwrite_option
 @common_options
 def command(
@@ -75,7 +76,7 @@ def command(
         raise UsageError(f"--max-gaussians applies to --method 3dgs; --method {method} does not change the number")
     how = OptimizeOptions.of(
         method, max_gaussians=most, target_psnr=options["target_psnr"], seed=options["seed"],
-        checkpoint=options["checkpoint"],
+        checkpoint=options["checkpoint"], device=options["device"],
         **budget(options["steps"], options["time_budget"]),
     )  # fmt: skip
     optimize_file(

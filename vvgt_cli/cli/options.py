@@ -185,6 +185,20 @@ def set_threads(count: int) -> None:
     os.environ["OMP_NUM_THREADS"] = str(count)
 
 
+def _device(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    from vvgt_cli.device import chosen
+
+    return chosen(value)
+
+
+def device_option(done: str) -> Decorator:
+    """``--device``, for what is ``done`` there; a command gets "cpu" or "cuda"."""
+    return click.option(
+        "--device", type=click.Choice(["cpu", "cuda", "auto"]), default="cpu", show_default=True, callback=_device,
+        help=f"Where {done}: auto is a GPU that is there and free, else the CPU.",
+    )  # fmt: skip
+
+
 def _threads(ctx: click.Context, param: click.Parameter, value: int | None) -> None:
     if not ctx.resilient_parsing:
         set_threads(value or default_threads())

@@ -12,6 +12,7 @@ from vvgt_cli.cli.options import (
     LABELS,
     TF_HELP,
     common_options,
+    device_option,
     group,
     light_options,
     placed_read_options,
@@ -74,8 +75,8 @@ image_options = group(
 ray_options = group(
     "rays",
     renderer=click.option(
-        "--renderer", type=click.Choice(["cpu", "cuda", "vtk"]), default="cpu", show_default=True,
-        help="Ray caster: our own on the CPU or, with torch, on CUDA; or VTK's.",
+        "--renderer", type=click.Choice(["vvgt", "vtk"]), default="vvgt", show_default=True,
+        help="Ray caster: our own, or VTK's.",
     ),
     samples=click.option(
         "--samples", default="adaptive", show_default=True, callback=_samples, metavar="adaptive|N",
@@ -111,6 +112,7 @@ optics_options = group(
 @block_options
 @click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I starts at 1.")
 @click.option("--overwrite", is_flag=True, help="Replace the views of another run.")
+@device_option("views are drawn")
 @common_options
 def command(
     volume: str,
@@ -124,6 +126,7 @@ def command(
     blocks: dict[str, Any],
     shard: str,
     overwrite: bool,
+    device: str,
     console: Console,
 ) -> None:
     """Render views of VOLUME with known cameras, and the files that 3DGS trainers start from.
@@ -147,6 +150,6 @@ def command(
     source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
-        shard=parse_shard(shard), overwrite=overwrite, blocks=block_options_of(blocks), **rays,
+        shard=parse_shard(shard), overwrite=overwrite, blocks=block_options_of(blocks), device=device, **rays,
     )  # fmt: skip
     render_view_sets(request, console)

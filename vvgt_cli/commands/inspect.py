@@ -14,6 +14,7 @@ from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
 from vvgt_cli.conversion.index import is_index, read_index
 from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, resolve_look
+from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply, write_ply
@@ -25,6 +26,7 @@ from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segmen
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
 from vvgt_cli.look.readers.names import names
+from vvgt_cli.resources import free_memory, processors
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.registry import contents
@@ -38,6 +40,13 @@ _PLY = (b"ply\n", b"ply\r")
 LISTED = 50  # of several volumes in a file
 CHEAP = 64 << 20  # bytes of a volume whose range is looked for
 _HEAD = 65536  # bytes that tell a view set from a transfer function
+
+
+def machine_facts() -> dict[str, Any]:
+    """Return what of this machine a run may use: processors, memory, GPU."""
+    memory = free_memory()
+    free = "unknown" if memory is None else f"{memory / 2**30:.1f} GiB free"
+    return {"kind": "machine", "processors": processors(), "memory": free, "gpu": describe_gpu()}
 
 
 def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = None) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.commands.view_files import CONTACT, Layout, View, field_points, start_points, thumbnail, thumbnails
 from vvgt_cli.commands.views_in_blocks import draw_in_blocks, fields_of
 from vvgt_cli.conversion.manifest import Manifest, Shard
+from vvgt_cli.device import on_device
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.digests import cameras_digest, volume_digest
@@ -115,12 +116,13 @@ class ViewsRequest:
         output: directory; several functions get a subdirectory each, by name.
         cameras: views to render.
         layout: files to write.
-        renderer: ``cpu``, ``cuda`` or ``vtk``.
+        renderer: ``vvgt`` or ``vtk``.
         samples: rays along a pixel's edge everywhere, None: 5 or 13 where neighbours differ, else 1.
         step: sampling distance in voxels.
         shard: part of the views to render.
         overwrite: replace the views of another run.
         blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
+        device: "cpu" or "cuda", where our own renderer casts the rays of a volume in memory.
     """
 
     source: SourceRequest
@@ -128,12 +130,13 @@ class ViewsRequest:
     output: str
     cameras: CameraRequest = field(default_factory=CameraRequest)
     layout: Layout = field(default_factory=Layout)
-    renderer: str = "cpu"
+    renderer: str = "vvgt"
     samples: int | None = None
     step: float = 0.5
     shard: Shard = field(default_factory=Shard)
     overwrite: bool = False
     blocks: BlockOptions | None = None
+    device: str = "cpu"
 
     def folders(self) -> list[Path]:
         """Return one folder per function.
@@ -286,7 +289,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         points = partial(field_points, job.field)
     elif job.pending or models:
         with run.stage("scene") as stage:
-            scene = job.source.scene()
+            scene = on_device(job.source.scene(), request.device, run.console.message)
             stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
         inside = view_renderer(request.renderer, scene, settings) if job.pending else None
         draw = None if inside is None else render_in_box(inside, scene.volume.axes)

@@ -53,8 +53,8 @@ def fields_of(
     options = options or automatic(source, run.console)
     if options is None:
         return None
-    if renderer != "cpu":
-        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: cpu")
+    if renderer != "vvgt":
+        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: vvgt")
     fields = []
     for folder, tf in functions.items():
         store = stack.enter_context(store_beside(str(folder)))

@@ -59,7 +59,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
     LEVELS: dict.fromkeys(
         (
             *("several --tf", "--steps", "--model", "--rule", "--target-psnr", "--time-budget", "--max-size", "--live"),
-            *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels"),
+            *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
         "levels are made by one closed form alone; remove it",
     ),
@@ -175,6 +175,7 @@ def options_in(request: ConvertRequest) -> set[str]:
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--labels none": source.labels == NONE,
         "--steps": fit.steps, "--model": fit.model, "--rule": fit.rule != INRIA.name,
         "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
+        "--device": fit.device != "cpu",
     }  # fmt: skip
     return {option for option, value in used.items() if value}
 

@@ -21,6 +21,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -281,6 +282,8 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
     Raises:
         DataError, UsageError: see `vvgt_cli.field.source.load`.
     """
+    if request.fit.device != "cpu":
+        load_ahead()
     options = request.blocks or automatic(request.source, run.console)
     if options is None:
         with run.stage("read") as stage:
@@ -289,7 +292,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
         _report_source(run, request, source)
         run.compile(_kernels(kernels, request, source), source.kernel_type())
         with run.stage("scene"):
-            field = Resident.of(source)
+            field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
     needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)

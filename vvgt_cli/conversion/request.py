@@ -33,6 +33,7 @@ class FitOptions:
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.
         steps: maximal number of steps of gradient descent; None: `STEPS`, or `MOST_STEPS` of
             `vvgt_cli.conversion.plan` with a target or a time budget.
+        device: "cpu", or "cuda" for views and steps.
     """
 
     max_gaussians: int = MAX_GAUSSIANS
@@ -42,6 +43,7 @@ class FitOptions:
     seed: int = 0
     steps: int | None = None
     model: str | None = None
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One switch over the programs that can render a `Scene`: the numba kernel, torch on CUDA, VTK."""
+"""One switch over the programs that can render a `Scene`: our own ray caster, VTK."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vvgt_cli.dvr.render import RenderSettings, render_view
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
 
-RENDERERS = ("cpu", "cuda", "vtk")
+RENDERERS = ("vvgt", "vtk")
 
 
 def view_renderer(
@@ -22,29 +22,23 @@ def view_renderer(
     What a renderer prepares once a scene (uploads, pipelines) is prepared here, so views can be asked for one by one.
 
     Args:
-        renderer: ``cpu`` (the numba kernel), ``cuda`` (torch, the same definition) or ``vtk`` (VTK's own picture).
-        scene: the volume under its function, and its light: ``cuda`` knows of none, ``vtk`` of none that is attenuated.
+        renderer: ``vvgt`` (on the scene's device) or ``vtk`` (VTK's own picture).
+        scene: the volume under its function, and its light: ``vtk`` knows of none that is attenuated.
         settings: step and rays a pixel; VTK takes the step and shoots one ray a pixel.
 
     Raises:
         UsageError: an unknown renderer, a light that it does not know, a package that is not installed.
-        DataError: no CUDA device, or no off-screen OpenGL, on this machine.
+        DataError: no off-screen OpenGL on this machine.
     """
     settings = settings or RenderSettings()
     if renderer not in RENDERERS:
         raise UsageError(f"renderer {renderer!r}; expected one of {', '.join(RENDERERS)}")
-    if scene.grid is not None and renderer != "cpu":
-        raise UsageError(f"the {renderer} renderer draws one volume under a function; of {scene.tf.name} try cpu")
-    if scene.light is not None and renderer == "cuda":
-        raise UsageError("the cuda renderer has no lighting; use the cpu renderer, or --light none")
-    if scene.light is not None and renderer == "vtk" and (scene.light.shadows or scene.light.occlusion):
-        raise UsageError("the vtk renderer has neither our shadows nor our ambient occlusion; use the cpu renderer")
-    if renderer == "cpu":
+    if renderer == "vvgt":
         return lambda camera: render_view(scene, camera, settings)
-    if renderer == "cuda":
-        from vvgt_cli.dvr import cuda
-
-        return cuda.view_renderer(scene, settings)
+    if scene.grid is not None:
+        raise UsageError(f"the vtk renderer draws one volume under a function; of {scene.tf.name} try vvgt")
+    if scene.light is not None and (scene.light.shadows or scene.light.occlusion):
+        raise UsageError("the vtk renderer has neither our shadows nor our ambient occlusion; use the vvgt renderer")
     from vvgt_cli.dvr import vtk
 
     return vtk.view_renderer(scene, settings)

@@ -1,177 +1,229 @@
-"""The ray caster in torch, for CUDA: the kernel's definition and tables, all rays of a block of pixels at once."""
+"""The ray caster on a CUDA device: what the CPU's kernels call, compiled for it by numba-cuda, a thread a pixel."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from dataclasses import replace
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.render import RenderSettings, tiers
-from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.dvr.kernel import (
+    FLAGS,
+    OPAQUE,
+    U,
+    Vector,
+    box_span,
+    inverse,
+    is_flat,
+    pass_segment,
+    sample,
+    skip,
+    table_coordinate,
+    values_met,
+)
+from vvgt_cli.dvr.layout import Optics, Voxels
+from vvgt_cli.dvr.march import LEAP, direction, shade_segment
+from vvgt_cli.dvr.vectors import add, lane, zeros4
+from vvgt_cli.jit.cache import source_digest
+from vvgt_cli.jit.decorators import inlined
 
-RAYS = 1 << 18  # marched at a time: bounds the memory
-CHECK = 16  # steps between two looks at which rays still go on: each look waits for the device
-OPAQUE = 1e-3  # times step^2: the kernel's
-PARTS = 4  # sub-segments, a fixed number of them: all rays go through the same operations
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.scene import Scene
+
+THREADS = 128  # of a block
+REGISTERS = 96  # of a thread: rays wait for memory, so that many of them beat few that keep all in registers
+Draw = Callable[..., None]  # arguments as of `march.render_tiles` from ``eye`` on
+
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 
-def view_renderer(scene: Scene, settings: RenderSettings, device: str = "cuda") -> Callable[[Camera], np.ndarray]:
-    """A function from a camera to its view, (height, width, 4) float32, premultiplied.
+@_jit
+def cast(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, p: Vector, d: Vector, step: float
+) -> tuple[float, float, float, float]:
+    """Return premultiplied (r, g, b, alpha) along a ray, as `march` does, in float64 and sample by sample.
 
-    Raises:
-        UsageError: torch is not installed.
-        DataError: torch finds no CUDA device.
+    Runs of samples are for vector instructions, which a thread of a GPU does not have. Arguments as of `march`.
     """
-    try:
-        import torch
-    except ImportError:
-        raise UsageError("the cuda renderer needs torch; install vvgt[cuda], or use the cpu renderer") from None
-    if device == "cuda" and not torch.cuda.is_available():
-        raise DataError("the cuda renderer found no CUDA device; use the cpu renderer, or check the driver")
-    field = Field.upload(scene, device)
+    (px, py, pz), (dx, dy, dz) = p, d
+    nz, ny, nx = voxels.values.shape
+    seen, flat = zeros4(), is_flat(optics)
+    trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
+    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if not t1 > t0:
+        return 0.0, 0.0, 0.0, 0.0
+    steps = math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)
+    count = max(int(steps), 1)  # a float on the device
+    dt = (t1 - t0) / count
+    opaque = OPAQUE * min(step * step, 1.0)
+    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
+    look = d if light is None else (dx * light.edge[0], dy * light.edge[1], dz * light.edge[2])
+    before = u0 = -1.0  # -1: no sample there, or not finite
+    i, stop, known = 0, 0, -1
+    ahead = 0.0  # sample ``known``, asked for before the one ahead of it is used: memory is slow
+    while i <= count and trans >= opaque:
+        if i >= stop:
+            at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
+            start = skip((nz, ny, nx), empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, at)
+            if start >= count:
+                break
+            if start > at:
+                before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
+            stop = i + LEAP
+        t = t0 + i * dt
+        value = ahead if known == i else sample(voxels.values, px + t * dx, py + t * dy, pz + t * dz)
+        s, known = t + dt, i + 1
+        ahead = sample(voxels.values, px + s * dx, py + s * dy, pz + s * dz)
+        u1 = table_coordinate(value, optics)
+        met = values_met(before, u0, u1, flat)
+        if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+            own, trans, s = pass_segment(voxels, optics, p, d, t - dt, dt, u0, u1, met, zeros4(), trans)
+            if light is None:
+                seen = add(seen, own)
+            elif lane(own, 3) > 0.0:
+                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s)
+                red, green, blue = red + r, green + g, blue + b
+        before, u0 = u0, u1
+        i += 1
+    if light is None:
+        red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)
+    return red, green, blue, 1.0 - trans
 
-    def draw(camera: Camera) -> np.ndarray:
-        image = np.zeros((camera.height, camera.width, 4), np.float32)
 
-        for rays in tiers(settings, image):
-            for offsets, mask, known in rays:
-                new = field.pixels(camera, np.array(np.nonzero(mask)), offsets, settings.step)
-                image[mask] = (known * image[mask] + len(offsets) * new) / (known + len(offsets))
-        return image
+@_jit
+def _store(
+    data: Any, light: Any, camera: np.ndarray, step: float, width: int, places: np.ndarray,
+    offsets: np.ndarray, out: np.ndarray, n: int,
+) -> None:  # fmt: skip
+    """Store the mean of the rays of pixel ``places[n]``, counted row by row, into row ``n`` of ``out`` (m, 4).
 
-    return draw
+    ``camera`` (5, 4): eye, the rows of the basis, lens, as of `march.render_tiles`; ``data``: `scene_arrays`.
+    """
+    row, col, rays = places[n] // width, places[n] % width, offsets.shape[0]
+    p = camera[0, 0], camera[0, 1], camera[0, 2]
+    red = green = blue = alpha = 0.0
+    for ray in range(rays):
+        d = direction(camera[1:4], camera[4], col + 0.5 + offsets[ray, 0], row + 0.5 + offsets[ray, 1])
+        r, g, b, a = cast(data[0], data[1], data[2], light, p, d, step)
+        red, green, blue, alpha = red + r, green + g, blue + b, alpha + a
+    out[n, 0], out[n, 1], out[n, 2], out[n, 3] = red / rays, green / rays, blue / rays, alpha / rays
 
 
-@dataclass(frozen=True)
-class Field:
-    """A scene on a device: ``values`` (1, 1, nz, ny, nx) float32, ``nodes`` and ``cumulative`` (n + 1, 4) float64."""
+@cache
+def _key() -> int:
+    """Return a number other than 0 that stands for all that the kernels are made of."""
+    return 1 + (int(source_digest(_kernels.__wrapped__), 16) >> 4)  # of 16 hexadecimal digits: within int64
 
-    scene: Scene
-    values: Any
-    nodes: Any
-    cumulative: Any
 
-    @classmethod
-    def upload(cls, scene: Scene, device: str) -> Field:
-        import torch
+@cache
+def _kernels(key: int) -> tuple[Any, Any]:
+    """Return the device's kernels, without a light and with one.
 
-        values = torch.from_numpy(scene.values.astype(np.float32)).to(device)[None, None]
-        nodes, cumulative = (torch.from_numpy(t).to(device) for t in (scene.optics.nodes, scene.optics.cumulative))
-        return cls(scene, values, nodes, cumulative)
+    numba-cuda keeps them on disk by their own code and the numbers around it: ``key`` stands for what they call.
+    """
+    import numba.cuda
 
-    def pixels(self, camera: Camera, pixels: np.ndarray, offsets: np.ndarray, step: float) -> np.ndarray:
-        """Means over the rays at ``offsets`` (m, 2) of ``pixels`` (2, n), rows and columns: (n, 4) float32."""
-        import torch
+    cuda: Any = numba.cuda  # which numba-cuda replaces
+    config: Any = numba.config
+    config.CUDA_LOW_OCCUPANCY_WARNINGS = False
 
-        at = 0.5 + offsets
-        block = max(RAYS // len(at), 1)
-        parts = []
-        for start in range(0, pixels.shape[1], block):
-            row, col = pixels[:, start : start + block, None]
-            a, b = (col + at[:, 0] - camera.cx) / camera.fx, (row + at[:, 1] - camera.cy) / camera.fy
-            local = np.stack([a, b, np.ones_like(a)], axis=-1).reshape(-1, 3)
-            local /= np.linalg.norm(local, axis=1, keepdims=True)
-            directions = torch.from_numpy(local @ camera.rotation).to(self.values.device)
-            rgba = self.march(camera.position, directions, step)
-            parts.append(rgba.reshape(-1, len(at), 4).mean(dim=1).float().cpu().numpy())
-        return np.concatenate(parts)
+    kernel = cuda.jit(cache=True, fastmath=FLAGS, max_registers=REGISTERS)
 
-    def march(self, eye: np.ndarray, directions: Any, step: float) -> Any:
-        """Premultiplied RGBA (n, 4) float64 along unit ``directions`` (n, 3) float64 in the unit frame."""
-        import torch
+    @kernel
+    def plain_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(data, None, camera, step, width, places, offsets, out, n)
 
-        scene, device = self.scene, directions.device
-        edge = torch.as_tensor(scene.step, device=device)
-        p = torch.as_tensor((eye + scene.half) / scene.step - 0.5, device=device)  # voxel coordinates
-        d = directions / edge
-        t0, t1 = self._span(p, d)
-        count = torch.ceil((t1 - t0) * d.norm(dim=1) / step).clamp(min=1)
-        dt = (t1 - t0) / count
-        out = torch.zeros((len(d), 4), dtype=torch.float64, device=device)
-        rays = torch.nonzero(t1 > t0)[:, 0]
-        light = torch.zeros((len(rays), 4), dtype=torch.float64, device=device)
-        light[:, 3] = 1
-        u0 = self._coordinate(p + t0[rays, None] * d[rays])
-        opaque = OPAQUE * min(step * step, 1.0)
-        for i in range(1, int(count.max()) + 1):
-            if i % CHECK == 0:
-                go = (light[:, 3] >= opaque) & (count[rays] >= i)
-                out[rays[~go]] = light[~go]
-                rays, light, u0 = rays[go], light[go], u0[go]
-                if len(rays) == 0:
-                    break
-            u1 = self._coordinate(p + (t0[rays] + i * dt[rays])[:, None] * d[rays])
-            length = torch.where(count[rays] >= i, dt[rays], 0.0)
-            light = self._composite(u0, u1, length, light)
-            u0 = u1
-        out[rays] = light
-        hit = t1 > t0
-        out[:, 3] = torch.where(hit, 1 - out[:, 3], 0.0)
-        return out
+    @kernel
+    def lit_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(data, data[3], camera, step, width, places, offsets, out, n)
 
-    def _span(self, p: Any, d: Any) -> tuple[Any, Any]:
-        """Entry and exit (n,) of rays p + t d, t >= 0, through the box; not entry < exit: missed."""
-        import torch
+    return plain_pixels, lit_pixels
 
-        top = torch.as_tensor(self.scene.values.shape[::-1], device=d.device) - 0.5
-        near, far = (-0.5 - p) / d, (top - p) / d
-        parallel, inside = d == 0, (p >= -0.5) & (p <= top)
-        endless = torch.full_like(d, torch.inf)
-        first = torch.where(parallel, torch.where(inside, -endless, endless), torch.minimum(near, far))
-        last = torch.where(parallel, torch.where(inside, endless, -endless), torch.maximum(near, far))
-        t0, t1 = first.amax(dim=1).clamp(min=0), last.amin(dim=1)
-        hit = t1 > t0
-        return torch.where(hit, t0, 0.0), torch.where(hit, t1, 0.0)
 
-    def _coordinate(self, points: Any) -> Any:
-        """Table coordinates (n,) float64 at voxel coordinates (n, 3); NaN where a voxel around is not finite."""
-        import torch
+def scene_arrays(scene: Scene) -> tuple[Any, ...]:
+    """Return what a ray of a scene reads, as the arguments of `cast` in front of the ray."""
+    return scene.voxels, scene.optics, scene.empty, *(() if scene.light is None else (scene.light,))
 
-        nz, ny, nx = self.values.shape[2:]
-        top = torch.tensor([nx, ny, nz], device=points.device) - 1
-        points = torch.minimum(points.clamp(min=0), top)
-        low = points.long()
-        high = torch.minimum(low + 1, top)
-        f = points - low
-        flat = self.values.reshape(-1)
-        total = torch.zeros(len(points), dtype=torch.float64, device=points.device)
-        for corner in np.ndindex(2, 2, 2):
-            at = [(high if up else low)[:, axis] for axis, up in enumerate(corner)]
-            w = [f[:, axis] if up else 1 - f[:, axis] for axis, up in enumerate(corner)]
-            total += w[0] * w[1] * w[2] * flat[(at[2] * ny + at[1]) * nx + at[0]]
-        tables = self.scene.optics
-        u = ((total - tables.lo) * tables.inv_width).clamp(0.0, float(tables.bins))
-        return torch.where(torch.isfinite(total), u, torch.nan)
 
-    def _rows(self, u: Any) -> tuple[Any, Any]:
-        """Optics at u (n,) and their integrals over [0, u], (n, 4) each (`kernel._point`, `_integrals`)."""
-        i = u.long().clamp(max=len(self.nodes) - 2)
-        f = (u - i)[:, None]
-        a, b = self.nodes[i], self.nodes[i + 1]
-        return a + f * (b - a), self.cumulative[i] + f * a + 0.5 * f * f * (b - a)
+class DeviceRays:
+    """Casts the rays of a scene on the first CUDA device; once that has failed, on the CPU.
 
-    def _composite(self, u0: Any, u1: Any, length: Any, light: Any) -> Any:
-        """``light`` (n, 4: r, g, b, T) behind segments along which the coordinate goes from u0 to u1."""
-        import torch
+    Attributes:
+        scene: what is drawn, without these rays.
+        say: told in a line that the device has failed.
+    """
 
-        known = torch.isfinite(u0) & torch.isfinite(u1)
-        u0, u1 = torch.where(known, u0, 0.0), torch.where(known, u1, 0.0)
-        width = u1 - u0
-        narrow = width.abs() < 0.5
-        point = self._rows(0.5 * (u0 + u1))[0]
-        wide = torch.where(narrow, 1.0, width)[:, None]
-        ends = [self._rows(u0 + width * (k / PARTS))[1] for k in range(PARTS + 1)]
-        color, trans = light[:, :3], light[:, 3]
-        length = torch.where(known, length, 0.0)[:, None]
-        for a, b in pairwise(ends):
-            optics = torch.where(narrow[:, None], point / PARTS, (b - a) / wide) * length
-            depth = optics[:, 3].clamp(min=0)
-            absorbed = torch.where(depth > 0, -torch.expm1(-depth) / depth.clamp(min=1e-300), 1.0) * trans
-            color = color + absorbed[:, None] * optics[:, :3]
-            trans = trans * torch.exp(-depth)
-        return torch.cat([color, trans[:, None]], dim=1)
+    def __init__(self, scene: Scene, say: Callable[[str], None]) -> None:
+        """Take a scene; nothing is sent to the device before a ray is cast."""
+        self.scene, self.say, self.failed = replace(scene, rays=None), say, False
+
+    @cached_property
+    def on_device(self) -> tuple[Any, ...]:
+        """The scene's arrays on the device.
+
+        Raises:
+            MemoryError: more bytes than are free there.
+        """
+        from numba import cuda
+
+        data = scene_arrays(self.scene)
+        needed, (free, _) = _bytes(data), cuda.current_context().get_memory_info()
+        if needed > free:
+            raise MemoryError(f"the volume needs {needed / 1e9:.1f} GB, of which {free / 1e9:.1f} are free")
+        found: tuple[Any, ...] = _sent(data)
+        return found
+
+    def __call__(self, *args: Any) -> None:
+        """Draw pixels; arguments as of `march.render_tiles` from ``eye`` on."""
+        from vvgt_cli.dvr.render import host_rays
+
+        if not self.failed:
+            try:
+                return self._cast(*args)
+            except Exception as error:  # the driver's, the compiler's and numba's, which share no class
+                self.failed = True
+                self.__dict__.pop("on_device", None)
+                reason = " ".join(str(error).split())[:200]
+                self.say(f"the GPU failed ({reason}); views are drawn on the CPU")
+        return host_rays(self.scene)(*args)
+
+    def _cast(
+        self, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, _order: np.ndarray,
+        offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
+    ) -> None:  # fmt: skip
+        from numba import cuda
+
+        places = np.flatnonzero(mask)
+        if not len(places):
+            return
+        data, pixels = self.on_device, cuda.device_array((len(places), 4), np.float32)
+        camera = np.zeros((5, 4))
+        camera[0, :3], camera[1:4, :3], camera[4] = eye, basis, lens
+        sent = map(cuda.to_device, (places.astype(np.int32), np.ascontiguousarray(offsets, np.float64)))
+        render = _kernels(_key())[self.scene.light is not None]
+        blocks = -(-len(places) // THREADS)
+        render[blocks, THREADS](data, cuda.to_device(camera), step, mask.shape[1], *sent, pixels)
+        share = len(offsets) / (known + len(offsets))
+        out[mask] = (1 - share) * out[mask] + share * pixels.copy_to_host()
+
+
+def _sent(value: Any) -> Any:
+    """Return arrays, or tuples of them, with the arrays on the device."""
+    from numba import cuda
+
+    if isinstance(value, tuple):
+        made = map(_sent, value)
+        return value._make(made) if hasattr(value, "_make") else tuple(made)
+    return cuda.to_device(value) if isinstance(value, np.ndarray) else value
+
+
+def _bytes(value: Any) -> int:
+    """Return the bytes of arrays, or tuples of them."""
+    return sum(map(_bytes, value)) if isinstance(value, tuple) else getattr(value, "nbytes", 0)

@@ -50,7 +50,7 @@ _exact = inlined(error_model="numpy", borrowed=True)  # the same on both sides o
 
 
 @_jit
-def _shade(
+def shade_segment(
     own: Quad, light: Light, values: np.ndarray, p: Vector, d: Vector, look: Vector, s: float
 ) -> tuple[float, float, float]:
     """Shade a segment's ``own`` (r, g, b, alpha) at p + s d, seen along ``look``; no colour exceeds its alpha."""
@@ -97,7 +97,7 @@ def _through_values(
                     else:
                         own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
                         if lane(own, 3) > 0.0:
-                            r, g, b_ = _shade(own, light, voxels.values, p, d, look, s)
+                            r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, s)
                             red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
@@ -140,7 +140,7 @@ def _through_texels(
                 seen, trans = blend_texels(a, b, dt, seen, trans)
             else:
                 own, trans = blend_texels(a, b, dt, zeros4(), trans)
-                r, g, b_ = _shade(own, light, voxels.values, p, d, look, t - 0.5 * dt)
+                r, g, b_ = shade_segment(own, light, voxels.values, p, d, look, t - 0.5 * dt)
                 red, green, blue = red + r, green + g, blue + b_
         a, known = b, True
         i += 1
@@ -176,6 +176,18 @@ def _whole(
 
 
 @_jit
+def direction(basis: np.ndarray, lens: np.ndarray, x: float, y: float) -> Vector:
+    """Return the direction of the ray through a point of the picture, in voxels; arguments as of `_tiles`."""
+    a, b = (x - lens[2]) * lens[0], (y - lens[3]) * lens[1]
+    norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
+    return (
+        (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm,
+        (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm,
+        (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm,
+    )
+
+
+@_jit
 def _pixel(
     voxels: Voxels, optics: Optics, texels: Any, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
     lens: np.ndarray, step: float, col: int, row: int, offsets: np.ndarray,
@@ -183,14 +195,9 @@ def _pixel(
     """Sum (r, g, b, alpha) over the rays at ``offsets`` from the centre of pixel (``col``, ``row``)."""
     acc0 = acc1 = acc2 = acc3 = 0.0
     for ray in range(len(offsets)):
-        a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
-        b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
-        norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-        dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-        dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-        dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+        d = direction(basis, lens, col + 0.5 + offsets[U(ray), 0], row + 0.5 + offsets[U(ray), 1])
         p = eye[0], eye[1], eye[2]
-        red, green, blue, alpha = _whole(voxels, optics, texels, empty, light, p, (dx, dy, dz), step)
+        red, green, blue, alpha = _whole(voxels, optics, texels, empty, light, p, d, step)
         acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
     return acc0, acc1, acc2, acc3
 

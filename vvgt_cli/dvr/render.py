@@ -152,8 +152,8 @@ def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> Rend
     return replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
 
 
-def _rays(scene: Scene) -> Callable[..., None]:
-    """Return the kernel for a scene's kind, bound to what it reads of the scene."""
+def host_rays(scene: Scene) -> Callable[..., None]:
+    """Return the CPU's kernel for a scene's kind, bound to what it reads of the scene."""
     from vvgt_cli.dvr import march
 
     if scene.grid is None:
@@ -177,7 +177,7 @@ def render_view(
     settings = settings or RenderSettings()
     if not isinstance(scene, Scene):
         return scene.view(camera, settings, blocks)
-    draw = _rays(scene)
+    draw = scene.rays or host_rays(scene)
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     order = tile_order(camera.height, camera.width, blocks)

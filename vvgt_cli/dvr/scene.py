@@ -55,6 +55,7 @@ class Scene:
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
             drawn. ``values`` and ``optics`` then hold its extinction alone: what light, shadows and bricks ask for.
         labels: the grid is one of labels alone.
+        rays: draws in place of the CPU's kernels (`vvgt_cli.dvr.cuda`).
     """
 
     volume: Volume
@@ -69,6 +70,7 @@ class Scene:
     light: Light | None = None
     grid: np.ndarray | None = None
     labels: bool = False
+    rays: Callable[..., None] | None = None
 
     @property
     def texels(self) -> Texels:

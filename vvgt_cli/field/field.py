@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.device import on_device
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
@@ -94,20 +95,24 @@ class Resident:
         source: the volume and its look.
         scene: the values, laid out for the kernels.
         views: renderer of its pictures; None selects the field itself.
+        device: "cpu" or "cuda", which renders them where it is the field itself.
+        say: told in a line that the device has failed.
     """
 
     source: Source
     scene: Scene
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+    device: str = "cpu"
+    say: Callable[[str], None] = print
 
     def __post_init__(self) -> None:
         """Use the field itself as the renderer if none is given."""
         self.views = self.views or self
 
     @classmethod
-    def of(cls, source: Source) -> Resident:
+    def of(cls, source: Source, device: str = "cpu", say: Callable[[str], None] = print) -> Resident:
         """Return the field of a source, with its values laid out for the kernels."""
-        return cls(source, source.scene())
+        return cls(source, on_device(source.scene(), device, say), device=device, say=say)
 
     @cached_property
     def layout(self) -> PreparedVolume:
@@ -168,7 +173,8 @@ class Resident:
 
         if source.layers[0].volume is not self.source.layers[0].volume:
             source = replace(source, statistics=statistics(source.volume))
-        return Resident.of(source if source.gridded or self.source.gridded else replace(source, layout=self.layout))
+        gridded = source.gridded or self.source.gridded
+        return Resident.of(source if gridded else replace(source, layout=self.layout), self.device, self.say)
 
     @cached_property
     def _digest(self) -> str | None:

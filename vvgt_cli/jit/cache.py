@@ -85,6 +85,13 @@ def _digest(*parts: Any) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
+def source_digest(function: Any, *more: Any) -> str:
+    """Return the digest, 16 hexadecimal digits, of what a function is compiled from, of ``more`` and versions."""
+    modules, constants = reached(function)
+    sources = [(module, _source(module)) for module in sorted(modules)]
+    return _digest(VERSIONS, sources, sorted(constants), *more)
+
+
 class KernelCache:
     """Cache of a numba dispatcher: the compiled forms of its signatures.
 
@@ -101,9 +108,7 @@ class KernelCache:
     @cached_property
     def key(self) -> str:
         """Digest of everything that is compiled, and of what compiles it."""
-        modules, constants = reached(self.function)
-        sources = [(module, _source(module)) for module in sorted(modules)]
-        return _digest(VERSIONS, sources, sorted(constants), options_of(self.dispatcher))
+        return source_digest(self.function, options_of(self.dispatcher))
 
     def file(self, types: tuple[Any, ...]) -> str:
         """Return the name of the file of a signature."""

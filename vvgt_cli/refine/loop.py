@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +18,12 @@ from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.densify import Densified
 from vvgt_cli.refine.judge import Judge
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.refine.states import Fields, OwnAxes, State
+from vvgt_cli.refine.states import MEMORY, Fields, OwnAxes, State
 from vvgt_cli.splat import blend
 
 SLOWER = 0.5  # rates after a fall
 LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
 SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
-MEMORY = 0.9  # of the running error, a step
 NEAR, FORGOTTEN, LITTLE = 0.3, 0.9, 1e-3  # 1 - cosine between views that are near; what was seen, a step; among equals
 KEEP = 30.0  # seconds after which a run is kept, looks or not
 
@@ -113,7 +113,11 @@ def begin(
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnAxes(gaussians, cameras, options.rule, free)
+    if options.device == "cpu":
+        return OwnAxes(gaussians, cameras, options.rule, free)
+    from vvgt_cli.refine.on_device import OwnAxesOnDevice
+
+    return OwnAxesOnDevice(gaussians, cameras, options, free, options.device)
 
 
 def step(
@@ -129,6 +133,9 @@ def step(
 
     ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
     """
+    if options.device != "cpu":
+        there: Any = state  # an `OwnAxesOnDevice`
+        return float(there.step_on(camera, target, options, error, share, speed))
     from vvgt_cli.refine.loss import loss_gradient
     from vvgt_cli.refine.ssim import add_ssim_gradient
     from vvgt_cli.refine.texture import add_texture_gradient

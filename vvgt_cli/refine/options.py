@@ -49,6 +49,7 @@ class OptimizeOptions:
         patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
+        device: "cpu", or "cuda" for steps of the method "frame" there (`vvgt_cli.refine.on_device`).
     """
 
     steps: int | None = STEPS
@@ -67,6 +68,7 @@ class OptimizeOptions:
     patience: int = 3
     checkpoint: str | None = None
     seed: int = 0
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Check the options.

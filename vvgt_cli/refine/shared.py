@@ -140,14 +140,17 @@ class SharedSteps:
         """
         found = np.empty((KNOWN, FEATURES), np.float32)
         steps.regress(self.solver, directions, self.factor, found)
-        plain = found.astype(np.float64) / self.factor
+        self.remember(found.astype(np.float64) / self.factor)
+        return found
+
+    def remember(self, plain: np.ndarray) -> None:
+        """Adapt `factor` to a prediction (KNOWN, FEATURES), ``plain`` without that factor."""
         size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
         if 0 < size < math.inf:
             cosine = float((plain * self.before).sum()) / size
             self.agreement = RECALL * self.agreement + (1 - RECALL) * cosine
             self.factor = min(max(self.factor * math.exp(PACE * (self.agreement - AGREEING)), BOUNDS[0]), BOUNDS[1])
         self.before = plain
-        return found
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return what the next steps depend on."""

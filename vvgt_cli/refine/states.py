@@ -17,6 +17,7 @@ from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
+MEMORY = 0.9  # share of the running error that a step keeps
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
@@ -106,23 +107,27 @@ class OwnAxes:
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
         slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
-        self.step += 1
-        pace = speed * min(1.0, 2 * (1 - share))
-        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
-        rates = self.RATES * self.OWN * pace if self.weakest else self.RATES * pace
+        rates, pace = self.rates(error, share, speed)
         steps.own_axes(
             slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
-            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1])
+            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
-            steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
+            steps.adam(values, slope, rate, *self.BETAS, self.step, first, second)
         if len(self.fixed):
             for array, there in zip(self.arrays, self.there, strict=True):
                 array[self.fixed] = there
+
+    def rates(self, error: float, share: float, speed: float) -> tuple[np.ndarray, float]:
+        """Count a step, and return the rates of its fields as of `RATES`, and the factor that they share."""
+        self.step += 1
+        pace = speed * min(1.0, 2 * (1 - share))
+        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        return self.RATES * self.OWN * pace if self.weakest else self.RATES * pace, pace
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what is added to Adam's divisors, features and shared weights; from slopes ``rows`` (COUNT, K)."""

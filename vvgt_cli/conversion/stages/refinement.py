@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.constants import MIN_ALPHA
@@ -74,7 +76,7 @@ class Refinement(Stage):
         target = work.limits.target_psnr
         options = OptimizeOptions.of(
             "frame", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule, judge=work.rule,
-            seed=work.fit.seed, checkpoint=work.checkpoint.descent,
+            seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.made()
@@ -106,16 +108,17 @@ def refine(
         free: (K,) bool, the Gaussians that may move; None for all.
     """
     with run.stage("refinement") as stage, run.console.interruption(run.console.message) as stop:
-        result, record = optimize(
+        descend = partial(
+            optimize,
             start if begin is None else begin[0],
             train.cameras,
             train.images,
-            options,
-            (check.cameras, check.images, check.blocks),
+            check=(check.cameras, check.images, check.blocks),
             progress=run.console.bar("refinement"),
             stop=stop,
             free=free,
         )
+        result, record = _on_its_device(run, options, descend)
         if begin is not None:
             record.psnr_before = begin[1]
             if (record.psnr_after or 0.0) <= record.psnr_before:
@@ -126,6 +129,22 @@ def refine(
     drawn = {"rule": options.rule.name, "dilation": options.rule.dilation}
     run.report.refinement = asdict(record) | {"method": options.method, "views": len(train)} | drawn
     return as_stored(result)
+
+
+def _on_its_device(
+    run: Run, options: OptimizeOptions, descend: partial[tuple[Gaussians, OptimizeRecord]]
+) -> tuple[Gaussians, OptimizeRecord]:
+    """Descend on the device of the options, or on the CPU where that does not or fails, which is said."""
+    if options.device != "cpu":
+        from vvgt_cli.refine.on_device import unfit
+
+        try:
+            if (reason := unfit(descend.args[0], options)) is None:
+                return descend(options=options)
+            run.console.message(f"{reason}: steps are taken on the CPU")
+        except DeviceFailed as failed:
+            run.console.message(f"the GPU failed ({failed}); steps are taken on the CPU")
+    return descend(options=replace(options, device="cpu"))
 
 
 def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians.constants import DILATION, NEAR
 from vvgt_cli.network.prepare import unpack
 from vvgt_cli.splat import project, render, render_backward
+from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 class Splat(torch.autograd.Function):
@@ -48,21 +48,8 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
 
 
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
-    """Return the picture of `splat` drawn by gsplat (Ye et al. 2024), differentiable.
-
-    Its alpha is capped at 0.999 where ours is at 0.99, and beside the frustum it takes the Jacobian at the frustum's
-    edge: pictures differ there.
-    """
-    from gsplat import rasterization
-
+    """`splat` by gsplat, differentiable; see `vvgt_cli.splat.by_gsplat.picture` for where pictures differ."""
     means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
-    view = torch.eye(4, device=rows.device)
-    view[:3, :3] = torch.as_tensor(camera.rotation, dtype=torch.float32)
-    view[:3, 3] = torch.as_tensor(camera.translation, dtype=torch.float32)
-    lens = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    rgb, alpha, _ = rasterization(
-        means, quaternions, log_scales.exp(), logits[:, 0].sigmoid(), colors.clamp(min=0), view[None],
-        torch.tensor([lens], dtype=torch.float32, device=rows.device), camera.width, camera.height,
-        near_plane=NEAR, eps2d=DILATION, packed=False,
-    )  # fmt: skip
-    return torch.cat([rgb[0], alpha[0]], dim=-1)
+    opacity = capped(logits[:, 0].sigmoid())
+    drawn = picture(means, opacity, colors.clamp(min=0), camera, quats=quaternions, scales=log_scales.exp())
+    return torch.cat(drawn, dim=-1)

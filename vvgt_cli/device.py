@@ -1,0 +1,101 @@
+"""The CUDA device that views are drawn and steps are taken on (docs/gpu.md): whether there is one, and its memory."""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from vvgt_cli.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+DEVICES = ("cpu", "cuda", "auto")
+PACKAGES = {"numba_cuda": "numba-cuda", "torch": "torch", "gsplat": "gsplat"}  # modules, and what installs them
+FREE = 0.5  # of a GPU's memory, below which "auto" leaves it to others
+
+
+class Gpu(NamedTuple):
+    """A GPU: its name, and bytes of memory, free and in all."""
+
+    name: str
+    free: int
+    total: int
+
+    def text(self) -> str:
+        """Return one line."""
+        return f"{self.name}, {self.free / 1e9:.1f} of {self.total / 1e9:.1f} GB free"
+
+
+def missing() -> list[str]:
+    """Return the packages for a GPU that are not installed."""
+    return [package for module, package in PACKAGES.items() if importlib.util.find_spec(module) is None]
+
+
+def first_gpu() -> Gpu | None:
+    """Return the first CUDA device; None where there is none, or it does not answer."""
+    if importlib.util.find_spec("numba_cuda") is None:
+        return None
+    from numba import cuda
+
+    try:
+        name = cuda.get_current_device().name
+        free, total = cuda.current_context().get_memory_info()
+    except Exception:  # the driver's errors, and that there is none, share no class
+        return None
+    return Gpu(name.decode() if isinstance(name, bytes) else name, int(free), int(total))
+
+
+def chosen(device: str) -> str:
+    """Return "cpu" or "cuda" for one of `DEVICES`; "auto" is a GPU that is there and has at least half its memory free.
+
+    Raises:
+        UsageError: "cuda" without the packages that it needs.
+        DataError: "cuda" without a CUDA device.
+    """
+    if device == "cpu":
+        return device
+    absent = missing()
+    gpu = None if absent else first_gpu()
+    if device == "auto":
+        return "cuda" if gpu is not None and gpu.free >= FREE * gpu.total else "cpu"
+    if absent:
+        raise UsageError(f"--device cuda needs {', '.join(absent)}: pip install 'vvgt[cuda]', or use --device cpu")
+    if gpu is None:
+        raise DataError("--device cuda: no CUDA device found; check the driver (nvidia-smi), or use --device cpu")
+    return "cuda"
+
+
+def describe() -> str:
+    """Return what there is of a GPU, for people."""
+    if absent := missing():
+        return f"none that could be used: {', '.join(absent)} not installed (pip install 'vvgt[cuda]')"
+    gpu = first_gpu()
+    return "none found" if gpu is None else gpu.text()
+
+
+def on_device(scene: Scene, device: str, say: Callable[[str], None]) -> Scene:
+    """Return the scene with its rays cast on ``device``, "cpu" or "cuda"; ``say`` is told where that fails."""
+    if device == "cpu":
+        return scene
+    if scene.grid is not None:
+        say("labels and layers are drawn on the CPU; a GPU draws one volume under a function")
+        return scene
+    from vvgt_cli.dvr.cuda import DeviceRays
+
+    return replace(scene, rays=DeviceRays(scene, say))
+
+
+def load_ahead() -> None:
+    """Begin to load what steps need, in the background: it takes as long as a closed form."""
+
+    def load() -> None:
+        import torch
+        from gsplat.cuda._backend import _C  # noqa: F401 # built at its first import
+
+        torch.eye(2, device="cuda") @ torch.eye(2, device="cuda")  # the context, and the library of products
+
+    threading.Thread(target=load, daemon=True).start()
