@@ -158,6 +158,7 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((frames, "-o", series / "{}{}.ply"), "expected one place for the frame's number"),
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "r.json"), "--report .*expected one place"),
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "expected one folder"),
+        ((frames, "-o", series / "{}" / "a.ply"), "expected one folder; got .*0, .*1, .*2$"),
         ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
         ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),

@@ -80,8 +80,8 @@ def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path
     monkeypatch.setattr(
         ViewingConditions, "cost", lambda stage, workload: counts.append(workload.gaussians) or cost(stage, workload)
     )
-    files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "r_{}.json")
-    names = {1: "r_1-label-1.json", 3: "r_3-label-3.json"}
+    files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "p_{}.json")
+    names = {1: "p_1-label-1.json", 3: "p_3-label-3.json"}  # beside p_index.json
     for number, name in names.items():
         plan = json.loads((tmp_path / name).read_text())["plan"]
         assert plan["gaussians"] == len(files[number])

@@ -17,7 +17,6 @@ from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     FUNCTIONS,
-    INDEX,
     LABELS,
     entry,
     function_name,
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion
 
 WHOLE_RUN = Shard()
+UNKNOWN = "0"  # stem of labels that are not read yet: not that of the index
 
 
 class Files:
@@ -80,37 +80,40 @@ class Files:
         Raises:
             UsageError: outputs that may not be written, or a folder of another series.
         """
-        request, overwrite = self._request, self._request.overwrite
-        if request.overwrite and self._shard.count > 1:
+        if self._request.overwrite and self._shard.count > 1:
             raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
-        first = self.names(batch.kind, batch.stems[0] if batch.stems else INDEX)
-        index = index_output(str(request.output))
-        check_outputs([*self._named(request, first).outputs(), index], request.inputs(), overwrite or batch.resumes)
-        self._check_stems(batch)
+        self._check(batch)
         batch.prepare(run)
-        self._check_stems(batch)
-        rows = [self.names(batch.kind, stem) for stem in batch.stems]
+        rows = self._check(batch)
         if not batch.resumes:
-            outputs = [output for row in rows for output in self._named(request, row).outputs()]
-            check_outputs([*outputs, index], request.inputs(), overwrite)
             return
-        folders = {str(Path(name).parent) for name in first}
-        if len(folders) > 1:
-            raise UsageError(f"-o, --report and --preview of a series: expected one folder; got {', '.join(folders)}")
-        self._manifest = Manifest(Path(folders.pop()), batch.settings(), self._shard, what="frames")
+        self._manifest = Manifest(Path(rows[0][0]).parent, batch.settings(), self._shard, what="frames")
         self._stack.enter_context(claim(self._manifest.folder / self._shard.manifest))
-        self._manifest.open([Path(name).name for name in (*(n for row in rows for n in row), index.path)], overwrite)
+        index = index_output(str(self._request.output)).path
+        names = [Path(name).name for name in (*(n for row in rows for n in row), index)]
+        self._manifest.open(names, self._request.overwrite)
         self._manifest.record()
+
+    def _check(self, batch: Batch) -> list[list[str]]:
+        """Check the outputs as far as stems are known, and return them; files of a series may exist."""
+        request, stems, inputs = self._request, batch.stems, self._request.inputs()
+        if len(set(stems)) < len(stems):
+            stated = ", ".join(dict.fromkeys(stems))
+            raise UsageError(f"{len(stems)} {batch.kind}, named {stated}: files would share a name; rename one")
+        rows = [self.names(batch.kind, stem) for stem in stems or [UNKNOWN]]
+        folders = sorted({str(Path(name).parent) for row in rows for name in row})
+        if batch.resumes and len(folders) > 1:
+            stated = ", ".join(folders[:3])
+            raise UsageError(f"-o, --report and --preview of a series: expected one folder; got {stated}")
+        checked, index = rows[:1] if batch.resumes else rows, index_output(str(request.output))
+        outputs = [output for row in checked for output in self._named(request, row).outputs()]
+        check_outputs([*outputs, index], inputs, request.overwrite or batch.resumes or not stems)
+        check_outputs([index], inputs, request.overwrite or batch.resumes)
+        return rows
 
     def close(self) -> None:
         """Release the folder."""
         self._stack.close()
-
-    @staticmethod
-    def _check_stems(batch: Batch) -> None:
-        if len(set(batch.stems)) < len(batch.stems):
-            stated = ", ".join(dict.fromkeys(batch.stems))
-            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would share a name; rename one")
 
     def wants(self, batch: Batch, stem: str) -> bool:
         """Return whether an item belongs to this shard and is not complete yet."""

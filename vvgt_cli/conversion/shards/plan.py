@@ -52,7 +52,7 @@ class Plan:
     degree: int = 0
 
     def save(self, store: BlockStore, light: Light | None) -> None:
-        """Write the light, if any, and then the plan store_beside the blocks."""
+        """Write the light, if any, and then the plan beside the blocks."""
         if light is not None:
             with atomic_write(store.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, allow_pickle=False, **light._asdict())
@@ -61,7 +61,7 @@ class Plan:
 
     @classmethod
     def load(cls, store: BlockStore) -> Plan:
-        """Read the plan store_beside blocks.
+        """Read the plan beside blocks.
 
         Raises:
             DataError: the plan is missing or damaged.
@@ -86,7 +86,7 @@ class Plan:
 
 
 def load_light(store: BlockStore, plan: Plan) -> Light | None:
-    """Read the light store_beside a plan, None for none.
+    """Read the light beside a plan, None for none.
 
     Raises:
         DataError: the file beside the plan is missing or damaged.

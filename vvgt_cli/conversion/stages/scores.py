@@ -85,11 +85,9 @@ class ViewingConditions(Stage):
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels and Gaussians."""
         near = (workload.size // 2) ** 2
-        store_beside = CONDITIONS[1] + CONDITIONS[2] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
+        splats = CONDITIONS[1] + CONDITIONS[2] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
         return Cost(
-            CONDITIONS[0] * workload.check_view_seconds
-            + workload.reference_seconds(near)
-            + workload.pace * store_beside
+            CONDITIONS[0] * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats
         )
 
     def views(self, fit: FitOptions) -> list[Picture]:
