@@ -66,5 +66,6 @@ def test_functions_of_one_name_are_refused(vvgt, tmp_path, functions):
     (tmp_path / "other").mkdir()
     twin = tmp_path / "other" / "bone.json"
     twin.write_text((tmp_path / "bone.json").read_text())
-    done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / "{}.ply"))
-    assert (done.code, "files would share a name" in done.err) == (2, True)
+    for output in ("{}.ply", "page.html"):
+        done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / output))
+        assert (done.code, "expected one name each" in done.err) == (2, True)

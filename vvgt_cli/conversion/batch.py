@@ -113,6 +113,16 @@ class Batch(ABC):
         self.request, self.volume, self.stems = request, volume, list(stems)
         self.facts: dict[str, Any] = {}
 
+    def check_names(self) -> None:
+        """Check that no two items have one name, as far as they are known.
+
+        Raises:
+            UsageError: two have.
+        """
+        if len(set(self.stems)) < len(self.stems):
+            stated = ", ".join(dict.fromkeys(self.stems))
+            raise UsageError(f"{len(self.stems)} {self.kind}, named {stated}: expected one name each; rename one")
+
     @abstractmethod
     def prepare(self, run: Run) -> None:
         """Read what all items share."""

@@ -97,9 +97,7 @@ class Files:
     def _check(self, batch: Batch) -> list[list[str]]:
         """Check the outputs as far as stems are known, and return them; files of a series may exist."""
         request, stems, inputs = self._request, batch.stems, self._request.inputs()
-        if len(set(stems)) < len(stems):
-            stated = ", ".join(dict.fromkeys(stems))
-            raise UsageError(f"{len(stems)} {batch.kind}, named {stated}: files would share a name; rename one")
+        batch.check_names()
         rows = [self.names(batch.kind, stem) for stem in stems or [UNKNOWN]]
         folders = sorted({str(Path(name).parent) for row in rows for name in row})
         if batch.resumes and len(folders) > 1:
@@ -165,7 +163,12 @@ class Memory:
         self._made: Cloud | None = None
 
     def open(self, batch: Batch, run: Run) -> None:
-        """Prepare the batch."""
+        """Prepare the batch.
+
+        Raises:
+            UsageError: two items of one name.
+        """
+        batch.check_names()
         batch.prepare(run)
 
     def wants(self, batch: Batch, stem: str) -> bool:
