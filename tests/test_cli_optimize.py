@@ -121,7 +121,7 @@ CASES = {
     "no views": (("in.ply", "--views", "none", "--steps", 1, "-o", "o.ply"), 1, "none/transforms_train.json"),
     "no ply": (("no.ply", "--views", "views", "--steps", 1, "-o", "o.ply"), 1, "no.ply"),
     "no budget": (("in.ply", "--views", "views", "-o", "o.ply"), 2, "--steps N or --time-budget"),
-    "two budgets": (("in.ply", "--views", "views", "--steps", 1, "--time-budget", 1, "-o", "o.ply"), 2, "one of the"),
+    "two budgets": (("in.ply", "--views", "views", "--steps", 1, "--time-budget", 1, "-o", "o.ply"), 2, "give either"),
     "over itself": (("in.ply", "--views", "views", "--steps", 1, "-o", "in.ply", "--overwrite"), 2, "input"),
     "suffix": (("in.ply", "--views", "views", "--steps", 1, "-o", "o.splat"), 2, ".ply"),
     "limit": (("in.ply", "--views", "views", "--steps", 1, "-o", "o.ply", "--max-gaussians", 9), 2, "--method 3dgs"),

@@ -143,7 +143,7 @@ def _outside(folder):
         (_truncate, "truncated"),
         (_damage, "sha256"),
         (_not_onnx, "cannot load"),
-        (_other_input, "wants normals"),
+        (_other_input, "needs normals"),
         (_other_output, "gives splats"),
         (_other_names, "its card says"),
         (_outside, "no such file"),
