@@ -91,23 +91,37 @@ def test_gradients_of_the_splatter_against_its_twin_and_against_differences():
     assert difference == pytest.approx(float((rows.grad.numpy() * step).sum()), rel=1e-3)
 
 
-def like_gsplat(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
-    """gsplat's `rasterization` by our kernels: world-to-camera matrices, pinholes as it documents them."""
-    assert (means.shape[1], viewmats.shape, Ks.shape) == (3, (1, 4, 4), (1, 3, 3))
-    assert (options["near_plane"], options["eps2d"]) == (NEAR, DILATION)
-    view, lens = viewmats[0].numpy().astype(float), Ks[0].numpy().astype(float)
-    assert view[3].tolist() == [0, 0, 0, 1]
-    assert lens[2].tolist() == [0, 0, 1]
-    camera = Camera(view[:3, :3], view[:3, 3], lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], width, height)
-    logits = torch.log(opacities / (1 - opacities))
-    fields = [field.numpy() for field in (means, scales.log(), quats, logits, colors)]
-    picture = torch.from_numpy(render(Gaussians(*fields), camera))
-    return picture[None, ..., :3], picture[None, ..., 3:], {}
+class LikeGsplat:
+    """Stands for gsplat's functions: draws by our kernels, from world-to-camera matrices and pinholes."""
+
+    def fully_fused_projection(self, means, covars, quats, scales, viewmats, Ks, width, height, **options):
+        assert covars is None
+        assert (means.shape[1], viewmats.shape, Ks.shape) == (3, (1, 4, 4), (1, 3, 3))
+        assert (options["near_plane"], options["eps2d"]) == (NEAR, DILATION)
+        view, lens = viewmats[0].numpy().astype(float), Ks[0].numpy().astype(float)
+        assert view[3].tolist() == [0, 0, 0, 1]
+        assert lens[2].tolist() == [0, 0, 1]
+        self.camera = Camera(view[:3, :3], view[:3, 3], lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], width, height)
+        self.fields = [field.numpy() for field in (means, scales.log(), quats)]
+        return (None,) * 5
+
+    def isect_tiles(self, *given):
+        return (None,) * 3
+
+    def isect_offset_encode(self, *given):
+        return None
+
+    def rasterize_to_pixels(self, centres, conics, colors, opacities, *given):
+        logits = torch.log(opacities[0] / (1 - opacities[0]))
+        picture = torch.from_numpy(render(Gaussians(*self.fields, logits.numpy(), colors[0].numpy()), self.camera))
+        return picture[None, ..., :3], picture[None, ..., 3:]
 
 
 def test_gsplat_is_handed_the_camera(monkeypatch):
     """A camera that is turned, off its axis, of unequal focal lengths and not square: no two numbers alike."""
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=like_gsplat))
+    cuda = SimpleNamespace(_wrapper=LikeGsplat())
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(cuda=cuda))
+    monkeypatch.setitem(sys.modules, "gsplat.cuda", cuda)
     gaussians, _, _ = scene(count=200, views=1)
     camera = replace(look_at((2.0, -1.7, 0.9), width=40, height=28), fx=52.0, fy=44.0, cx=17.0, cy=16.5)
     rows = torch.from_numpy(pack(gaussians))
