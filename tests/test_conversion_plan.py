@@ -1,4 +1,4 @@
-"""What `convert` decides to do: limits, estimates, and what is left out."""
+"""What `convert` decides to do: limits, estimates, and what is skipped."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def write_scouts(folder: Path, number: int, uid: str = "1.2.3", **changes) -> No
 def test_scouts_in_the_series_are_left_out_and_that_is_said(tmp_path: Path) -> None:
     write_series(tmp_path)
     write_scouts(tmp_path, 7, ImageType=SCOUT)
-    with pytest.warns(UserWarning, match=r"left out.*1/2: 3 sagittal slices of 5 x 4, localiser$"):
+    with pytest.warns(UserWarning, match=r"skipped.*1/2: 3 sagittal slices of 5 x 4, localiser$"):
         check_grid(read_volume(str(tmp_path)), atol=SLOPE)
 
 
@@ -48,7 +48,7 @@ def test_fewer_slices_than_make_a_stack_are_left_out(tmp_path: Path, count: int)
         (tmp_path / "other" / name).rename(tmp_path / name)
         if k >= count:
             (tmp_path / name).unlink()
-    said = rf"left out.*1/2: {count} sagittal slice{'s' * (count > 1)} of 5 x 4$"
+    said = rf"skipped.*1/2: {count} sagittal slice{'s' * (count > 1)} of 5 x 4$"
     with pytest.warns(UserWarning, match=said):
         check_grid(read_volume(str(tmp_path)), atol=SLOPE)
 
@@ -91,7 +91,7 @@ def test_series_of_scouts_segmentations_and_pictures_are_left_out(tmp_path: Path
     write_scouts(tmp_path, 7, "1.2.7", SeriesNumber=7, ImageType=SCOUT)
     write_series(tmp_path, "1.2.8", 8, SOPClassUID=UID("1.2.840.10008.5.1.4.1.1.66.4"), Modality="SEG")
     write_series(tmp_path, "1.2.9", 9, ImagePositionPatient=None, Modality="OT")
-    said = r"left out: 7 'series 7' \(CT, 3 slices, 1\.2\.7\); 8 .*\(SEG, .*; 9 .*\(OT, "
+    said = r"skipped: 7 'series 7' \(CT, 3 slices, 1\.2\.7\); 8 .*\(SEG, .*; 9 .*\(OT, "
     with pytest.warns(UserWarning, match=said):
         check_grid(read_volume(str(tmp_path)), atol=SLOPE)
     write_series(tmp_path, "1.2.4", 2)

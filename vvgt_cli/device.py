@@ -77,16 +77,16 @@ def describe() -> str:
     return "none found" if gpu is None else gpu.text()
 
 
-def on_device(scene: Scene, device: str, say: Callable[[str], None]) -> Scene:
-    """Return the scene with its rays cast on ``device``, "cpu" or "cuda"; ``say`` is told where that fails."""
+def on_device(scene: Scene, device: str, report: Callable[[str], None]) -> Scene:
+    """Return the scene with its rays cast on ``device``, "cpu" or "cuda"; where that fails, ``report`` gets a line."""
     if device == "cpu":
         return scene
     if scene.grid is not None:
-        say("labels and layers are drawn on the CPU; a GPU draws one volume under a function")
+        report("labels and layers are drawn on the CPU; a GPU draws one volume under a function")
         return scene
     from vvgt_cli.dvr.cuda import DeviceRays
 
-    return replace(scene, rays=DeviceRays(scene, say))
+    return replace(scene, rays=DeviceRays(scene, report))
 
 
 def load_ahead() -> None:

@@ -157,12 +157,12 @@ class DeviceRays:
 
     Attributes:
         scene: what is drawn, without these rays.
-        say: told in a line that the device has failed.
+        report: gets a line if the device fails.
     """
 
-    def __init__(self, scene: Scene, say: Callable[[str], None]) -> None:
+    def __init__(self, scene: Scene, report: Callable[[str], None]) -> None:
         """Take a scene; nothing is sent to the device before a ray is cast."""
-        self.scene, self.say, self.failed = replace(scene, rays=None), say, False
+        self.scene, self.report, self.failed = replace(scene, rays=None), report, False
 
     @cached_property
     def on_device(self) -> tuple[Any, ...]:
@@ -191,7 +191,7 @@ class DeviceRays:
                 self.failed = True
                 self.__dict__.pop("on_device", None)
                 reason = " ".join(str(error).split())[:200]
-                self.say(f"the GPU failed ({reason}); views are drawn on the CPU")
+                self.report(f"the GPU failed ({reason}); views are drawn on the CPU")
         return host_rays(self.scene)(*args)
 
     def _cast(

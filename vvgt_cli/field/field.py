@@ -96,23 +96,23 @@ class Resident:
         scene: the values, laid out for the kernels.
         views: renderer of its pictures; None selects the field itself.
         device: "cpu" or "cuda", which renders them where it is the field itself.
-        say: told in a line that the device has failed.
+        report: gets a line if the device fails.
     """
 
     source: Source
     scene: Scene
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
     device: str = "cpu"
-    say: Callable[[str], None] = print
+    report: Callable[[str], None] = print
 
     def __post_init__(self) -> None:
         """Use the field itself as the renderer if none is given."""
         self.views = self.views or self
 
     @classmethod
-    def of(cls, source: Source, device: str = "cpu", say: Callable[[str], None] = print) -> Resident:
+    def of(cls, source: Source, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:
         """Return the field of a source, with its values laid out for the kernels."""
-        return cls(source, on_device(source.scene(), device, say), device=device, say=say)
+        return cls(source, on_device(source.scene(), device, report), device=device, report=report)
 
     @cached_property
     def layout(self) -> PreparedVolume:
@@ -174,7 +174,7 @@ class Resident:
         if source.layers[0].volume is not self.source.layers[0].volume:
             source = replace(source, statistics=statistics(source.volume))
         gridded = source.gridded or self.source.gridded
-        return Resident.of(source if gridded else replace(source, layout=self.layout), self.device, self.say)
+        return Resident.of(source if gridded else replace(source, layout=self.layout), self.device, self.report)
 
     @cached_property
     def _digest(self) -> str | None:

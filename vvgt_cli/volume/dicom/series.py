@@ -1,6 +1,6 @@
 """The choice of the images in a DICOM folder that make the volume: one series, and in it one stack of slices.
 
-Localisers (scouts), segmentations and single images of another orientation are left out where one stack remains, and a
+Localisers (scouts), segmentations and single images of another orientation are skipped where one stack remains, and a
 warning says so; where several remain, the error lists them.
 """
 
@@ -81,7 +81,7 @@ def _only(found: dict[str, Files], path: Path) -> Files:
         raise SeveralArrays(text, "--series", list(found), titles)
     if len(left) < len(found):
         warnings.warn(
-            f"{path}: left out: {_listed(aside)} (localisers, segmentations, images without a position)", stacklevel=2
+            f"{path}: skipped: {_listed(aside)} (localisers, segmentations, images without a position)", stacklevel=2
         )
     return next(iter(left.values()))
 
@@ -156,7 +156,7 @@ def one_stack(
             "SERIES/STACK", "--series", [f"{name}/{k}" for k in range(1, len(stacks) + 1)], list(map(_of, stacks)),
         )  # fmt: skip
     rest = "; ".join(f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks, 1) if stack is not large[0])
-    warnings.warn(f"{path}: left out, of another size or orientation: {rest[:500]}", stacklevel=2)
+    warnings.warn(f"{path}: skipped, of another size or orientation: {rest[:500]}", stacklevel=2)
     return large[0]
 
 
