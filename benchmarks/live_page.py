@@ -22,7 +22,8 @@ from closed_form import read_options, scene_rows
 from dvr_scenes import print_table, write_rows
 
 from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
-from vvgt_cli.conversion.convert import convert, initialise_only, open_field, ply_options
+from vvgt_cli.conversion.convert import convert, initialise_only, open_field
+from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.live import convert_live
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.field.source import SourceRequest, load

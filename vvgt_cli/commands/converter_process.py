@@ -16,7 +16,8 @@ from typing import IO, Any, NoReturn
 
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Start
 from vvgt_cli.commands.live_site import Cloud, page_files, stored
-from vvgt_cli.conversion.convert import convert_in_memory, open_field, ply_options
+from vvgt_cli.conversion.convert import convert_in_memory, open_field
+from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.live import convert_live, live_refusal
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest

@@ -9,9 +9,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
+from vvgt_cli.conversion.file_layout import degree_of, harmonics_warning, ply_options
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, convert_live
-from vvgt_cli.conversion.place import placement_warnings, to_unit_frame, up_axis, with_place
+from vvgt_cli.conversion.place import placement_warnings, to_unit_frame
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import report_format_cost
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
@@ -30,18 +31,15 @@ from vvgt_cli.field.settings import MANY, BlockOptions
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
-from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 QUICKEST = 0.5  # least pace, where the closed form took less time than estimated
-VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
 SMALLER = (8, 4, 2)  # divisors of the budget that a target is tried with first
 
 
@@ -324,7 +322,7 @@ def by_regions(request: ConvertRequest) -> bool:
 def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
-    flattened = _harmonics_warning(degree_of(request, source), source)
+    flattened = harmonics_warning(degree_of(request, source), source)
     for warning in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.message(warning)
     run.report.volume = volume_record(source)
@@ -338,50 +336,6 @@ def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) ->
     """Return the kernels that a source needs of ``names``."""
     names += LIVE if request.live else ()
     return for_degree(source.kernels(names), degree_of(request, source))
-
-
-def degree_of(request: ConvertRequest, source: Source) -> int:
-    """Return the degree of harmonics: 0 where the light does not depend on the view, else as requested or 2."""
-    if source.lighting is None or not source.lighting.depends_on_view:
-        return 0
-    return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
-
-
-def _harmonics_warning(degree: int, source: Source) -> str | None:
-    """Return a message where the requested degree cannot represent the light."""
-    if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
-        return None
-    return (
-        f"--sh-degree {degree}: headlight and highlights change with the view; the file has their mean "
-        f"over directions (--sh-degree {VIEW_DEGREE} represents them)"
-    )
-
-
-def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
-    """Return the layout of the file, with everything that follows from the source."""
-    ply = replace(
-        request.ply,
-        up=up_axis(request.up, request.ply.frame, source.volume.space),
-        unit_distance=source.unit_distance,
-        unit_distance_label=source.unit_label,
-        made_for=request.fit.size,
-        rule=request.fit.rule,
-        light=source.lighting,
-        function=source.name if len(source.layers) > 1 else source.tf.name,
-        optics=source.optics(),
-        legend=_legend(source),
-    )
-    return with_place(ply, source.volume)
-
-
-def _legend(source: Source) -> str | None:
-    """Return the legend of one function or label table."""
-    if len(source.layers) > 1:
-        return None
-    labelled, volume = isinstance(source.tf, LabelTable), source.volume
-    numbers = None if labelled else source.statistics
-    lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
-    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
 def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:

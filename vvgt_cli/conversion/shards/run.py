@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.cameras.sets import RADIUS
-from vvgt_cli.conversion.convert import degree_of, ply_options
+from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.part_descent import PartDescent
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS

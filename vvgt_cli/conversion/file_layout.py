@@ -1,0 +1,58 @@
+"""The layout of a conversion's file: what follows from the volume, its look and its light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vvgt_cli.conversion.place import up_axis, with_place
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.field.source import Source
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.gaussians.legend import legend_text
+from vvgt_cli.look.labels import LabelTable
+
+VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
+
+
+def degree_of(request: ConvertRequest, source: Source) -> int:
+    """Return the degree of harmonics: 0 where the light does not depend on the view, else as requested or 2."""
+    if source.lighting is None or not source.lighting.depends_on_view:
+        return 0
+    return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
+
+
+def harmonics_warning(degree: int, source: Source) -> str | None:
+    """Return a message where the requested degree cannot represent the light."""
+    if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
+        return None
+    return (
+        f"--sh-degree {degree}: headlight and highlights change with the view; the file has their mean "
+        f"over directions (--sh-degree {VIEW_DEGREE} represents them)"
+    )
+
+
+def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
+    """Return the layout of the file, with everything that follows from the source."""
+    ply = replace(
+        request.ply,
+        up=up_axis(request.up, request.ply.frame, source.volume.space),
+        unit_distance=source.unit_distance,
+        unit_distance_label=source.unit_label,
+        made_for=request.fit.size,
+        rule=request.fit.rule,
+        light=source.lighting,
+        function=source.name if len(source.layers) > 1 else source.tf.name,
+        optics=source.optics(),
+        legend=_legend(source),
+    )
+    return with_place(ply, source.volume)
+
+
+def _legend(source: Source) -> str | None:
+    """Return the legend of one function or label table."""
+    if len(source.layers) > 1:
+        return None
+    labelled, volume = isinstance(source.tf, LabelTable), source.volume
+    numbers = None if labelled else source.statistics
+    lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
+    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
