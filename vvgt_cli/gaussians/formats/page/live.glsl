@@ -67,17 +67,18 @@ float vvgtCutAll(inout vec3 center, inout mat3 axes) {
   return stays;
 }
 
-vec3 vvgtShaded(vec3 color, vec3 n, vec3 center) {  // Blinn and Phong's (docs/light.md)
+vec3 vvgtShaded(vec3 color, vec3 n, float share, vec3 center) {  // Blinn and Phong's (docs/light.md): a share has the normal n, the rest any
   vec3 d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
-  return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
+  vec2 seen = mix(vec2(0.5, 1.0 / (vvgtLight.w + 1.0)), vec2(abs(dot(n, l)), pow(facing, vvgtLight.w)), share);
+  return min(color * (vvgtLight.x + vvgtLight.y * seen.x) + vvgtLight.z * seen.y, vec3(1.0));
 }
 
-vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {
+vec3 vvgtLit(vec3 color, vec3 axis, vec3 center) {
   if (vvgtLight.x < 0.0) return color;
-  float rises = length(gradient);
-  vec3 own = rises == 0.0 ? color * vvgtLight.x : vvgtShaded(color, gradient / rises, center);
-  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, center), vvgtFace.w) : own;
+  float share = length(axis);
+  vec3 own = share == 0.0 ? color * vvgtLight.x : vvgtShaded(color, axis / share, min(share, 1.0), center);
+  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, 1.0, center), vvgtFace.w) : own;
 }
 
 void modifySplatCenter(inout vec3 center) {
@@ -105,7 +106,7 @@ void modifySplatCenter(inout vec3 center) {
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
   float mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
-  vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
+  vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * ((vec3(loadVvgtAxis().xyz) - 128.0) / 127.0), place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);

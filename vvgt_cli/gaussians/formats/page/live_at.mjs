@@ -1,6 +1,8 @@
 // One Gaussian of a live page as live.glsl shows it, and the value at a place; `look` as `liveLook` returns it.
 import { around } from './cloud.mjs';
 
+const ROW = 9;  // plane of a row's low byte, before that of its high byte (formats/live.py)
+
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 // what a Gaussian carries: value and spread, log of the length, direction in which values rise (viewer's axes) and its length r
@@ -23,7 +25,7 @@ const along = (gradient, arms) => {
 export const layersOf = (live) => live.layers.map((layer) => ({ ...live, ...layer }));
 
 // the row of a Gaussian's look, and its layer's number
-const rowOf = ({ bytes, count, live }, i) => (live.planes > 6 ? bytes[6 * count + i] + 256 * bytes[7 * count + i] : 0);
+const rowOf = ({ bytes, count, live }, i) => (live.planes > ROW ? bytes[ROW * count + i] + 256 * bytes[(ROW + 1) * count + i] : 0);
 const layerOf = ({ layers }, row) => layers.findLastIndex((layer) => layer.row <= row);
 const beyond = ({ planes = [] }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
