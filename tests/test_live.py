@@ -34,6 +34,7 @@ from vvgt_cli.gaussians.live import (
     Table,
     apply_look,
     baked,
+    without_tails,
 )
 from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
@@ -126,6 +127,23 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
     assert covariance[0, 0] == pytest.approx(0.01 * variance, rel=0.05)
     assert covariance[1, 1] == pytest.approx(0.01, rel=1e-4)
     assert shown.live is None
+
+
+def test_what_shows_only_a_tail_of_the_values_is_not_seen() -> None:
+    """A body of values above 20 beside Gaussians of spread 1, ever farther from it: the law's tail would be a halo."""
+    nodes = PiecewiseOpacity(np.array([0.0, 20, 20, 100]), np.array([0.0, 0, 0.9, 0.9]))
+    step = TransferFunction("step", nodes, COLORS)
+    table, means = Table.of_function(step, LO, HI, 0.05, GRAIN), np.array([20.0, 19.5, 19.0, 17.5])
+    sums = table.at(means, np.ones(4))
+    z = sums[:, 4] / sums[:, 3]
+    assert 0 < z[0] < z[1] < 1.2 < z[2] < 2 < z[3]
+    found = without_tails(sums) / sums[:, 3]
+    np.testing.assert_allclose(found, [1, 1, (2 - z[2]) / 0.8, 0], atol=1e-12)
+    live = np.column_stack([means, np.ones(4), np.full(4, 0.1), np.zeros((4, 6))])
+    some = Gaussians(np.zeros((4, 3)), np.full((4, 3), -3), [[1, 0, 0, 0]] * 4, [0.0] * 4, [[1, 1, 1]] * 4, live=live)
+    for shown in (apply_look(some, table), baked(some, table)):
+        assert shown.opacity_logits[3] < -10
+        assert shown.opacity_logits[2] > -4
 
 
 def test_a_look_turns_with_its_gaussians() -> None:

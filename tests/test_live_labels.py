@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.labelled import assign_labels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.legend import legend_text
-from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, apply_look, baked, opacities, visible_under
+from vvgt_cli.gaussians.live import SHARP, Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LiveFacts
 from vvgt_cli.look.fog import label_fog
 from vvgt_cli.look.label_files import read_labels
@@ -63,7 +63,7 @@ def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
         np.testing.assert_allclose(opacity, opacities(tau * length**3, variances, 0.0), atol=2e-5)
         smaller = np.sort(shown.log_scales[own], axis=1) - np.sort(some.log_scales[own], axis=1)
         opaque = -np.expm1(-tau * length)[:, None]
-        np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, FLAT, FLAT])), atol=1e-3)
+        np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, 1, 1])), atol=1e-3)
     np.testing.assert_allclose(shown.means, some.means, atol=1e-6)
     assert set(some.live[visible_under(some, Palette.of_labels(LABELS, 0.05)), LABEL_ROW]) == {0, 1}
 

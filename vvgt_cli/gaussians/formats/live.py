@@ -27,12 +27,12 @@ from vvgt_cli.gaussians.live import (
     AMOUNT,
     AROUND,
     BEND,
-    FLAT,
     LENGTH,
     MEANS,
     SHARP,
     SPREAD,
     SPREADS,
+    TAIL,
     THINNEST,
     VALUE,
     WIDEST,
@@ -91,7 +91,8 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Seq
         "bend": BEND,
         "table": [MEANS, SPREADS],
         "thinnest": THINNEST,
-        "opaque": [SHARP, FLAT],
+        "sharp": SHARP,
+        "tail": list(TAIL),
         "around": [AROUND, AMOUNT],
     }
 

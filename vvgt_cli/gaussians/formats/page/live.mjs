@@ -110,7 +110,7 @@ export async function liveLook({ app }, live) {
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
   look.light(live.light);
-  gsplat.setParameter('vvgtOpaque', [...live.opaque, live.dilation]);
+  gsplat.setParameter('vvgtOpaque', [live.sharp, live.dilation, ...live.tail]);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut([]);
   layers.forEach((layer, k) => {
