@@ -1,14 +1,14 @@
 """Gaussians that carry the volume's values, and their look under any function (docs/live.md).
 
 Each Gaussian stores the mean value m and standard deviation s of the field under it, the edge L of a cube of the volume
-that it represents, and the direction of the mean gradient, with the share r of s that the gradient explains as its
-length. For a function with extinction e and colour c, the values are modelled as a normal distribution N(m, s). Each
-value covers w = 1 - exp(-e g) of the background over a voxel's edge g. The Gaussian's extinction E covers as much as
-the values do on average; its colour is the mean of c weighted by w, minus what neighbours, whose values have a wider
-spread, will mix in. Weighted by w, z = (v - m) / s has a mean and a variance, by which the Gaussian moves along the
-gradient and becomes thinner in that direction. Where
-only a tail of the distribution is seen, the extinction is lowered. Opaque Gaussians, with a large 1 - exp(-E L), become
-flat in the surface whose normal is the gradient. The opacity is that of the optical mass E L^3
+that it represents, the direction of the mean gradient, with the share r of s that the gradient explains as its length,
+and the axis of the normals, for light (`vvgt_cli.closed_form.relight`). For a function with extinction e and colour c,
+the values are modelled as a normal distribution N(m, s). Each value covers w = 1 - exp(-e g) of the background over a
+voxel's edge g. The Gaussian's extinction E covers as much as the values do on average; its colour is the mean of c
+weighted by w, minus what neighbours, whose values have a wider spread, will mix in. Weighted by w, z = (v - m) / s has
+a mean and a variance, by which the Gaussian moves along the gradient and becomes thinner in that direction. Where only
+a tail of the distribution is seen, the extinction is lowered. Opaque Gaussians, with a large 1 - exp(-E L), become flat
+in the surface whose normal is the gradient. The opacity is that of the optical mass E L^3
 (`vvgt_cli.gaussians.opacity`). The means are tabulated over m and s.
 """
 
