@@ -14,11 +14,19 @@ import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
-from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
+from vvgt_cli.closed_form.gaussian_samples import (
+    NORMAL_SUMS,
+    POINTS,
+    add_normals,
+    in_voxels,
+    offsets,
+    sample_points,
+    values_of,
+)
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.formats.live import BYTES, from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.frames import rotations, transform, turn
 from vvgt_cli.gaussians.live import (
     AMOUNT,
@@ -26,8 +34,9 @@ from vvgt_cli.gaussians.live import (
     Table,
     apply_look,
     baked,
+    without_tails,
 )
-from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
+from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.fog import fog
@@ -48,10 +57,11 @@ def cloud(count: int = 40, seed: int = 1) -> Gaussians:
     rng = np.random.default_rng(seed)
     gradient = rng.normal(size=(count, 3))
     gradient *= rng.uniform(0, 1, (count, 1)) / np.linalg.norm(gradient, axis=1, keepdims=True)
+    axis = rng.uniform(-0.5, 0.5, (count, 3))
     values = [rng.uniform(LO, HI, count), rng.uniform(0, 20, count), np.exp(rng.uniform(-4, 0, count))]
     return Gaussians(
         rng.uniform(-0.6, 0.6, (count, 3)), np.log(rng.uniform(0.02, 0.2, (count, 3))), rng.normal(size=(count, 4)),
-        rng.normal(size=count), rng.uniform(0, 1, (count, 3)), live=np.column_stack([*values, gradient]),
+        rng.normal(size=count), rng.uniform(0, 1, (count, 3)), live=np.column_stack([*values, axis, gradient]),
     )  # fmt: skip
 
 
@@ -104,7 +114,7 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
 
 def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() -> None:
     """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
-    live = np.array([[10.0, 20.0, 1e-5, 1.0, 0.0, 0.0]])
+    live = np.array([[10.0, 20.0, 1e-5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
     shown = apply_look(one, Table.of_function(WINDOW, LO, HI, 0.05, GRAIN))
     np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
@@ -119,11 +129,28 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
     assert shown.live is None
 
 
+def test_what_shows_only_a_tail_of_the_values_is_not_seen() -> None:
+    """A body of values above 20 beside Gaussians of spread 1, ever farther from it: the law's tail would be a halo."""
+    nodes = PiecewiseOpacity(np.array([0.0, 20, 20, 100]), np.array([0.0, 0, 0.9, 0.9]))
+    step = TransferFunction("step", nodes, COLORS)
+    table, means = Table.of_function(step, LO, HI, 0.05, GRAIN), np.array([20.0, 19.6, 18.8, 17.5])
+    sums = table.at(means, np.ones(4))
+    z = sums[:, 4] / sums[:, 3]
+    assert 0 < z[0] < z[1] < 1.4 < z[2] < 2 < z[3]
+    found = without_tails(sums) / sums[:, 3]
+    np.testing.assert_allclose(found, [1, 1, (2 - z[2]) / 0.6, 0], atol=1e-12)
+    live = np.column_stack([means, np.ones(4), np.full(4, 0.1), np.zeros((4, 6))])
+    some = Gaussians(np.zeros((4, 3)), np.full((4, 3), -3), [[1, 0, 0, 0]] * 4, [0.0] * 4, [[1, 1, 1]] * 4, live=live)
+    for shown in (apply_look(some, table), baked(some, table)):
+        assert shown.opacity_logits[3] < -10
+        assert shown.opacity_logits[2] > -4
+
+
 def test_a_look_turns_with_its_gaussians() -> None:
     """Of maps that stretch too, where nothing is opaque: gradients are covectors."""
     some, table = cloud(), Table.of_function(WINDOW, LO, HI, 0.05, GRAIN)
     assert some.live is not None
-    fine = replace(some, live=np.where(np.arange(6) == 2, 1e-5, some.live))
+    fine = replace(some, live=np.where(np.arange(9) == 2, 1e-5, some.live))
     shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
     mirrored = -np.eye(3)
     for of, change in (
@@ -139,30 +166,34 @@ def test_a_look_turns_with_its_gaussians() -> None:
 
 
 def test_values_under_gaussians_of_a_linear_field() -> None:
-    """Mean, spread and direction of v = 3 i - k + 7 in voxels, of which the stored values are negative halves."""
+    """Mean, spread, axis and direction of v = 3 i - k + 7 in voxels, of which negative halves are stored."""
     z, _, x = np.mgrid[:20, :21, :22]
     stored = (-(3 * x - z + 7) / 2).astype(np.float32)
     stored.flags.writeable = False
     half, step = np.array([1.1, 1.05, 1.0]), np.full(3, 0.1)
     some = replace(cloud(), log_scales=np.full((40, 3), np.log(0.05)), means=cloud().means * 0.8)
-    samples = np.full((40, POINTS), np.nan, np.float32)
+    samples, sums = np.full((40, POINTS), np.nan, np.float32), np.zeros((40, NORMAL_SUMS))
     nothing = np.zeros(3, np.int64)
     where = in_voxels(some, half, step)
-    sample_points(Voxels(stored), *where, offsets(), nothing, nothing, np.array([22, 21, 20]), samples)
-    found = values_of(samples, some, -2.0, 0.0)
+    everywhere = nothing, nothing, np.array([22, 21, 20])
+    sample_points(Voxels(stored), *where, offsets(), *everywhere, samples)
+    add_normals(Voxels(stored), *where, offsets(), *everywhere, step, sums)
+    found = values_of(samples, sums, some, -2.0, 0.0)
     at = where[0]
     np.testing.assert_allclose(found[:, 0], 3 * at[:, 0] - at[:, 2] + 7, atol=1e-3)
     spread = np.sqrt(((offsets() @ np.array([[3, 0, -1]]).T * 0.5) ** 2).mean())
     np.testing.assert_allclose(found[:, 1], spread, rtol=1e-3)
-    np.testing.assert_allclose(found[:, 2:], np.tile(np.array([3, 0, -1]) / 10**0.5, (40, 1)), atol=1e-3)
+    direction = np.tile(np.array([3, 0, -1]) / 10**0.5, (40, 1))
+    np.testing.assert_allclose(found[:, 5:], direction, atol=1e-3)
+    np.testing.assert_allclose(found[:, 2:5] * np.sign(found[:, [2]]), direction, atol=1e-3)
 
 
 def test_samples_that_are_not_finite_do_not_count() -> None:
     samples = np.full((2, POINTS), 5, np.float32)
     samples[0, ::3] = np.nan
     samples[1] = np.inf
-    found = values_of(samples, cloud(2), 2.0, 1.0)
-    np.testing.assert_allclose(found[0], [11, 0, 0, 0, 0], atol=1e-6)
+    found = values_of(samples, np.zeros((2, NORMAL_SUMS)), cloud(2), 2.0, 1.0)
+    np.testing.assert_allclose(found[0], [11, *[0] * 7], atol=1e-6)
     assert np.isnan(found[1, 0])
 
 
@@ -173,9 +204,11 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     write_ply(tmp_path / "a.ply", some, options)
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == facts()
-    assert [name for name in header.dtype.names or ()][-3:] == ["value", "spread", "length"]
+    assert [name for name in header.dtype.names or ()][-6:] == list(COLUMNS)
     assert back.live is not None
     np.testing.assert_array_equal(back.live[:, :3], some.live[:, :3])  # type: ignore[index]
+    axes = [np.sort(np.abs(g.live[:, AXIS])) for g in (back, some)]  # type: ignore[index]
+    np.testing.assert_allclose(*axes, atol=1e-6)
     write_ply(tmp_path / "b.ply", replace(some, live=None), options)
     assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
     whole = (tmp_path / "a.ply").read_bytes()
@@ -232,7 +265,7 @@ def test_bytes_for_pages_lose_little() -> None:
     """About 0.1 dB at most, of a file that is 34 dB from its volume."""
     some = cloud(400, 3)
     stream, known = live_bytes(some, facts()), live_json([some], facts(), [0.05])
-    assert stream.shape == (400, 8)
+    assert stream.shape == (400, BYTES)
     assert json.loads(json.dumps(known)) == known
     back = replace(some, live=from_bytes(stream, known))
     camera = default_views("test", size=200)[0]

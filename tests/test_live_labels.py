@@ -16,8 +16,8 @@ from vvgt_cli.closed_form.labelled import assign_labels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.legend import legend_text
-from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, apply_look, baked, opacities, visible_under
-from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.gaussians.live import SHARP, Palette, apply_look, baked, opacities, visible_under
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LiveFacts
 from vvgt_cli.look.fog import label_fog
 from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.look.labels import Label, LabelTable
@@ -52,10 +52,10 @@ def halves() -> Volume:
 def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
     some = labels_cloud()
     assert some.live is not None
-    some.live[:, 3:6] = 0  # in no surface
+    some.live[:, GRADIENT] = 0  # in no surface
     shown = apply_look(some, Palette.of_labels(LABELS, 0.05))
     for row, label in enumerate(LABELS[:2]):
-        own = some.live[:, 6] == row
+        own = some.live[:, LABEL_ROW] == row
         np.testing.assert_allclose(shown.colors[own], np.tile(label.color, (own.sum(), 1)), atol=1e-6)
         tau = -np.log1p(-min(label.opacity, 1 - 1e-5)) / 0.05
         opacity = 1 / (1 + np.exp(-shown.opacity_logits[own].astype(float)))
@@ -63,9 +63,9 @@ def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
         np.testing.assert_allclose(opacity, opacities(tau * length**3, variances, 0.0), atol=2e-5)
         smaller = np.sort(shown.log_scales[own], axis=1) - np.sort(some.log_scales[own], axis=1)
         opaque = -np.expm1(-tau * length)[:, None]
-        np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, FLAT, FLAT])), atol=1e-3)
+        np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, 1, 1])), atol=1e-3)
     np.testing.assert_allclose(shown.means, some.means, atol=1e-6)
-    assert set(some.live[visible_under(some, Palette.of_labels(LABELS, 0.05)), 6]) == {0, 1}
+    assert set(some.live[visible_under(some, Palette.of_labels(LABELS, 0.05)), LABEL_ROW]) == {0, 1}
 
 
 def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) -> None:
@@ -75,13 +75,13 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     assert header.live == facts()
     assert header.dtype["label"] == np.uint8
     assert back.live is not None
-    np.testing.assert_array_equal(back.live[:, [0, 1, 2, 6]], some.live[:, [0, 1, 2, 6]])  # type: ignore[index]
+    np.testing.assert_array_equal(back.live[:, [0, 1, 2, LABEL_ROW]], some.live[:, [0, 1, 2, LABEL_ROW]])  # type: ignore[index]
     many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
     row = np.full(len(some), 299.0)
-    last = replace(some, live=np.column_stack([labels_cloud().live[:, :6], row]))  # type: ignore[index]
+    last = replace(some, live=np.column_stack([labels_cloud().live[:, :LABEL_ROW], row]))  # type: ignore[index]
     write_ply(tmp_path / "b.ply", last, PlyOptions(live=facts(many)))
     assert read_ply(tmp_path / "b.ply")[1].dtype["label"] == np.dtype("<u2")
-    assert read_ply(tmp_path / "b.ply")[0].live[0, 6] == 299  # type: ignore[index]
+    assert read_ply(tmp_path / "b.ply")[0].live[0, LABEL_ROW] == 299  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
     with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
@@ -136,10 +136,10 @@ def test_bytes_for_pages_hold_the_label() -> None:
     many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
     some = labels_cloud(many)
     live = some.live.copy()  # type: ignore[union-attr]
-    live[:, 6] = np.linspace(0, 299, len(live)).round()
+    live[:, LABEL_ROW] = np.linspace(0, 299, len(live)).round()
     some = replace(some, live=live)
     stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), [0.05])
-    np.testing.assert_array_equal(from_bytes(stream, known)[:, 6], live[:, 6])
+    np.testing.assert_array_equal(from_bytes(stream, known)[:, LABEL_ROW], live[:, LABEL_ROW])
     assert json.loads(json.dumps(known)) == known
 
 
@@ -188,8 +188,8 @@ def test_cells_do_not_straddle_labels() -> None:
     )
     live, means = result.gaussians.live, result.gaussians.means
     assert live is not None
-    assert set(live[:, 6]) == {0, 1}
-    right = (means[:, 0] > 0) == (live[:, 6] == 1)
+    assert set(live[:, LABEL_ROW]) == {0, 1}
+    right = (means[:, 0] > 0) == (live[:, LABEL_ROW] == 1)
     assert right.mean() > 0.97
 
 
@@ -211,7 +211,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     assert vvgt("recolor", label_file, "--labels", tmp_path / "t.json", "-o", tmp_path / "a.ply").code == 0
     found, header = read_ply(tmp_path / "a.ply")
     assert header.live is None
-    assert len(found) == (whole.live[:, 6] == 0).sum()  # type: ignore[index]
+    assert len(found) == (whole.live[:, LABEL_ROW] == 0).sum()  # type: ignore[index]
     np.testing.assert_allclose(found.colors, np.tile([1, 0, 0], (len(found), 1)), atol=1e-6)
     scores = []
     for file in (label_file, tmp_path / "a.ply"):
@@ -237,9 +237,9 @@ def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tm
         assert header.live is not None
         assert [label.opacity for label in header.live.labels] == [1, 0]
         assert gaussians.live is not None
-        counts = np.bincount(gaussians.live[:, 6].astype(int))
+        counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(int))
         assert 0.05 < counts[1] / counts.sum() < 0.5
-        assert gaussians.opacity_logits[gaussians.live[:, 6] == 1].max() < -10
+        assert gaussians.opacity_logits[gaussians.live[:, LABEL_ROW] == 1].max() < -10
         assert vvgt("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite").code == 0
         assert len(read_ply(tmp_path / "a.ply")[0]) == len(gaussians)
 
@@ -274,6 +274,8 @@ def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
     for file in (label_file, tmp_path / "b.ply"):
         gaussians = read_ply(file)[0]
         assert gaussians.live is not None
-        found.append((gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, 6].astype(int)) / len(gaussians)))
+        found.append(
+            (gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, LABEL_ROW].astype(int)) / len(gaussians))
+        )
     np.testing.assert_allclose(found[0][0], found[1][0], atol=0.02)
     np.testing.assert_allclose(found[0][1], found[1][1], atol=0.05)

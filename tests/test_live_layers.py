@@ -44,7 +44,7 @@ def test_each_layer_is_looked_up_in_its_own_table() -> None:
     tables = (Table.of_function(WINDOW, LO, 80, 0.05, GRAIN), Palette.of_labels(LABELS, 0.02))
     together = apply_look(some, LayerTables(tables))
     for number, table in enumerate(tables):
-        own = np.flatnonzero(some.live[:, 7] == number)  # type: ignore[index]
+        own = np.flatnonzero(some.live[:, LAYER_ID] == number)  # type: ignore[index]
         alone = apply_look(some.take(own), table)
         np.testing.assert_array_equal(alone.means, together.means[own])
         np.testing.assert_array_equal(alone.opacity_logits, together.opacity_logits[own])
@@ -76,7 +76,9 @@ def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == several()
     assert [header.dtype[name] for name in ("label", "layer")] == [np.uint8, np.uint8]
-    np.testing.assert_array_equal(back.live[:, [0, 1, 2, 6, 7]], some.live[:, [0, 1, 2, 6, 7]])  # type: ignore[index]
+    np.testing.assert_array_equal(
+        back.live[:, [0, 1, 2, LABEL_ROW, LAYER_ID]], some.live[:, [0, 1, 2, LABEL_ROW, LAYER_ID]]
+    )  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(whole[:-1] + b"\x07")
     with pytest.raises(vvgt_library.DataError, match="layer number 7"):
@@ -86,12 +88,12 @@ def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
         read_ply(tmp_path / "c.ply")
     scalars = replace(several(), others=(replace(values(RAMP), name="pet", distance=1.0),))
     live = some.live.copy()  # type: ignore[union-attr]
-    live[:, 6] = 0
+    live[:, LABEL_ROW] = 0
     write_ply(tmp_path / "d.ply", replace(some, live=live), replace(options, live=scalars))
     back, header = read_ply(tmp_path / "d.ply")
     assert header.live == scalars
     assert "label" not in (header.dtype.names or ())
-    np.testing.assert_array_equal(back.live[:, 7], live[:, 7])  # type: ignore[index]
+    np.testing.assert_array_equal(back.live[:, LAYER_ID], live[:, LAYER_ID])  # type: ignore[index]
 
 
 def test_gaussians_of_one_grid_in_the_frame_of_another() -> None:
@@ -148,7 +150,7 @@ def test_layers_lie_where_they_are_in_the_world(pair: Path) -> None:
         assert [len(layer.labels) for layer in header.live.layers] == [0, 0, 1]
         live = some.live
         assert live is not None
-        number = live[:, 7].astype(int)
+        number = live[:, LAYER_ID].astype(int)
         assert (np.bincount(number) > 40).all()
         bright = [np.flatnonzero((number == k) & (live[:, 0] > 0.6)) for k in (0, 1)]
         voxels = [some.means[own].mean(axis=0) / header.scale for own in bright]  # type: ignore[operator]
@@ -172,7 +174,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     assert vvgt("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply").code == 0
     assert vvgt("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply").code == 0
     without = [len(read_ply(tmp_path / f"{name}.ply")[0]) for name in "hd"]
-    seen = [int((read_ply(live)[0].live[:, 7] == number).sum()) for number in (2, 0)]  # type: ignore[index]
+    seen = [int((read_ply(live)[0].live[:, LAYER_ID] == number).sum()) for number in (2, 0)]  # type: ignore[index]
     for left, gone in zip(without, seen, strict=True):
         assert len(own) - gone <= left < len(own)
     every = ("--layer", hidden, "--layer", f"0,{dark}", "--layer", f"1,{dark}")
@@ -224,7 +226,7 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
         assert scores[0] == pytest.approx(scores[1], abs=0.01)
         assert scores[0] > 22
         assert vvgt("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite").code == 0
-        number = read_ply(tmp_path / "l.ply")[0].live[:, 7]  # type: ignore[index]
+        number = read_ply(tmp_path / "l.ply")[0].live[:, LAYER_ID]  # type: ignore[index]
         assert (np.bincount(number.astype(int)) > 40).all()
     every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
     done = vvgt("evaluate", pair / "live.ply", "--volume", *every)
@@ -255,7 +257,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
     assert facts.layers[2].labels[0].opacity == 0.25
     assert facts.layers[2].labels[0].name == "top"
-    number = saved.gaussians.live[:, 7]  # type: ignore[index]
+    number = saved.gaussians.live[:, LAYER_ID]  # type: ignore[index]
     assert (np.abs(saved.gaussians.colors[number == 2] - (0, 1, 1)) < 1e-3).all()
     thinner = saved.gaussians.opacity_logits[number == 0] < cloud.gaussians.opacity_logits[number == 0]
     assert thinner.mean() > 0.4  # opacity is per twice the distance

@@ -14,11 +14,15 @@ from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.relight import relight
 from vvgt_cli.dvr.light import sphere
+from vvgt_cli.field.field import Resident
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.harmonics import basis, view_colors
-from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
+from vvgt_cli.gaussians.live import MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
+from vvgt_cli.gaussians.live_facts import AXIS
 from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.volume import Volume
 
 SIDE = Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
 HEAD = Lighting(True, (), 0.1, 0.7, 0.2, 3.0)
@@ -43,14 +47,17 @@ def exact(color: np.ndarray, n: np.ndarray, d: np.ndarray, light: Lighting) -> n
 
 @pytest.mark.parametrize("light", [HEAD, SIDE, replace(HEAD, specular=0.0), replace(SIDE, specular=0.0)])
 def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lighting) -> None:
+    """Of a share of the matter that faces along the axis; the rest faces all directions."""
     rng = np.random.default_rng(2)
-    gradient = rng.normal(size=(5, 3)) * rng.uniform(0.1, 1, (5, 1))
-    shaded = relight(grey(gradient), gradient, light)
+    axis, share = rng.normal(size=(5, 3)), np.array([1.0, 0.8, 0.5, 0.2, 0.01])
+    axis *= (share / np.linalg.norm(axis, axis=1))[:, None]
+    shaded, everywhere = relight(grey(axis), axis, light), sphere(2000)
     assert shaded.degree == (2 if light.depends_on_view else 0)
-    eyes = sphere(400)
+    eyes, color = sphere(400), np.array([0.5, 0.3, 0.1])
     for k in range(5):
-        n = gradient[k] / np.linalg.norm(gradient[k])
-        wanted = np.array([exact(np.array([0.5, 0.3, 0.1]), n, d, light) for d in eyes])
+        one = np.array([exact(color, axis[k] / share[k], d, light) for d in eyes])
+        rest = np.mean([exact(color, n, eyes[0], light) for n in everywhere], axis=0)
+        wanted = share[k] * one + (1 - share[k]) * rest
         found = np.tile(shaded.colors[k].astype(float), (400, 1))
         if shaded.harmonics is not None:
             found += basis(eyes, 2) @ shaded.harmonics[k].astype(float)
@@ -71,7 +78,7 @@ def test_a_light_turns_with_its_gaussians() -> None:
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
-        return relight(apply_look(gaussians, table), gaussians.live[:, 3:], light)
+        return relight(apply_look(gaussians, table), gaussians.live[:, AXIS], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
     for light, other in ((SIDE, turned), (HEAD, HEAD)):
@@ -142,19 +149,17 @@ def test_a_page_begins_with_the_files_light() -> None:
 def test_what_is_opaque_lies_flat_in_its_surface() -> None:
     """A round one whose values rise along a direction: that becomes the shortest axis; without it one of them is."""
     rises = np.array([0.48, 0.6, 0.64])
-    live = np.array([[70.0, 1.0, 1.0, *rises], [70.0, 1.0, 1.0, 0, 0, 0]])
+    live = np.array([[70.0, 1.0, 1.0, 0, 0, 0, *rises], [70.0, 1.0, 1.0, 0, 0, 0, 0, 0, 0]])
     some = Gaussians(
         np.zeros((2, 3)), np.full((2, 3), np.log(0.1)), [[1, 0, 0, 0]] * 2, [0.0] * 2, [[1, 1, 1]] * 2, live=live
     )
     shown = apply_look(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     axes = rotations(shown.quaternions.astype(float)) * np.exp(shown.log_scales.astype(float))[:, None, :]
     variances, turned = np.linalg.eigh(axes[0] @ axes[0].T)
-    wanted = 0.01 * np.array([SHARP, FLAT, FLAT])
+    wanted = 0.01 * np.array([SHARP, 1, 1])
     np.testing.assert_allclose(variances, wanted, rtol=1e-3)
     assert abs(turned[:, 0] @ rises) == pytest.approx(1, abs=1e-5)
-    np.testing.assert_allclose(
-        np.sort(np.exp(2 * shown.log_scales[1])), 0.01 * np.array([SHARP, FLAT, FLAT]), rtol=1e-3
-    )
+    np.testing.assert_allclose(np.sort(np.exp(2 * shown.log_scales[1])), 0.01 * np.array([SHARP, 1, 1]), rtol=1e-3)
 
 
 def test_directions_are_unit_vectors_of_own_axes() -> None:
@@ -163,3 +168,24 @@ def test_directions_are_unit_vectors_of_own_axes() -> None:
     assert (share <= 1).all()
     assert spreads()[-1] == WIDEST
     assert Table.of_function(RAMP, LO, HI, 1, GRAIN).sums.shape == (MEANS, SPREADS, 6)
+
+
+def test_the_axis_of_normals_is_that_of_a_surface_and_shorter_the_noisier_it_is() -> None:
+    """Of a plate that both sides of lie under one Gaussian, where the mean gradient is zero; in a ramp; in noise."""
+    rng, (z, _, _) = np.random.default_rng(4), np.mgrid[:24, :24, :24]
+    noise, plate = rng.normal(size=z.shape), np.exp(-(((z - 11.5) / 3) ** 2))
+    some = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.2)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]])
+    found = {}
+    for name, values in {"plate": plate, "ramp": z, "rough": z + 2 * noise, "noise": noise, "flat": 0 * noise}.items():
+        volume = Volume(values.astype(np.float32), (1, 1, 1), name=name)
+        live = Resident.of(load(SourceRequest(volume, tf="viridis"))).sample(some)[0]
+        found[name] = live[2:5], live[5:8]
+    share = {name: float(np.linalg.norm(axis)) for name, (axis, _) in found.items()}
+    assert share["ramp"] == pytest.approx(1, abs=1e-6)
+    assert share["plate"] > 0.9
+    assert 0.9 > share["rough"] > share["noise"]
+    assert share["noise"] < 0.5
+    assert share["flat"] == 0
+    for name in ("plate", "ramp"):
+        assert abs(found[name][0][2]) == pytest.approx(share[name], abs=1e-3)
+    assert np.linalg.norm(found["plate"][1]) < 0.1

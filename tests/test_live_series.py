@@ -15,11 +15,11 @@ import pytest
 import vvgt_cli as vvgt_library
 from tests.test_live_labels import LABELS
 from tests.test_live_layers import TF, layered, several
-from tests.test_page_live import PLANES
 from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.formats.live import from_bytes
+from vvgt_cli.gaussians.formats.live import BYTES, ROW, from_bytes
 from vvgt_cli.gaussians.formats.page_live import shared_facts, with_shared_labels
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID
 
 SMALL = ("--max-gaussians", 90, "--size", 48)
 
@@ -57,9 +57,9 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
         assert list(header.live.histogram) == live["layers"][0]["histogram"]
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
         assert held is not None
-        planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(len(PLANES), -1)
-        stream = np.zeros((len(some), 8), np.uint8)
-        stream[:, PLANES] = planes.T
+        planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
+        stream = np.zeros((len(some), BYTES), np.uint8)
+        stream[:, :ROW] = planes.T
         back = from_bytes(stream, live)
         assert some.live is not None
         span = live["layers"][0]["values"][1] - live["layers"][0]["values"][0]
@@ -106,8 +106,8 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
     for k, rows in enumerate(({0, 1}, {0, 2})):
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
         assert held is not None
-        planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(8, -1)
-        assert set(planes[6].tolist()) == rows
+        planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(BYTES, -1)
+        assert set(planes[ROW].tolist()) == rows
 
 
 def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> None:
@@ -129,11 +129,10 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
     for k, held in enumerate(re.findall(rb'id="values-\d">([^<]+)<', content)):
         some, header = read_ply(tmp_path / f"f_{k}.ply")
         assert (some.live is not None, header.live is not None) == (True, True)
-        planes = np.frombuffer(gzip.decompress(base64.b64decode(held)), np.uint8).reshape(8, -1)
-        stream = np.zeros((len(some), 8), np.uint8)
-        stream[:, (0, 1, 2, 4, 5, 6, 3, 7)] = planes.T
+        planes = np.frombuffer(gzip.decompress(base64.b64decode(held)), np.uint8).reshape(BYTES, -1)
+        stream = planes.T
         back = from_bytes(stream, live)
-        for column in (6, 7):
+        for column in (LABEL_ROW, LAYER_ID):
             counted = np.unique(some.live[:, column], return_counts=True)  # type: ignore[index]
             np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
 
@@ -157,7 +156,7 @@ def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path) -> None:
     assert (done.code, "skipped: f1 (only background)" in done.err) == (0, True), done.err
     for k, numbers in enumerate(([0, 1], [1], [0, 1])):
         live = read_ply(tmp_path / f"f_{k}.ply")[0].live
-        assert np.unique(live[:, 7]).tolist() == numbers  # type: ignore[index]
+        assert np.unique(live[:, LAYER_ID]).tolist() == numbers  # type: ignore[index]
 
 
 def test_layers_have_in_common_what_each_has_of_all() -> None:
@@ -169,12 +168,12 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     assert both.layers == (value, replace(named, labels=LABELS))
     for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
         assert shared_facts([first, other]) is None
-    assert with_shared_labels(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
-    assert with_shared_labels(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    assert with_shared_labels(layered(4), first, both).live[:, LABEL_ROW].tolist() == [0, 0, 0, 1]  # type: ignore[index]
+    assert with_shared_labels(layered(4), second, both).live[:, LABEL_ROW].tolist() == [0, 1, 0, 2]  # type: ignore[index]
     other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
     both = shared_facts([first, replace(value, others=(other,))])
     assert both is not None
     assert [(label.number, label.name) for label in both.others[0].labels] == [
         (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
     ]  # fmt: skip
-    assert with_shared_labels(layered(4), first, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    assert with_shared_labels(layered(4), first, both).live[:, LABEL_ROW].tolist() == [0, 1, 0, 2]  # type: ignore[index]

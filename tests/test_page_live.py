@@ -19,9 +19,9 @@ from tests.test_live import COLORS, GRAIN, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
-from vvgt_cli.gaussians.formats.live import from_bytes
+from vvgt_cli.gaussians.formats.live import BYTES, ROW, from_bytes
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.gaussians.formats.page_live import PLANES, nodes_of, planes_of
+from vvgt_cli.gaussians.formats.page_live import nodes_of, planes_of
 from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.live import Looks, Table, apply_look, baked
@@ -54,9 +54,9 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     [layer] = live["layers"]
     held = re.search(rb'id="values-0">([^<]+)<', content)
     assert held is not None
-    planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(len(PLANES), -1)
-    stream = np.zeros((600, 8), np.uint8)
-    stream[:, PLANES] = planes.T
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
+    stream = np.zeros((600, BYTES), np.uint8)
+    stream[:, :ROW] = planes.T
     wanted, splats = turn(some, "y"), read_html(content, "a.html")
     away = np.linalg.norm(wanted.means[:, None] - splats.means, axis=2)
     order = away.argmin(axis=0)
@@ -148,8 +148,8 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
     assert laid.live is not None
     planes, own = gzip.decompress(base64.b64decode(held[1])), planes_of(laid.live)
     wanted = turn(some, "z").take(morton_order(turn(some, "z").means))
-    stream = np.zeros((len(some), 8), np.uint8)
-    stream[:, own] = np.frombuffer(planes, np.uint8).reshape(len(own), -1).T
+    stream = np.zeros((len(some), BYTES), np.uint8)
+    stream[:, :own] = np.frombuffer(planes, np.uint8).reshape(own, -1).T
     carried = wanted.live
     wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
     assert carried is not None

@@ -16,6 +16,7 @@ from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
 from vvgt_cli.commands.live_site import Cloud, PageController, parse_labels
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
+from vvgt_cli.gaussians.live_facts import LABEL_ROW
 
 Z, Y, X = np.mgrid[:12, :12, :12] // 6
 CUBES = (1 + X + 2 * Y + 4 * Z).astype(np.uint8)
@@ -46,7 +47,7 @@ def test_saved_labels_have_the_colours_of_the_page(controller: tuple[str, PageCo
     assert [label.name for label in labels] == [label.name for label in eight.options.live.labels]
     live = saved.gaussians.live
     assert live is not None
-    row = live[:, 6].astype(int)
+    row = live[:, LABEL_ROW].astype(int)
     assert set(row) == set(range(8))  # hidden ones can be shown again
     assert saved.gaussians.opacity_logits[row == 0].max() < -5
     assert saved.gaussians.opacity_logits[row == 1].max() > -3

@@ -8,6 +8,7 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, sample
 from vvgt_cli.dvr.layout import TUPLES, Voxels
+from vvgt_cli.dvr.shading import normal
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.jit.decorators import parallel_kernel
@@ -16,6 +17,7 @@ from vvgt_cli.jit.threads import ThreadSlice, iterations
 POINTS = 48  # a Gaussian
 NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
 PRIMES = 2, 3, 5
+NORMAL_SUMS = 7  # of a Gaussian's normals n: n n^T (xx, xy, xz, yy, yz, zz), and how many points there are
 
 
 def offsets() -> np.ndarray:
@@ -65,6 +67,35 @@ def sample_points(
                 out[k, m] = sample(voxels.values, x - begin[0], y - begin[1], z - begin[2])
 
 
+@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f8:1 f8:2", TUPLES, fastmath=FLAGS, error_model="numpy")
+def add_normals(
+    thread: ThreadSlice,
+    voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
+    hi: np.ndarray, step: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Add to ``out`` (n, NORMAL_SUMS) the normals at the points that `sample_points` reads, zero without a gradient.
+
+    ``step`` (3,) edges of a voxel, box frame; other arguments as of `sample_points`.
+    """
+    for k in iterations(thread, len(centres)):
+        row = out[k]
+        for m in range(len(points)):
+            p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
+            x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)
+            y = centres[k, 1] + (arms[k, 1, 0] * p0 + arms[k, 1, 1] * p1 + arms[k, 1, 2] * p2)
+            z = centres[k, 2] + (arms[k, 2, 0] * p0 + arms[k, 2, 1] * p1 + arms[k, 2, 2] * p2)
+            inside = x >= lo[0] - 0.5 and y >= lo[1] - 0.5 and z >= lo[2] - 0.5
+            if inside and x < hi[0] - 0.5 and y < hi[1] - 0.5 and z < hi[2] - 0.5:
+                n0, n1, n2 = normal(voxels.values, step, x - begin[0], y - begin[1], z - begin[2])
+                row[0] += n0 * n0
+                row[1] += n0 * n1
+                row[2] += n0 * n2
+                row[3] += n1 * n1
+                row[4] += n1 * n2
+                row[5] += n2 * n2
+                row[6] += 1.0
+
+
 def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (K, 3) and axes of a standard deviation (K, 3, 3), columns, of box-frame Gaussians, in voxels."""
     axes = rotations(gaussians.quaternions.astype(np.float64))
@@ -72,15 +103,18 @@ def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple
     return (gaussians.means.astype(np.float64) + half) / step - 0.5, np.ascontiguousarray(arms)
 
 
-def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept: float) -> np.ndarray:
-    """Return (K, 5) float32 of ``samples`` (K, POINTS) at points of Gaussians: mean, spread and direction of values.
+def values_of(
+    samples: np.ndarray, sums: np.ndarray, gaussians: Gaussians, slope: float, intercept: float
+) -> np.ndarray:
+    """Return (K, 8) float32 of points of Gaussians: mean and spread of the values, `normal_axis`, gradient.
 
-    The direction is that of the gradient, fitted by least squares, as long as the share of the spread that it explains.
-    Samples that are not finite do not count; a row without any has NaN.
+    The gradient is fitted by least squares; it is as long as the share of the spread that it explains. Samples that are
+    not finite do not count; a row without any has NaN.
 
     Args:
         samples: (K, POINTS) as kernels read them.
-        gaussians: in the box frame, as is the direction.
+        sums: (K, NORMAL_SUMS) of `add_normals`.
+        gaussians: in the box frame, as are the axis and the gradient.
         slope: of the data value ``slope * sample + intercept``.
         intercept: of the data value.
     """
@@ -100,4 +134,19 @@ def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept
     gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
     gradient *= (explained.clip(0, 1) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30))[:, None]
     found = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
-    return np.concatenate([found, gradient], axis=1).astype(np.float32)
+    return np.concatenate([found, normal_axis(sums), gradient], axis=1).astype(np.float32)
+
+
+def normal_axis(sums: np.ndarray) -> np.ndarray:
+    """Return the main axes (K, 3) of normals from their ``sums`` (K, NORMAL_SUMS), as long as they agree.
+
+    The length is the largest eigenvalue of the mean n n^T minus the mean of the others: 1 where all normals are
+    parallel, 0 where they point everywhere, or there are none. What a light adds is then close to the length times
+    that of one normal along the axis, and the rest times the mean over all directions. Unlike that of a mean gradient,
+    the direction is the same on both sides of a thin plate, and every voxel's noise counts as it does on a ray.
+    """
+    mean = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / np.maximum(sums[:, 6], 1)[:, None, None]
+    along, axes = np.linalg.eigh(mean)
+    length = along[:, 2] - along[:, :2].mean(axis=1)
+    result: np.ndarray = axes[:, :, 2] * length.clip(0, 1)[:, None]
+    return result

@@ -1,4 +1,4 @@
-"""Light on Gaussians that carry the direction of the gradient under them (docs/live.md)."""
+"""Light on Gaussians that carry the axis of the normals under them (docs/live.md)."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from vvgt_cli.look.lighting import Lighting
 DEGREE = 2  # of harmonics under a light that depends on the view
 
 
-def relight(gaussians: Gaussians, gradient: np.ndarray, lighting: Lighting) -> Gaussians:
+def relight(gaussians: Gaussians, axis: np.ndarray, lighting: Lighting) -> Gaussians:
     """Colour Gaussians under a light, without shadows or occlusion.
 
     Args:
         gaussians: of one colour each.
-        gradient: (K, 3) in their frame, of any length; zeros where there is none: ambient light only.
+        axis: (K, 3) in their frame, as long as the normals agree (`normal_axis` of `gaussian_samples`): that share has
+            a normal along it, the rest normals in all directions; zeros where there are none: ambient light only.
         lighting: directions in the same frame.
     """
     light = scene_light(lighting, np.eye(3), np.ones(3), (1, 1, 1), _unattenuated)
-    length = np.linalg.norm(gradient.astype(np.float64), axis=1)
-    normals = gradient / np.maximum(length, 1e-30)[:, None]
+    share = np.linalg.norm(axis.astype(np.float64), axis=1)
+    normals, rest = axis / np.maximum(share, 1e-30)[:, None], np.where(share > 0, 1 - share, 0)
     sums = np.zeros((len(gaussians), ARRIVING + len(light.directions)))
     sums[:, 0] = 1
-    sums[:, NORMALS] = normals[:, [0, 0, 0, 1, 1, 2]] * normals[:, [0, 1, 2, 1, 2, 2]]
+    sums[:, NORMALS] = share[:, None] * normals[:, [0, 0, 0, 1, 1, 2]] * normals[:, [0, 1, 2, 1, 2, 2]]
     sums[:, TINT] = gaussians.colors
-    diffuse = np.abs(normals @ light.directions.T).sum(axis=1)
+    lights, mean = len(light.directions) + int(light.head), 1 / (light.power + 1)  # mean of abs(n . h)^power
+    diffuse = share * np.abs(normals @ light.directions.T).sum(axis=1) + rest * lights / 2
     sums[:, FIXED] = gaussians.colors * (light.ambient + light.diffuse * diffuse)[:, None]
+    sums[:, FIXED] += (light.specular * lights * mean * rest)[:, None]
     sums[:, ARRIVING:] = 1
     return colored(gaussians, light, sums, DEGREE if lighting.depends_on_view else 0)
 

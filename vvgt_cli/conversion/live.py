@@ -27,7 +27,7 @@ from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import GRADIENT, LAYER_ID, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
@@ -205,7 +205,7 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     from vvgt_cli.closed_form.relight import relight
 
     assert gaussians.live is not None
-    return gaussians if lighting is None else relight(gaussians, gaussians.live[:, GRADIENT], lighting)
+    return gaussians if lighting is None else relight(gaussians, gaussians.live[:, AXIS], lighting)
 
 
 def function_table(source: Source) -> Table:

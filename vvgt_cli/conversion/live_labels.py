@@ -65,6 +65,6 @@ def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...])
         owner, gradient = owner[known], gradient[known]
         tau = extinction(np.full(len(known), THIN), 2 * UNIT_SHARE)
         length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
-        live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, owner])
+        live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, gradient, owner])
         stage.note = f"{len(np.unique(owner))} of {len(labels)} labels have Gaussians"
     return replace(gaussians, live=live, harmonics=None)

@@ -34,7 +34,7 @@ MOST = 50.0  # greatest ratio of extinctions
 OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
 WARM_START = "starting from the earlier conversion"
-GRADIENT = slice(2, 5)  # columns of samples
+GRADIENT = slice(5, 8)  # columns of samples
 
 
 class PreviousLook(WarmStart):
@@ -142,7 +142,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
 def _look_alone(
     look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
 ) -> tuple[Gaussians, np.ndarray]:
-    """Return Gaussians with the colours of a look at ``samples`` (K, 5), and (K,) extinctions."""
+    """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
@@ -151,8 +151,9 @@ def _look_alone(
     sums = table.of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
-    lighting = box_lighting(look)
-    return (plain if lighting is None else relight(plain, samples[:, GRADIENT], lighting)), tau
+    lighting, gradient = box_lighting(look), samples[:, GRADIENT].astype(np.float64)
+    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30)[:, None]
+    return (plain if lighting is None else relight(plain, normals, lighting)), tau
 
 
 def _same_volume(field: Field, other: Field) -> bool:

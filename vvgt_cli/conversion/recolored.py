@@ -15,7 +15,7 @@ from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts
 from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
-from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable, check_labels, distinct
@@ -143,12 +143,12 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
     assert seen.live is not None
     found = apply_look(seen, table, pixel)
     there = np.flatnonzero(opacity(found) >= MIN_ALPHA)
-    found, gradient = found.take(there), seen.live[there, GRADIENT]
+    found, axis = found.take(there), seen.live[there, AXIS]
     if lighting is None:
         return found
     from vvgt_cli.closed_form.relight import relight
 
-    return relight(found, gradient, lighting)
+    return relight(found, axis, lighting)
 
 
 def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:

@@ -288,7 +288,7 @@ class Blocked:
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Implement `Field.sample`."""
-        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, values_of
+        from vvgt_cli.closed_form.gaussian_samples import NORMAL_SUMS, POINTS, in_voxels, values_of
 
         self.source.require_scalar_field()
         assert isinstance(self.reader, Scalars)
@@ -302,11 +302,13 @@ class Blocked:
         task = ValueBlocks(self.reader, grid, store, str(path), kind)
         self.run_pass(task, "values")
         samples = np.full(len(gaussians) * POINTS, np.nan, np.float32)
+        sums = np.zeros((len(gaussians), NORMAL_SUMS))
         for number in range(len(task)):
             part = store.load(kind, number)
             samples[part["numbers"]] = part["found"]
+            sums[part["which"]] += part["sums"]
         rule = self.reader.rule
-        return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
+        return values_of(samples.reshape(-1, POINTS), sums, gaussians, rule.slope, rule.intercept)
 
     def with_look(self, source: Source) -> Blocked:
         """Implement `Field.with_look`; the new field's blocks go to a subfolder of this field's store."""

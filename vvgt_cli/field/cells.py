@@ -180,7 +180,7 @@ class PointBlocks(Blockwise):
 
 @dataclass(frozen=True)
 class ValueBlocks(Blockwise):
-    """Values at the sample points of Gaussians.
+    """Values and normals at the sample points of Gaussians.
 
     Attributes:
         gaussians: file of centres and axes (n, 12) in voxels.
@@ -191,8 +191,18 @@ class ValueBlocks(Blockwise):
     kind: str
 
     def __call__(self, number: int) -> None:
-        """Save the values at points in block ``number``, with the points' numbers over all Gaussians."""
-        from vvgt_cli.closed_form.gaussian_samples import POINTS, offsets, reach, sample_points
+        """Save what the Gaussians with points in block ``number`` have there.
+
+        Saved are the values, with the points' numbers over all Gaussians, and the sums of each Gaussian's normals.
+        """
+        from vvgt_cli.closed_form.gaussian_samples import (
+            NORMAL_SUMS,
+            POINTS,
+            add_normals,
+            offsets,
+            reach,
+            sample_points,
+        )
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")
@@ -200,17 +210,18 @@ class ValueBlocks(Blockwise):
         near = (rows[:, :3] + far >= lo - 0.5) & (rows[:, :3] - far < hi - 0.5)
         which = np.flatnonzero(near.all(axis=1))
         found, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
+        sums = np.zeros((len(which), NORMAL_SUMS))
         if len(which):
-            box = self.box(number, HALO)
+            box = self.box(number, LIT_HALO)
             samples = np.full((len(which), POINTS), np.nan, np.float32)
             some, begin = np.array(rows[which]), box.begin.astype(np.int64)
-            sample_points(
-                box.voxels, some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy(), offsets(), begin,
-                lo.astype(np.int64), hi.astype(np.int64), samples,
-            )  # fmt: skip
+            where = some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy(), offsets()
+            part = begin, lo.astype(np.int64), hi.astype(np.int64)
+            sample_points(box.voxels, *where, *part, samples)
+            add_normals(box.voxels, *where, *part, np.array(self.grid.step), sums)
             row, column = np.nonzero(np.isfinite(samples))
             found, numbers = samples[row, column], which[row] * POINTS + column
-        self.store.save(self.kind, number, numbers=numbers, found=found)
+        self.store.save(self.kind, number, numbers=numbers, found=found, which=which, sums=sums)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Field(Protocol):
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """Return the mean value, spread and gradient under Gaussians of the box frame, (K, 5) float32.
+        """Return mean value, spread, axis of the normals and gradient under Gaussians of the box frame, (K, 8) float32.
 
         Raises:
             UsageError: the source is an optics grid, which has no scalar values.
@@ -154,17 +154,26 @@ class Resident:
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Implement `Field.sample`."""
-        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
+        from vvgt_cli.closed_form.gaussian_samples import (
+            NORMAL_SUMS,
+            POINTS,
+            add_normals,
+            in_voxels,
+            offsets,
+            sample_points,
+            values_of,
+        )
 
         self.source.require_scalar_field()
-        scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)
+        scene, values = self.scene, np.empty((len(gaussians), 8), np.float32)
         nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
         for k in range(0, len(gaussians), AT_ONCE):
             part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
             samples = np.full((len(part), POINTS), np.nan, np.float32)
-            where = in_voxels(part, scene.half, scene.step)
+            where, sums = in_voxels(part, scene.half, scene.step), np.zeros((len(part), NORMAL_SUMS))
             sample_points(scene.voxels, *where, offsets(), nothing, nothing, dims, samples)
-            values[k : k + len(part)] = values_of(samples, part, self.layout.slope, self.layout.intercept)
+            add_normals(scene.voxels, *where, offsets(), nothing, nothing, dims, scene.step, sums)
+            values[k : k + len(part)] = values_of(samples, sums, part, self.layout.slope, self.layout.intercept)
         return values
 
     def with_look(self, source: Source) -> Resident:

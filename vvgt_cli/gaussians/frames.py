@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.harmonics import turned
-from vvgt_cli.gaussians.live_facts import GRADIENT
+from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT
 from vvgt_cli.gaussians.types import Gaussians
 
 _HALF = math.sqrt(0.5)
@@ -69,7 +69,7 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
         means=means.astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         harmonics=turned(gaussians, matrix),
-        live=_gradients_turned(gaussians, matrix),
+        live=_normals_turned(gaussians, matrix),
     )
 
 
@@ -111,18 +111,19 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
         log_scales=log_scales.astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         harmonics=turned(gaussians, matrix),
-        live=_gradients_turned(gaussians, matrix),
+        live=_normals_turned(gaussians, matrix),
     )
 
 
-def _gradients_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
-    """Return `Gaussians.live` after a linear map: gradients transform by its inverse transpose, lengths stay."""
+def _normals_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
+    """Return `Gaussians.live` after a linear map: normals are mapped by its inverse transpose, their lengths stay."""
     if gaussians.live is None:
         return None
     live = gaussians.live.astype(np.float64)
-    before = np.linalg.norm(live[:, GRADIENT], axis=1, keepdims=True)
-    after = live[:, GRADIENT] @ np.linalg.inv(matrix)
-    live[:, GRADIENT] = after * before / np.maximum(np.linalg.norm(after, axis=1, keepdims=True), 1e-30)
+    for columns in (AXIS, GRADIENT):
+        before = np.linalg.norm(live[:, columns], axis=1, keepdims=True)
+        after = live[:, columns] @ np.linalg.inv(matrix)
+        live[:, columns] = after * before / np.maximum(np.linalg.norm(after, axis=1, keepdims=True), 1e-30)
     return live.astype(np.float32)
 
 

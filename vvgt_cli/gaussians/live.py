@@ -1,13 +1,14 @@
 """Gaussians that carry the volume's values, and their look under any function (docs/live.md).
 
 Each Gaussian stores the mean value m and standard deviation s of the field under it, the edge L of a cube of the volume
-that it represents, and the direction of the mean gradient, with the share r of s that the gradient explains as its
-length. For a function with extinction e and colour c, the values are modelled as a normal distribution N(m, s). Each
-value covers w = 1 - exp(-e g) of the background over a voxel's edge g. The Gaussian's extinction E covers as much as
-the values do on average; its colour is the mean of c weighted by w, minus what neighbours, whose values have a wider
-spread, will mix in. Weighted by w, z = (v - m) / s has a mean and a variance, by which the Gaussian moves along the
-gradient and becomes thinner in that direction. Opaque Gaussians, with a large 1 - exp(-E L), become smaller than fog,
-which overlaps, and flat in the surface whose normal is the gradient. The opacity is that of the optical mass E L^3
+that it represents, the direction of the mean gradient, with the share r of s that the gradient explains as its length,
+and the axis of the normals, for light (`vvgt_cli.closed_form.relight`). For a function with extinction e and colour c,
+the values are modelled as a normal distribution N(m, s). Each value covers w = 1 - exp(-e g) of the background over a
+voxel's edge g. The Gaussian's extinction E covers as much as the values do on average; its colour is the mean of c
+weighted by w, minus what neighbours, whose values have a wider spread, will mix in. Weighted by w, z = (v - m) / s has
+a mean and a variance, by which the Gaussian moves along the gradient and becomes thinner in that direction. Where only
+a tail of the distribution is seen, the extinction is lowered. Opaque Gaussians, with a large 1 - exp(-E L), become flat
+in the surface whose normal is the gradient. The opacity is that of the optical mass E L^3
 (`vvgt_cli.gaussians.opacity`). The means are tabulated over m and s.
 """
 
@@ -35,7 +36,8 @@ NODES = 33  # samples of the normal distribution, of equal weight
 FINE = 1 << 14  # values over the range at which a function is tabulated
 SHORTEST, LONGEST = 1e-5, 2.0  # bounds of L, unit-frame lengths
 CLEAR = MIN_ALPHA / 8  # optical depth below which nothing is visible, however thin
-SHARP, FLAT = 0.3, 0.8  # factors of an opaque Gaussian's variance, across the surface and along the other axes
+SHARP = 0.3  # factor of an opaque Gaussian's variance across its surface
+TAIL = 1.4, 2.0  # mean abs(z) of what is seen, from which on it counts less, and from which on not at all
 AROUND = 1.6  # spread of the values of a Gaussian and its neighbours, which overlap it, per its own spread
 AMOUNT = 0.45  # share of the neighbours' effect on its colour to compensate (as in `closed_form.sharpen`)
 OPAQUE = 1 - 1e-6  # largest opacity of a look; the smallest is 1 minus this, so that logits are finite
@@ -174,7 +176,7 @@ def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     sums = table.of(gaussians.live)
     colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
     variances = np.exp(2 * gaussians.log_scales.astype(np.float64))
-    logits = _logits(opacities(sums[:, TAU] * _volumes(gaussians), variances, pixel))
+    logits = _logits(opacities(without_tails(sums) * _volumes(gaussians), variances, pixel))
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
@@ -195,27 +197,37 @@ def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussi
     if not len(gaussians):
         return replace(gaussians, live=None, harmonics=None)
     sums = table.of(gaussians.live)
-    tau = np.maximum(sums[:, TAU], 1e-30)
-    first = sums[:, FIRST] / tau
-    variance = np.maximum(sums[:, SECOND] / tau - first**2, 0)
+    whole, tau = np.maximum(sums[:, TAU], 1e-30), without_tails(sums)
+    first = sums[:, FIRST] / whole
+    variance = np.maximum(sums[:, SECOND] / whole - first**2, 0)
     along, explained = directions(gaussians)
     opaque, facing = -np.expm1(-tau * gaussians.live[:, LENGTH]), explained**2
-    thin = np.sqrt(np.maximum(1 - facing * (1 - variance), THINNEST**2) * (1 - opaque * facing * (1 - SHARP / FLAT)))
+    thin = np.sqrt(np.maximum(1 - facing * (1 - variance), THINNEST**2) * (1 - opaque * facing * (1 - SHARP)))
     axes = rotations(gaussians.quaternions.astype(np.float64))
     axes *= np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     arm = np.einsum("kij,kj->ki", axes, along)
     quaternions, log_scales = factored(axes + (arm * (thin - 1)[:, None])[:, :, None] * along[:, None, :])
     variances = np.exp(2 * log_scales)
     shortest = np.arange(3) == variances.argmin(axis=1)[:, None]
-    kept = np.where(shortest, (SHARP + (FLAT - SHARP) * facing)[:, None], FLAT)
-    variances *= 1 - opaque[:, None] * (1 - kept)
+    variances *= 1 - shortest * (opaque * (1 - SHARP) * (1 - facing))[:, None]
     return Gaussians(
         gaussians.means + arm * (explained * first)[:, None],
         0.5 * np.log(variances),
         quaternions,
         _logits(opacities(tau * _volumes(gaussians), variances, pixel)),
-        sums[:, :TAU] / tau[:, None],
+        sums[:, :TAU] / whole[:, None],
     )
+
+
+def without_tails(sums: np.ndarray) -> np.ndarray:
+    """Return the extinctions (K,) of ``sums`` (K, 6), less where only a tail of the normal distribution is seen.
+
+    No value of a linear field under a Gaussian is as far from its mean as those: what shows only them is beside a body.
+    """
+    tau = sums[:, TAU]
+    first, last = TAIL
+    found: np.ndarray = tau * ((last - np.abs(sums[:, FIRST]) / np.maximum(tau, 1e-30)) / (last - first)).clip(0, 1)
+    return found
 
 
 def opacities(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:

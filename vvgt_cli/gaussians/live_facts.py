@@ -18,9 +18,10 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
-COLUMNS, NXYZ, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
-VALUES, LABEL_ROW, LAYER_ID = slice(0, 3), 6, 7  # columns of `Gaussians.live`
-GRADIENT = slice(3, 6)  # columns of `Gaussians.live`, stored as normals in a file
+COLUMNS = ("value", "spread", "length", "axis_x", "axis_y", "axis_z")
+NXYZ, LABEL, LAYER = ("nx", "ny", "nz"), "label", "layer"
+VALUES, LABEL_ROW, LAYER_ID = slice(0, 6), 9, 10  # columns of `Gaussians.live`
+AXIS, GRADIENT = slice(3, 6), slice(6, 9)  # the same; the gradient is stored as the normal in a file
 SAMPLED = 64  # nodes of a function that cannot be stored exactly
 MOST_LABELS = 500  # labels that fit in a header
 LONGEST = 12_000  # characters of a function: some loaders read only the first 10 KB of a header, ours 64

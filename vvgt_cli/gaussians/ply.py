@@ -328,7 +328,7 @@ def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
         rows = zip(facts.labels, counts, strict=True)
         return {"live_labels": [{"label": e.number, "name": e.name, "gaussians": n} for e, n in rows]}
     found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
-    for column, name in enumerate(COLUMNS):
+    for column, name in enumerate(COLUMNS[:3]):
         found[f"live_{name}"] = [float(f"{q:.6g}") for q in np.percentile(gaussians.live[:, column], (0, 50, 100))]
     return found | {"live_function": facts.baked().get("name", "")}
 

@@ -25,10 +25,11 @@ class Gaussians:
         colors: (K, 3) RGB in display space, 0.5 + SH_C0 * f_dc; may lie outside [0, 1].
         harmonics: (K, M, 3) view-dependent RGB, added to the colour by direction from the eye to the centre, as M = 3,
             8 or 15 coefficients in the order of `vvgt_cli.gaussians.harmonics.basis`; None for none.
-        live: (K, 6) carried values, for a look under any function (`vvgt_cli.gaussians.live`): mean and spread of the
-            data value, length in the unit frame, and gradient direction with the share of the spread that it explains
-            as its length; (K, 7) for a label map, with the row of the label; (K, 8) for several layers, with the number
-            of the layer last; None for a fixed look.
+        live: (K, 9) carried values, for a look under any function (`vvgt_cli.gaussians.live`): mean and spread of the
+            data value, length in the unit frame, axis of the normals with their concentration as its length, and
+            gradient direction with the share of the spread that it explains as its length; (K, 10) for a label map,
+            with the row of the label; (K, 11) for several layers, with the number of the layer last; None for a fixed
+            look.
 
     Raises:
         DataError: an array has the wrong shape, or a value is not finite.
@@ -49,7 +50,7 @@ class Gaussians:
         if self.harmonics is not None:
             shapes["harmonics"] = [(count, terms, 3) for terms in HARMONICS.values() if terms]
         if self.live is not None:
-            shapes["live"] = [(count, n) for n in (6, 7, 8)]
+            shapes["live"] = [(count, n) for n in (9, 10, 11)]
         for field, expected in shapes.items():
             array = np.ascontiguousarray(getattr(self, field), dtype=np.float32)
             if array.shape not in expected:

@@ -70,7 +70,7 @@ SEGMENTS = {
     GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
 }
 CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
+LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points", "vvgt_cli.closed_form.gaussian_samples:add_normals")
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)

@@ -1,14 +1,15 @@
 """The data with which a page shows Gaussians that carry values under any function: bytes of each, and JSON facts.
 
-There are eight bytes per Gaussian, two RGBA8U textures, in the order of the file:
+There are eleven bytes per Gaussian, three RGBA8U textures, in the order of the file:
 
 | byte | holds |
 | --- | --- |
 | 0 | value m: (m - lo) / (hi - lo) * 255 |
 | 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table scaled to 0 to 255 |
 | 2 | log L: (log L - l0) / (l1 - l0) * 255 |
-| 4, 5, 6 | gradient direction, with the share r that it explains as its length: 128 + 127 times x, y, z |
-| 3, 7 | row of its look, low and high byte |
+| 3, 4, 5 | gradient direction, with the share r that it explains as its length: 128 + 127 times x, y, z |
+| 6, 7, 8 | axis of the normals, with their concentration as its length: the same |
+| 9, 10 | row of its look, low and high byte |
 
 Each layer of values has one row, each layer of labels one per label; the rows of a layer follow those of the previous
 one.
@@ -26,24 +27,24 @@ from vvgt_cli.gaussians.live import (
     AMOUNT,
     AROUND,
     BEND,
-    FLAT,
     LENGTH,
     MEANS,
     SHARP,
     SPREAD,
     SPREADS,
+    TAIL,
     THINNEST,
     VALUE,
     WIDEST,
 )
-from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_ID, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT, LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
-BYTES = 8
+BYTES, ROW = 11, 9  # in all, and the first of the two of the row
 
 
 def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float] | None = None) -> np.ndarray:
-    """Return the bytes (K, 8) uint8 of Gaussians that carry values, with directions in the Gaussians' frame.
+    """Return the bytes (K, 11) uint8 of Gaussians that carry values, with directions in the Gaussians' frame.
 
     ``logs`` are the `log_lengths` of all Gaussians in the page, by default of these.
     """
@@ -56,10 +57,11 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float]
     out[:, 0] = _byte((live[:, VALUE] - lo) / width)
     out[:, 1] = _byte((live[:, SPREAD] / width / WIDEST).clip(0, 1) ** (1 / BEND))
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
-    out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
+    out[:, 3:6] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
+    out[:, 6:9] = np.rint(128 + 127 * live[:, AXIS].clip(-1, 1))
     row = np.array(_first_rows(facts.layers))[number.astype(np.int64)]
     row += live[:, LABEL_ROW].astype(np.int64) if facts.most_labels else 0
-    out[:, 3], out[:, 7] = row & 255, row >> 8
+    out[:, ROW], out[:, ROW + 1] = row & 255, row >> 8
     return out
 
 
@@ -89,7 +91,8 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Seq
         "bend": BEND,
         "table": [MEANS, SPREADS],
         "thinnest": THINNEST,
-        "opaque": [SHARP, FLAT],
+        "sharp": SHARP,
+        "tail": list(TAIL),
         "around": [AROUND, AMOUNT],
     }
 
@@ -110,9 +113,9 @@ def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, A
 
 
 def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
-    """Decode bytes and facts to `Gaussians.live`, (K, 6 to 8) float32, as a page does."""
+    """Decode bytes and facts to `Gaussians.live`, (K, 9 to 11) float32, as a page does."""
     layers, (first, last) = facts["layers"], facts["log_lengths"]
-    row = stream[:, 3] + 256 * stream[:, 7].astype(np.int64)
+    row = stream[:, ROW] + 256 * stream[:, ROW + 1].astype(np.int64)
     rows = np.array([layer["row"] for layer in layers])
     number = np.searchsorted(rows, row, side="right") - 1
     lo, hi = np.array([layer["values"] for layer in layers])[number].T
@@ -120,9 +123,9 @@ def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
     value = lo + (hi - lo) * share[:, 0]
     spread = np.where(hi > lo, hi - lo, 1.0) * facts["widest"] * share[:, 1] ** facts["bend"]
     length = np.exp(first + (last - first) * share[:, 2])
-    gradient = (stream[:, 4:7].astype(np.float64) - 128) / 127
+    gradient, axis = (stream[:, 3:6].astype(np.float64) - 128) / 127, (stream[:, 6:9].astype(np.float64) - 128) / 127
     labelled = any(layer["labels"] for layer in layers) or len(layers) > 1
-    columns = [value, spread, length, gradient, *([row - rows[number]] if labelled else [])]
+    columns = [value, spread, length, axis, gradient, *([row - rows[number]] if labelled else [])]
     found: np.ndarray = np.column_stack([*columns, *([number] if len(layers) > 1 else [])]).astype(np.float32)
     return found
 

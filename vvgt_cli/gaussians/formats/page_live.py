@@ -14,7 +14,7 @@ from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.constants import DILATION
-from vvgt_cli.gaussians.formats.live import live_bytes, live_json, log_lengths
+from vvgt_cli.gaussians.formats.live import BYTES, ROW, live_bytes, live_json, log_lengths
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
@@ -26,7 +26,6 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume.types import triple
 
 HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
-PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; with labels or several layers all are used
 SAMPLED = 96  # nodes for colours that are not interpolated linearly in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
@@ -120,7 +119,7 @@ def live_page_data(
         ordered.append(some)
     logs, planes = log_lengths(ordered), []
     for some, (_, options) in zip(ordered, clouds, strict=True):
-        rows = live_bytes(turn(some, upright(options).up), facts, logs)[:, planes_of(facts)]
+        rows = live_bytes(turn(some, upright(options).up), facts, logs)[:, : planes_of(facts)]
         planes.append(gzip.compress(np.ascontiguousarray(rows.T).tobytes(), 9, mtime=0))
     return splats, planes, _facts(ordered, facts, clouds[0][1])
 
@@ -138,9 +137,9 @@ def with_shared_labels(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -
     return replace(gaussians, live=live)
 
 
-def planes_of(facts: LiveFacts) -> tuple[int, ...]:
-    """Return the columns of `live_bytes` that a page stores, one after the other."""
-    return (*PLANES, 3, 7) if facts.labels or facts.others else PLANES
+def planes_of(facts: LiveFacts) -> int:
+    """Return how many columns of `live_bytes` a page stores, one after the other: all, or those before the rows."""
+    return BYTES if facts.labels or facts.others else ROW
 
 
 def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -> dict[str, Any]:
@@ -152,7 +151,7 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
     axes = _axes(upright(options).up)
     return found | {
         "held": [f"{HELD}-{k}" for k in range(len(clouds))],
-        "planes": len(planes_of(facts)),
+        "planes": planes_of(facts),
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
         "dilation": DILATION * pixel_width(options.made_for or SIZE) ** 2,

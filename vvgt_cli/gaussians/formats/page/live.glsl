@@ -3,7 +3,7 @@
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // a column a row of looks: of a label red, green, blue, extinction; of a function its number in the table, and -1
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
-uniform vec3 vvgtOpaque;  // of the variance of what is opaque across its surface, and along the others; variance of the screen's dilation
+uniform vec4 vvgtOpaque;  // of the variance of what is opaque across its surface; variance of the screen's dilation; mean abs(z) of what is seen, from which on it counts less, and from which on not at all
 uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
@@ -35,7 +35,7 @@ float vvgtAlpha(float y) {  // whose dilogarithm is y, to 3e-4
 }
 
 float vvgtPeak(float mass, vec3 variance) {  // the mean over views along the axes, by the areas that these see
-  vec3 v = variance + vvgtOpaque.z, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area;
+  vec3 v = variance + vvgtOpaque.y, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area;
   y += min(y, vec3(1.0 / 255.0));
   return dot(vec3(vvgtAlpha(y.x), vvgtAlpha(y.y), vvgtAlpha(y.z)), area) / (area.x + area.y + area.z);
 }
@@ -67,17 +67,18 @@ float vvgtCutAll(inout vec3 center, inout mat3 axes) {
   return stays;
 }
 
-vec3 vvgtShaded(vec3 color, vec3 n, vec3 center) {  // Blinn and Phong's (docs/light.md)
+vec3 vvgtShaded(vec3 color, vec3 n, float share, vec3 center) {  // Blinn and Phong's (docs/light.md): a share has the normal n, the rest any
   vec3 d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
-  return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
+  vec2 seen = mix(vec2(0.5, 1.0 / (vvgtLight.w + 1.0)), vec2(abs(dot(n, l)), pow(facing, vvgtLight.w)), share);
+  return min(color * (vvgtLight.x + vvgtLight.y * seen.x) + vvgtLight.z * seen.y, vec3(1.0));
 }
 
-vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {
+vec3 vvgtLit(vec3 color, vec3 axis, vec3 center) {
   if (vvgtLight.x < 0.0) return color;
-  float rises = length(gradient);
-  vec3 own = rises == 0.0 ? color * vvgtLight.x : vvgtShaded(color, gradient / rises, center);
-  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, center), vvgtFace.w) : own;
+  float share = length(axis);
+  vec3 own = share == 0.0 ? color * vvgtLight.x : vvgtShaded(color, axis / share, min(share, 1.0), center);
+  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, 1.0, center), vvgtFace.w) : own;
 }
 
 void modifySplatCenter(inout vec3 center) {
@@ -93,19 +94,20 @@ void modifySplatCenter(inout vec3 center) {
     sums = mix(texelFetch(vvgtTable, ivec2(at, near), 0), texelFetch(vvgtTable, ivec2(at, near + 1), 0), f);
     z = mix(texelFetch(vvgtTable, ivec2(at, near + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, near + 1 + spreads), 0).xy, f);
   }
-  float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
+  float whole = max(sums.a, 1e-12), first = z.x / whole, variance = max(z.y / whole - first * first, 0.0);
+  float tau = whole * clamp((vvgtOpaque.w - abs(first)) / (vvgtOpaque.w - vvgtOpaque.z), 0.0, 1.0);
   mat3 turn = quatToMat3(getRotation());
   vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;
   along /= max(length(along), 1e-30);
   float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), fog = exp(-tau * edge), r = min(length(gradient), 1.0), facing = r * r;
-  float thin = sqrt(max(1.0 - facing * (1.0 - variance), vvgtFacts.z * vvgtFacts.z) * (1.0 - (1.0 - fog) * facing * (1.0 - vvgtOpaque.x / vvgtOpaque.y)));
+  float thin = sqrt(max(1.0 - facing * (1.0 - variance), vvgtFacts.z * vvgtFacts.z) * (1.0 - (1.0 - fog) * facing * (1.0 - vvgtOpaque.x)));
   mat3 axes = mat3(matrix_model) * mat3(turn[0] * scale.x, turn[1] * scale.y, turn[2] * scale.z);
   vec3 arm = axes * along;
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
   float mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
-  vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
+  vec3 color = vvgtLit(sums.rgb / whole, mat3(matrix_model) * ((vec3(loadVvgtAxis().xyz) - 128.0) / 127.0), place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);
@@ -116,8 +118,7 @@ void modifySplatCenter(inout vec3 center) {
   if (determinant(unit) < 0.0) unit[2] = -unit[2];
   vvgtRotation = vvgtQuaternion(unit);
   float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
-  vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(mix(vvgtOpaque.x, vvgtOpaque.y, facing)), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
-  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), fog);
+  vec3 squares = vvgtScale * vvgtScale * (1.0 - (1.0 - fog) * (1.0 - vvgtOpaque.x) * (1.0 - facing) * vec3(lessThanEqual(vvgtScale, vec3(shortest))));
   vvgtScale = sqrt(squares);
   vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }

@@ -5,7 +5,7 @@ import { layersOf } from './live_at.mjs';
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
-const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]];  // and the planes of each one's r, g, b and a
+const STREAMS = [['vvgtValues', [0, 1, 2, 9]], ['vvgtGradient', [3, 4, 5, 10]], ['vvgtAxis', [6, 7, 8]]];  // and the planes of each one's r, g, b and a
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64), `size` of them
@@ -110,7 +110,7 @@ export async function liveLook({ app }, live) {
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
   look.light(live.light);
-  gsplat.setParameter('vvgtOpaque', [...live.opaque, live.dilation]);
+  gsplat.setParameter('vvgtOpaque', [live.sharp, live.dilation, ...live.tail]);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut([]);
   layers.forEach((layer, k) => {

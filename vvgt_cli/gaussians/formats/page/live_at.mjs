@@ -1,6 +1,8 @@
 // One Gaussian of a live page as live.glsl shows it, and the value at a place; `look` as `liveLook` returns it.
 import { around } from './cloud.mjs';
 
+const ROW = 9;  // plane of a row's low byte, before that of its high byte (formats/live.py)
+
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 // what a Gaussian carries: value and spread, log of the length, direction in which values rise (viewer's axes) and its length r
@@ -23,7 +25,7 @@ const along = (gradient, arms) => {
 export const layersOf = (live) => live.layers.map((layer) => ({ ...live, ...layer }));
 
 // the row of a Gaussian's look, and its layer's number
-const rowOf = ({ bytes, count, live }, i) => (live.planes > 6 ? bytes[6 * count + i] + 256 * bytes[7 * count + i] : 0);
+const rowOf = ({ bytes, count, live }, i) => (live.planes > ROW ? bytes[ROW * count + i] + 256 * bytes[(ROW + 1) * count + i] : 0);
 const layerOf = ({ layers }, row) => layers.findLastIndex((layer) => layer.row <= row);
 const beyond = ({ planes = [] }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
@@ -46,7 +48,7 @@ function seen({ live }, center, arms, tau, length, facing) {
     }
   }
   const squares = axes.map((axis) => dot(axis, axis)), shortest = squares.indexOf(Math.min(...squares)), fog = Math.exp(-tau * length);
-  const [sharp, flat] = live.opaque, factors = squares.map((_, k) => fog + (1 - fog) * (k === shortest ? sharp + (flat - sharp) * facing : flat));
+  const factors = squares.map((_, k) => (k === shortest ? 1 - (1 - fog) * (1 - live.sharp) * (1 - facing) : 1));
   const wide = squares.map((v, k) => v * factors[k] + live.dilation), areas = [0, 1, 2].map((k) => 2 * Math.PI * Math.sqrt(wide[(k + 1) % 3] * wide[(k + 2) % 3]));
   const total = areas.reduce((sum, area) => sum + area), mass = tau * length ** 3;
   const opacity = areas.reduce((sum, area) => sum + area * alpha(mass / area + Math.min(mass / area, 1 / 255)), 0) / total;
@@ -66,12 +68,13 @@ export function looksOf(look) {
       const j = Math.min(Math.floor(column), spreads - 2), f = column - j;
       const at = (c) => (1 - f) * look.sums[k][6 * (row * spreads + j) + c] + f * look.sums[k][6 * (row * spreads + j + 1) + c];
       tau = at(3);
-      first = at(4) / tau;
-      variance = Math.max(at(5) / tau - first * first, 0);
+      first = at(4) / Math.max(tau, 1e-30);
+      variance = Math.max(at(5) / Math.max(tau, 1e-30) - first * first, 0);
+      tau *= Math.min(Math.max((live.tail[1] - Math.abs(first)) / (live.tail[1] - live.tail[0]), 0), 1);
     }
     if (tau < 1e-12) return null;
-    const unit = along(gradient, arms), facing = r * r, opaque = 1 - Math.exp(-tau * length), [sharp, flat] = live.opaque;
-    const thin = Math.sqrt(Math.max(1 - facing * (1 - variance), live.thinnest ** 2) * (1 - opaque * facing * (1 - sharp / flat)));
+    const unit = along(gradient, arms), facing = r * r, opaque = 1 - Math.exp(-tau * length);
+    const thin = Math.sqrt(Math.max(1 - facing * (1 - variance), live.thinnest ** 2) * (1 - opaque * facing * (1 - live.sharp)));
     const arm = [0, 1, 2].map((c) => arms[0][c] * unit[0] + arms[1][c] * unit[1] + arms[2][c] * unit[2]);
     const moved = center.map((x, c) => x + arm[c] * r * first);
     if (beyond(look, moved)) return null;
