@@ -38,6 +38,13 @@ class Cloud(Result):
     facts: dict[str, Any]
     directions: np.ndarray | None
 
+    def shown_name(self) -> str:
+        """Return the name in the list of a page: of a frame, whose own name is a file's, its time or number."""
+        if "frame" not in self.facts:
+            return self.name
+        time, unit = self.facts.get("time"), self.facts.get("time_unit", "")
+        return f"frame {self.stem}" if time is None else f"t = {time:g} {unit}".rstrip()
+
     def normals(self) -> np.ndarray | None:
         """Implement `Result.normals`."""
         return self.directions
@@ -140,13 +147,13 @@ class Clouds(Mapping[str, Result]):
         """Return one page of all clouds."""
         from vvgt_cli.gaussians.formats.page_live import page_of_several
 
-        return page_of_several([(cloud.name, cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
+        return page_of_several([(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
 
     def _repr_html_(self) -> str | None:
         """Return the page for a notebook; None where a library is missing."""
         from vvgt_cli.gaussians.formats.page_file import iframe
 
         try:
-            return iframe(self._html(self.volume), self.volume)
+            return iframe(self._html(self.kind), self.kind)
         except DataError:
             return None

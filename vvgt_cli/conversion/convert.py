@@ -6,11 +6,12 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
-from vvgt_cli.conversion.gaussian_files import write_gaussians
-from vvgt_cli.conversion.live import check_live, convert_live
+from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+from vvgt_cli.conversion.live import check_live, convert_live, editor_form
 from vvgt_cli.conversion.place import placement_warnings, to_unit_frame, up_axis, with_place
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import report_format_cost
@@ -269,8 +270,9 @@ def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Co
     """Return a conversion without scores."""
     source = work.field.source
     return Conversion(
-        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field
-    )
+        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field,
+        partial(editor_form, request),
+    )  # fmt: skip
 
 
 @contextmanager
@@ -295,7 +297,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
             field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live or request.editor)
     with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
         _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
@@ -352,8 +354,15 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         function=source.name if len(source.layers) > 1 else source.tf.name,
         optics=source.optics(),
         legend=_legend(source),
+        title=request.title or _example(request) or source.title,
     )
     return with_place(ply, source.volume)
+
+
+def _example(request: ConvertRequest) -> str | None:
+    """Return the name of a volume that comes with the program."""
+    volume = request.source.volume
+    return volume.split(":")[1] if isinstance(volume, str) and volume.startswith("example:") else None
 
 
 def _legend(source: Source) -> str | None:
@@ -363,7 +372,7 @@ def _legend(source: Source) -> str | None:
     labelled, volume = isinstance(source.tf, LabelTable), source.volume
     numbers = None if labelled else source.statistics
     lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
-    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
+    return legend_text(source.tf, lo, hi, volume.values_in, volume.quantity)
 
 
 def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
@@ -387,7 +396,8 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     assert request.output is not None
     if conversion.ply.certificate is not None or not written:
         file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
-        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage)
+        editor = conversion.live_form(run) if request.editor and is_page(request.output) else None
+        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, editor=editor)
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

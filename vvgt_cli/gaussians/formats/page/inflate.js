@@ -1,4 +1,4 @@
-// Of a page in one file: the viewer's program, packed, becomes a script.
+// In a page that is one file, the viewer's program is packed; it becomes a script.
 (async () => {
   const text = atob(document.getElementById('program').textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
@@ -7,4 +7,4 @@
   script.textContent = await new Response(stream).text();
   document.getElementById('program').remove();
   document.body.append(script);
-})().catch((error) => { document.getElementById('said').textContent = `This browser does not show it: ${error}`; });
+})().catch((error) => { document.getElementById('said').textContent = `This browser cannot show the 3D view: ${error}`; });
