@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.gaussian_files import is_page
-from vvgt_cli.conversion.index import entry, index_of, index_output, is_pattern, psnr_of, put_name, write_index
+from vvgt_cli.conversion.index import (
+    entry,
+    index_of,
+    index_output,
+    is_pattern,
+    psnr_of,
+    put_name,
+    shown_name,
+    write_index,
+)
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
@@ -39,11 +48,8 @@ class Cloud(Result):
     directions: np.ndarray | None
 
     def shown_name(self) -> str:
-        """Return the name in the list of a page: of a frame, whose own name is a file's, its time or number."""
-        if "frame" not in self.facts:
-            return self.name
-        time, unit = self.facts.get("time"), self.facts.get("time_unit", "")
-        return f"frame {self.stem}" if time is None else f"t = {time:g} {unit}".rstrip()
+        """Return the name in the list of a page."""
+        return shown_name(self.name, self.facts)
 
     def normals(self) -> np.ndarray | None:
         """Implement `Result.normals`."""
