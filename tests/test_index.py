@@ -47,7 +47,7 @@ NAMES = {
     "functions": [("bone", "x_bone.ply"), ("skin", "x_skin.ply")],
     "labels": [("label 1", "x_1-label-1.ply"), ("label 2", "x_2-label-2.ply")],
 }
-SHOWN = {"frames": ["t = 0 s", "t = 6 s"]}  # on a page: not the names of files
+SHOWN = {"frames": ["t = 1 s", "t = 6 s"]}  # on a page: not the names of files
 FACTS = {
     "frames": {"frame": 2, "time": 6.0, "time_unit": "s"},
     "functions": {"function": "skin.json"},
