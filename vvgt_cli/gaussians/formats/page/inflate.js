@@ -5,6 +5,9 @@
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
   const script = document.createElement('script');
   script.textContent = await new Response(stream).text();
+  document.addEventListener('securitypolicyviolation', ({ effectiveDirective: what }) => {
+    if (what.startsWith('script')) document.getElementById('said').textContent = 'The content security policy of the site blocks the 3D view: it has hashes of another version.';
+  });
   document.getElementById('program').remove();
   document.body.append(script);
 })().catch((error) => { document.getElementById('said').textContent = `This browser cannot show the 3D view: ${error}`; });
