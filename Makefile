@@ -34,7 +34,7 @@ docs: $(VENV)/bin/pytest
 	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,docs]'
 	$(VENV)/bin/python -m sphinx -W --keep-going -q -c docs . out/docs
 
-# The checks that take too long for every change: tests marked `long`, and property tests with 100 times the examples.
+# The checks that take too long for every change: tests marked `long`, and property tests with 10,000 examples.
 long: $(VENV)/bin/pytest
 	HYPOTHESIS_PROFILE=long $(VENV)/bin/pytest --long
 

@@ -9,12 +9,20 @@ from dataclasses import dataclass
 import hypothesis
 import pytest
 
+from tests.spared import MARCH, spare
 from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
 os.environ["SOURCE_DATE_EPOCH"] = "0"  # no seconds in files: what is made twice is compared byte by byte
 
-hypothesis.settings.register_profile("default", max_examples=100, deadline=None)
+SLOWEST = (
+    *("matrix", "docs_run", "stiff", "benchmarks", "jit", "fuzz", "stiff_equivalence", "volume_vtk_family", "report"),
+    *("scale_workers", "slurm", "cli_streams", "previous_frame", "closed_form", "certificate", "cli_convert"),
+    *("conversion_plan", "previous_look", "split_labels", "dask", "field_rays", "volume_openfoam", "volume_grib"),
+    *("check_splats", "clouds", "splat_backward", "closed_form_moments", "architecture", "peers", "threads"),
+)  # files' names, tens of seconds to ten
+
+hypothesis.settings.register_profile("default", max_examples=40, deadline=None)
 hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)
 hypothesis.settings.register_profile("quick", max_examples=10, deadline=None)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
@@ -26,6 +34,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "long: takes too long for every change (make long)")
+    config.option.loadscopereorder = False  # of pytest-xdist, which would begin with the files of most tests
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -51,6 +60,9 @@ def compile_kernels() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no process waits for another at the end; skip long tests."""
+    order = {f"test_{name}.py": place for place, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
     if not config.getoption("--long"):
         for item in items:
             if "long" in item.keywords:
@@ -58,15 +70,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_conversions() -> Iterator[None]:
-    """Spare conversions and reports in this process what takes most of a small one's time.
+def small_conversions() -> None:
+    """Spare commands in this process what takes most of a small one's time; in others they do as users have it."""
+    spare()
 
-    They are scored at their size and twice that, not for a 4K screen. `vvgt` in a process of its own does as users
-    have it.
-    """
+
+@pytest.fixture(scope="module")
+def whole_march() -> Iterator[None]:
+    """March visibility as users have it, where files of this process are compared with those of another."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("conversion.stages.scores", "commands.report_runs"):
-            patch.setattr(f"vvgt_cli.{module}.screens", lambda size: [(size, 40.0), (2 * size, 40.0)])
+        patch.setattr(MARCH, 128)
         yield
 
 

@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+from tests.spared import spare
 from vvgt_cli.cli.main import run
 
 SIZES = {"convert": "--max-gaussians 200 --size 48", "init": "--max-gaussians 200", "render": "--size 48"}
@@ -28,4 +29,5 @@ def small(words: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
+    spare()
     sys.exit(run(small(sys.argv[1:])))

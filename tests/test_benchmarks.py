@@ -233,11 +233,17 @@ def test_curve(bench, scenes, tmp_path):
     assert read_png(tmp_path / "a.png").shape[2] in (3, 4)
 
 
-def test_whole(bench, scenes, tmp_path):
+def test_whole(bench, scenes, tmp_path, monkeypatch):
     from vvgt_cli.dvr.vtk import require_opengl
 
     require_opengl()
-    module, found = bench("whole", STEP={"blob": 1.0}, VIEWS=2), tmp_path / "a.csv"
+    module, found = bench("whole", STEP={"blob": 1.0}, VIEWS=2, SIZE=SIZE), tmp_path / "a.csv"
+    commands, few = module.commands, ["--max-gaussians", "60", "--size", str(SIZE), "--steps", "2"]
+
+    def small(*args):
+        return [(what, at, [*words, *few] if "convert" in words else words) for what, at, words in commands(*args)]
+
+    monkeypatch.setattr(module, "commands", small)
     call(module.main, "measure", *scenes, "-o", found, "--rounds", 1, "--threads", 1, "--lit", "--other", ROOT)
     rows = rows_of(found)
     assert len({row["what"] for row in rows if float(row["wall"]) > 0}) == len(rows) == 6

@@ -75,11 +75,9 @@ def test_volumes_functions_and_outputs_through_pipes(head):
     assert plain.returncode == 0, plain.stderr
     for i, line in enumerate(
         (
-            f"vvgt convert <(gunzip -c head.npy.gz) --tf <(cat tf.json) {MAKE} -o b0.ply",
-            f"gunzip -c head.npy.gz | vvgt convert /dev/stdin --tf tf.json {MAKE} -o b1.ply",
-            f"vvgt convert head.npy --tf tf.json {MAKE} -o >(cat > b2.ply) && sleep 0.3",
-            f"mkfifo out.ply; cat out.ply > b3.ply & vvgt convert head.npy --tf tf.json {MAKE} -o out.ply && wait",
-            f"vvgt convert head.npy --tf tf.json {MAKE} -o /dev/stdout > b4.ply",
+            f"vvgt convert <(gunzip -c head.npy.gz) --tf <(cat tf.json) {MAKE} -o >(cat > b0.ply) && sleep 0.3",
+            f"gunzip -c head.npy.gz | vvgt convert /dev/stdin --tf tf.json {MAKE} -o /dev/stdout > b1.ply",
+            f"mkfifo out.ply; cat out.ply > b2.ply & vvgt convert head.npy --tf tf.json {MAKE} -o out.ply && wait",
         )
     ):
         done = shell(line, head)
@@ -88,9 +86,8 @@ def test_volumes_functions_and_outputs_through_pipes(head):
 
 
 def test_info_of_pipes(head):
-    for kind in ("volume", "transfer function", "gaussians"):
-        assert shell(f"vvgt {INIT} -o g.ply --overwrite -q", head).returncode == 0
-        name = {"volume": "head.npy", "transfer function": "tf.json", "gaussians": "g.ply"}[kind]
+    assert shell(f"vvgt {INIT} -o g.ply -q", head).returncode == 0
+    for kind, name in {"volume": "head.npy", "transfer function": "tf.json", "gaussians": "g.ply"}.items():
         done = shell(f"vvgt info <(cat {name}) --json", head)
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)["kind"] == kind

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_damaged_files_end_in_one_of_our_errors(request: pytest.FixtureRequest) -> None:
-    inputs = 100_000 if request.config.getoption("--long") else 200
+    inputs = 100_000 if request.config.getoption("--long") else 100
     command = [sys.executable, "tests/fuzz.py", "--inputs", str(inputs)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.stdout, done.stderr

@@ -31,12 +31,6 @@ class Named:
     name: str = "grid"
 
 
-@pytest.fixture(autouse=True)
-def small_march(monkeypatch: pytest.MonkeyPatch) -> None:
-    """March visibility through 64 x 64 pixels, which meet every cell of 30 voxels."""
-    monkeypatch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
-
-
 def random_grid(shape=(9, 10, 11), top: float = 3.0, share: float = 0.5, seed: int = 0) -> np.ndarray:
     """Independent voxels, a ``share`` of them empty."""
     rng = np.random.default_rng(seed)

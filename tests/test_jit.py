@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.jit import ahead
+from vvgt_cli.jit.compile import compile_ahead
 from vvgt_cli.jit.store import folders
 
 ROOT = Path(__file__).parent.parent
@@ -83,15 +85,18 @@ def test_cold_and_warm_runs_leave_the_same_bytes(tmp_path, target):
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A copy of the package's folder, where NUMBA_CACHE_DIR = ``tmp_path / "cache"`` has it."""
+    compile_ahead(ahead.ALL)
+    whole = next(folder for folder in folders() if folder.is_dir())
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     (folder,) = folders()
-    shutil.copytree(command("warmup", cwd=tmp_path, folder=None).stdout.strip(), folder)
+    shutil.copytree(whole, folder)
     return folder
 
 
 def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache):
-    """Two kernels of loops over threads and one without are compiled by the first run, one of them by itself."""
-    some = ("vvgt_cli.splat.tiles.blend-", "vvgt_cli.splat.kernel.project-", "vvgt_cli.closed_form.pyramid.take_base-")
+    """Two kernels of loops over threads and one without are compiled by the first run."""
+    names = ("splat.kernel.count_pairs", "splat.kernel.sum_pairs", "closed_form.pyramid.take_base")
+    some = tuple(f"vvgt_cli.{name}-" for name in names)
     for name in kernels(cache):
         if name.startswith(some):
             (cache / name).unlink()
@@ -105,7 +110,7 @@ def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache)
 
 
 def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
-    some = ("vvgt_cli.closed_form.surface_offset._shift", "vvgt_cli.splat.kernel.project-")
+    some = ("vvgt_cli.closed_form.surface_offset._blur", "vvgt_cli.splat.kernel.sum_pairs-")
     gone = {name for name in kernels(cache) if name.startswith(some)}
     for name in gone:
         (cache / name).unlink()
@@ -118,8 +123,6 @@ def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
     assert len(kernels(cache)) == kept + len(found)
     assert f"{len(found)} kernels were missing" in first.stderr
     assert "nothing was missing" in command("warmup", cwd=tmp_path, folder=tmp_path / "cache").stderr
-    done = command("convert", SOURCE, *SMALL, "-o", "a.ply", cwd=tmp_path, folder=tmp_path / "cache")
-    assert "compile" not in done.stderr
 
 
 def test_warmup_without_a_place_is_an_error(tmp_path):
@@ -130,78 +133,93 @@ def test_warmup_without_a_place_is_an_error(tmp_path):
     assert "no folder can keep" in done.stderr
 
 
-def wanted(tmp_path, *args):
-    """Kernels that a command asks for."""
-    spy = (
-        "import sys; from vvgt_cli.jit.cache import KernelCache as K; inner = K.load_overload; names = set()\n"
-        "def spy(self, sig, context):\n"
-        "    names.add(f'{self.function.__module__}:{self.function.__qualname__}')\n"
-        "    return inner(self, sig, context)\n"
-        "K.load_overload = spy\n"
-        "from vvgt_cli.cli.main import run\n"
-        f"code = run({[str(arg) for arg in args]!r}); print(*names); sys.exit(code)"
-    )
-    return set(python("-c", spy, cwd=tmp_path, folder=None).stdout.splitlines()[-1].split())
+SPY = """
+import importlib, json, os, sys
+from vvgt_cli.cli.main import run
+from vvgt_cli.jit import ahead, compile
+from vvgt_cli.jit.cache import KernelCache
+inner, asked, odd = KernelCache.load_overload, set(), set()
+def spy(self, sig, context):
+    name = f"{self.function.__module__}:{self.function.__qualname__}"
+    usual = [compile.usual_types(self.dispatcher, kind) for kind in compile.VOLUMES]
+    (asked if tuple(getattr(sig, "args", sig)) in usual else odd).add(name)
+    return inner(self, sig, context)
+KernelCache.load_overload = spy
+for name in ahead.ALL:
+    importlib.import_module(name.split(":")[0])
+for line in sys.stdin:
+    if os.fork() == 0:
+        answers, sys.stdout = sys.stdout, open(os.devnull, "w")
+        code = run(json.loads(line))
+        print(json.dumps([code, sorted(asked), sorted(odd)]), file=answers, flush=True)
+        os._exit(0)
+    os.wait()
+"""
 
 
-def one_by_one(tmp_path, *args):
-    """Kernels, with the types, that a command finds no code for and was not told of."""
-    spy = (
-        "import sys; from vvgt_cli.jit import compile as c; from vvgt_cli.jit.cache import KernelCache as K\n"
-        "inner = K.load_overload; alone = []\n"
-        "def spy(self, sig, context):\n"
-        "    types = tuple(getattr(sig, 'args', sig))\n"
-        "    usual = [c.usual_types(self.dispatcher, kind) for kind in c.VOLUMES]\n"
-        "    if types not in usual: alone.append(self.function.__qualname__)\n"
-        "    return inner(self, sig, context)\n"
-        "K.load_overload = spy\n"
-        "from vvgt_cli.cli.main import run\n"
-        f"code = run({[str(arg) for arg in args]!r}); print(*alone); sys.exit(code)"
-    )
-    return python("-c", spy, cwd=tmp_path, folder=None).stdout.splitlines()[-1].split()
+@pytest.fixture
+def spied(tmp_path):
+    """Run a command in ``tmp_path`` in a fork that has no kernels yet; returns those that it asks for.
+
+    They are two sets: with the types that are compiled ahead, and with others.
+    """
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", SPY], cwd=tmp_path, env=environment(None), **pipes) as process:
+
+        def run(*args):
+            print(json.dumps([str(arg) for arg in args]), file=process.stdin, flush=True)
+            code, asked, odd = json.loads(process.stdout.readline())
+            assert code == 0, args
+            return set(asked), set(odd)
+
+        yield run
+        process.stdin.close()
 
 
-def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
+def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
+    def wanted(*args):
+        asked, others = spied(*args)
+        assert not others, args
+        return asked
+
     rare = {
         f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")
     }  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     rare |= set(ahead.REGRESS)  # and of more than a few Gaussians
-    assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
-    many = ("--max-gaussians", 1500, "--size", 64, "-q", "--steps", 24)
-    assert set(ahead.REGRESS) <= wanted(tmp_path, "convert", SOURCE, *many, "-o", "o.ply")
-    large = ("--max-gaussians", 200, "--size", 650, "-q", "--steps", 24)  # scored on blocks
-    assert one_by_one(tmp_path, "convert", SOURCE, *large, "-o", "l.ply") == []
-    assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
+    assert wanted("convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
+    many = ("--max-gaussians", 1500, "--size", 650, "-q", "--steps", 24)  # and scored on blocks
+    assert set(ahead.REGRESS) <= wanted("convert", SOURCE, *many, "-o", "o.ply")
+    assert wanted("init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
     (tmp_path / "v_24x24x24_uint8.raw").write_bytes(bytes(range(216)) * 64)
-    blocks = wanted(tmp_path, "init", "v_24x24x24_uint8.raw", *fit, "--blocks", 16, "-o", "k.ply")
+    blocks = wanted("init", "v_24x24x24_uint8.raw", *fit, "--blocks", 16, "-o", "k.ply")
     started = ahead.for_blocks((ahead.RENDER, *ahead.INIT, *ahead.DRAW))
     assert blocks == {*started, *ahead.COUNT_WHOLE} - rare
     np.linspace(0, 1, 24**3, dtype=np.float32).tofile(tmp_path / "f_24x24x24_float32.raw")
     reals = ("init", "f_24x24x24_float32.raw", *fit, "--blocks", 16)
-    assert wanted(tmp_path, *reals, "-o", "n.ply") == {*started, *ahead.COUNT_REAL} - rare
-    fitted = wanted(tmp_path, "convert", "v_24x24x24_uint8.raw", *fit, "--steps", 24, "--blocks", 16, "-o", "m.ply")
+    assert wanted(*reals, "-o", "n.ply") == {*started, *ahead.COUNT_REAL} - rare
+    fitted = wanted("convert", "v_24x24x24_uint8.raw", *fit, "--steps", 24, "--blocks", 16, "-o", "m.ply")
     assert fitted == {*ahead.for_blocks(ahead.CONVERT), *ahead.COUNT_WHOLE} - rare
-    few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
+    few = wanted("convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
     assert set(ahead.BACK_PROJECT) <= few <= set(ahead.CONVERT)
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")
-    assert wanted(tmp_path, "render-views", SOURCE, *views) == set(ahead.VIEWS) - {ahead.BLOCK_MOMENTS}
+    assert wanted("render-views", SOURCE, *views) == set(ahead.VIEWS) - {ahead.BLOCK_MOMENTS}
     seen = ("a.ply", "--views", "views")
     alone = set(ahead.OPTIMIZE) - set(ahead.SHARED)
-    assert wanted(tmp_path, "optimize", *seen, "--steps", 3, "-qo", "c.ply") == alone
+    assert wanted("optimize", *seen, "--steps", 3, "-qo", "c.ply") == alone
     seen_by_many = ("o.ply", *seen[1:], "--steps", 3, "-qo", "p.ply")
-    assert set(ahead.SHARED) <= wanted(tmp_path, "optimize", *seen_by_many) <= set(ahead.OPTIMIZE)
-    assert wanted(tmp_path, "infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
-    assert wanted(tmp_path, "evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
-    assert wanted(tmp_path, "render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
-    lit = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "--light", "headlight", "-o", "e.ply")
+    assert set(ahead.SHARED) <= wanted("optimize", *seen_by_many) <= set(ahead.OPTIMIZE)
+    assert wanted("infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
+    assert wanted("evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
+    assert wanted("render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
+    lit = wanted("convert", SOURCE, *fit, "--steps", 24, "--light", "headlight", "-o", "e.ply")
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
     np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
-    labels = wanted(tmp_path, "convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
+    labels = wanted("convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
     assert labels == set(ahead.for_grid(ahead.CONVERT)) - {*ahead.REGRESS, ahead.MIX}  # of other grids, and of more
-    assert one_by_one(tmp_path, "convert", "seg.npy", *large, "-o", "h.ply") == []
+    wanted("convert", "seg.npy", *fit, "--steps", 24, "--light", "above", "--shadows", "--blocks", 16, "-o", "h.ply")
     dark = ("--light", "above", "--shadows", "--specular", 0)
-    flat = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")
+    flat = wanted("convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")
     assert flat == set(ahead.for_light(ahead.CONVERT, True)) - rare
 
 
@@ -383,15 +401,12 @@ def test_without_a_home(tmp_path):
     assert len(kernels(tmp_path / "user")) == 1
 
 
-def test_two_first_runs_at_once(tmp_path, ply):
+def test_two_first_runs_at_once(tmp_path, stepped):
     """For a processor without extensions, whatever this one has: code of another kind, and a folder of its own."""
-    cache = tmp_path / "cache"
-    args = [sys.executable, "-m", "vvgt_cli.cli.main", "render", str(ply), "--orbit", "1", "--size", "40", "-q", "-o"]
-    variables = environment(cache, NUMBA_CPU_NAME="generic")
-    runs = [subprocess.Popen([*args, str(i)], cwd=tmp_path, env=variables) for i in range(2)]
-    assert [run.wait() for run in runs] == [0, 0]
-    command(*args[3:], "2", cwd=tmp_path, folder=cache, NUMBA_CPU_NAME="generic")
-    first, second, warm = ((tmp_path / str(i) / "orbit_000.png").read_bytes() for i in range(3))
-    assert first == second == warm
-    assert len(kernels(cache)) == len(ahead.DRAW)
-    assert not list(cache.rglob("*.part"))
+    variables = environment(tmp_path, NUMBA_CPU_NAME="generic")
+    pipe = {"env": variables, "stdout": subprocess.PIPE, "text": True}
+    runs = [subprocess.Popen([sys.executable, "-c", STEP], **pipe) for _ in range(2)]
+    assert [run.communicate()[0] for run in runs] == [stepped[0]] * 2
+    assert python("-c", STEP, folder=tmp_path, NUMBA_CPU_NAME="generic").stdout == stepped[0]
+    assert len(kernels(tmp_path)) == 1
+    assert not list(tmp_path.rglob("*.part"))

@@ -46,7 +46,7 @@ def folder(volume: Path) -> Path:
     from vvgt_cli.cli.main import run
 
     out = volume.parent / "out"
-    assert run(["convert", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0
+    assert run(["init", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0
     return out
 
 
@@ -152,7 +152,7 @@ def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_
 
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert vvgt("convert", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json").code == 0
+    assert vvgt("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json").code == 0
     assert vvgt("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts").code == 0
     assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json").code == 0
     for other in (tmp_path / "whole", tmp_path / "merged"):
@@ -164,12 +164,10 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     [
         (("--init", "wavelet"), "needs moments"),
         (("--frame", "world"), "remove --frame"),
-        (("--steps", "50"), "made by one closed form"),
-        (("--live",), "made by one closed form"),
-        (("--tf", "a.json", "--tf", "b.json"), "made by one closed form"),
-        (("--target-psnr", "30"), "made by one closed form"),
-        (("--dry-run",), "made by one closed form"),
-        (("--preview", "p.png"), "made by one closed form"),
+        (("--live",), "made node by node"),
+        (("--tf", "a.json", "--tf", "b.json"), "made node by node"),
+        (("--dry-run",), "made node by node"),
+        (("--preview", "p.png"), "made node by node"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
@@ -186,7 +184,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 2500)
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
     whole, out = tmp_path / "whole", tmp_path / "out"
-    line = ("convert", volume, *FIT, "--blocks", "32", "-o")
+    line = ("init", volume, *FIT, "--blocks", "32", "-o")
     assert vvgt(*line, whole / "lod-meta.json").code == 0
     calls = {"level_errors": 0, "images_of": 0}
     real = {"level_selection.level_errors": level_errors, "streamed_files.images_of": images_of}
@@ -247,8 +245,8 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
     for path in (stale / "meta.json", stale / "sh0.webp", other / "notes.txt"):
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"x")
-    assert vvgt("convert", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
-    assert vvgt("convert", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json").code == 0
+    assert vvgt("init", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
+    assert vvgt("init", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json").code == 0
     assert not stale.exists()
     assert (other / "notes.txt").is_file()  # not of the manifest
 
@@ -256,7 +254,7 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
 def test_nothing_else_in_the_folder_is_touched(vvgt, volume: Path, tmp_path: Path) -> None:
     (tmp_path / "2024_11").mkdir()
     (tmp_path / "2024_11" / "notes.txt").write_text("of someone")
-    assert vvgt("convert", volume, *FIT, "-o", tmp_path / "lod-meta.json").code == 0
+    assert vvgt("init", volume, *FIT, "-o", tmp_path / "lod-meta.json").code == 0
     assert (tmp_path / "2024_11" / "notes.txt").read_text() == "of someone"
 
 

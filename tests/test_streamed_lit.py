@@ -43,7 +43,7 @@ def nearest(found: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("light", LIGHTS)
 def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_path: Path, light: str) -> None:
     out = tmp_path / "out" / "lod-meta.json"
-    assert vvgt("convert", volume, *FIT, *LIGHTS[light], "--blocks", "32", "-o", out).code == 0
+    assert vvgt("init", volume, *FIT, *LIGHTS[light], "--blocks", "32", "-o", out).code == 0
     assert vvgt("init", volume, *FIT, *LIGHTS[light], "-o", tmp_path / "a.ply").code == 0
     (found, header), (expected, told) = read_splats(out), read_ply(tmp_path / "a.ply")
     assert header.light == told.light
@@ -68,7 +68,7 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
             assert vvgt(*line).code == 0
     assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged.ply").code == 0
     assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "m" / "lod-meta.json").code == 0
-    assert vvgt("convert", volume, *FIT, *lit, "-o", tmp_path / "c" / "lod-meta.json").code == 0
+    assert vvgt("init", volume, *FIT, *lit, "-o", tmp_path / "c" / "lod-meta.json").code == 0
     one, *others = ((tmp_path / name).read_bytes() for name in ("32.ply", "64.ply", "merged.ply"))
     assert all(other == one for other in others)
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]

@@ -39,6 +39,8 @@ from vvgt_cli.network.training import loop, losses, sample  # noqa: E402
 from vvgt_cli.network.training.config import config_text, read_config  # noqa: E402
 from vvgt_cli.network.training.splatter import gsplat_picture, splat  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("whole_march")  # runs are compared with those of other processes
+
 STEPPER = replace(
     TINY, variant="wo_vgf", rounds=2, image=replace(TINY.image, views=2),
     geometry=replace(TINY.geometry, head="step", gradients=True, depths=(0, 1, 1, 1, 1), decoder_depths=(0, 1, 1, 1)),

@@ -143,18 +143,18 @@ def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt: Call
 
 @pytest.mark.parametrize("make", [netcdf, vti])
 def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Path, vvgt: Callable) -> None:
-    """In blocks, with processes of workers."""
+    """In blocks; the packed ones with processes of workers."""
     np.save(tmp_path / "v.npy", BALL.astype("f4"))
     files = []
-    for source in (tmp_path / "v.npy", make(tmp_path)):
+    for source, more in ((tmp_path / "v.npy", ()), (make(tmp_path), ("--workers", 2))):
         files.append(tmp_path / f"{source.suffix[1:]}.ply")
-        how = ("--max-gaussians", 200, "--blocks", 32, "--workers", 2, "--no-comments")
+        how = ("--max-gaussians", 200, "--blocks", 32, *more, "--no-comments")
         assert vvgt("init", source, "-o", files[-1], *how).code == 0
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt: Callable) -> None:
     source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
-    done = vvgt("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--steps", 0)
+    done = vvgt("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--size", 32, "--steps", 0)
     assert done.code == 0, done.err
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply"]

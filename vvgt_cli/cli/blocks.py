@@ -44,8 +44,9 @@ _options = {
         "Default: blocks if the volume is larger than 1 GiB or does not fit in memory.",
     ),
     "workers": click.option(
-        "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
-        help="Number of parallel worker processes, or of SLURM jobs with --scheduler slurm.",
+        "--workers", type=click.IntRange(1, 1024), metavar="N",
+        help="Number of parallel worker processes, or of SLURM jobs with --scheduler slurm. Default: by processors, "
+        "memory and size.",
     ),
     "scheduler": click.option(
         "--scheduler", metavar="local|slurm|ADDRESS",
@@ -66,12 +67,11 @@ _shard_option = {
 }  # fmt: skip
 block_options = group("blocks", **_options)
 shared_block_options = group("blocks", **_options, **_shard_option)
-ONE = ("workers",)  # options that are 1 where they are not given
 
 
 def any_given(blocks: dict[str, Any]) -> bool:
     """Return whether any of the options is given."""
-    return any(value is not None and (key not in ONE or value > 1) for key, value in blocks.items())
+    return any(value is not None for value in blocks.values())
 
 
 def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:

@@ -44,9 +44,13 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     from vvgt_cli.cli.blocks import block_options_of
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
-    from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
+    from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
     from vvgt_cli.field.open import automatic
 
     request = convert_request(volume, **options)
-    request = replace(request, blocks=block_options_of(blocks) or automatic(request.source, console))
-    (init_in_blocks if writes_streaming(request) else initialise_only)(request, console)
+    found = block_options_of(blocks) or automatic(request.source, console)
+    request = replace(request, blocks=found, fit=replace(request.fit, steps=0))
+    if writes_streaming(request):
+        convert_in_batches(request, console)
+    else:
+        initialise_only(request, console)

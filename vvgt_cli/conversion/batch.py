@@ -58,10 +58,10 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
     LIVE: {"--dry-run": "live files need no plan; remove it", "after": "live files need no earlier one; remove it"},
     LEVELS: dict.fromkeys(
         (
-            *("several --tf", "--steps", "--model", "--rule", "--target-psnr", "--time-budget", "--max-size", "--live"),
+            *("several --tf", "--model", "--rule", "--max-size", "--live"),
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
-        "levels are made by one closed form alone; remove it",
+        "levels are made node by node, of one closed form; remove it",
     ),
     PAGE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",

@@ -24,8 +24,10 @@ from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.settings import MANY, BlockOptions
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
@@ -150,6 +152,10 @@ def run_conversion(
     if request.live:
         check_live(request)
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
+    if made is None and start is None and isinstance(field, Blocked) and by_regions(request):
+        from vvgt_cli.conversion.shards.run import gaussians_by_regions
+
+        made = gaussians_by_regions(run, request, field)
     if start is not None:
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None)
@@ -286,7 +292,12 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
     """
     if request.fit.device != "cpu":
         load_ahead()
-    options = request.blocks or automatic(request.source, run.console)
+    options, most = request.blocks or automatic(request.source, run.console), None
+    if by_regions(request):
+        from vvgt_cli.conversion.shards.plan import most_cells
+
+        run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
+        options, most = options or BlockOptions(), most_cells(request.budget())
     if options is None:
         with run.stage("read") as stage:
             source = load(request.source)
@@ -297,12 +308,20 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
             field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live or request.editor)
+    values = request.live or request.editor
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, most, values=values)
     with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
         _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
         yield found
         store.remove()
+
+
+def by_regions(request: ConvertRequest) -> bool:
+    """Return whether a request is for so many Gaussians that they are refined region by region."""
+    fit = request.fit
+    other = fit.init != "vbm" or fit.model or fit.device != "cpu" or request.live or request.checkpoint
+    return request.budget() > MANY and fit.steps != 0 and not other
 
 
 def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:

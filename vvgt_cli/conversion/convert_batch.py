@@ -249,11 +249,11 @@ def convert_files(
     for one in [*kinds, *([PAGE] if page else [])]:
         check_options(one, used)
     if is_streamed(output):
-        from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
+        from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
 
         request = replace(request, blocks=request.blocks or automatic(request.source, console))
         if writes_streaming(request):
-            init_in_blocks(request, console)
+            convert_in_batches(request, console)
         return None
     if dry_run:
         return plan_conversion(request, console).text()

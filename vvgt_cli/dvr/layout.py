@@ -106,6 +106,7 @@ class Light(NamedTuple):
 
 # Types of the fields, for `jit.decorators.kernel`.
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1"}
+EXTINCTION: dict[type, str] = {**TUPLES, Voxels: "E"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1 f8:1"}
 GRID: dict[type, str] = {Texels: "f4:4"}
-LIT_GRID: dict[type, str] = {**LIT, **GRID}
+LIT_GRID: dict[type, str] = {**LIT, **EXTINCTION, **GRID}

@@ -35,7 +35,7 @@ from vvgt_cli.dvr.kernel import (
     texel_at,
     values_met,
 )
-from vvgt_cli.dvr.layout import LIT_GRID, Light, Optics, Texels, Voxels
+from vvgt_cli.dvr.layout import LIT, LIT_GRID, Light, Optics, Texels, Voxels
 from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, lane, zeros4
@@ -315,7 +315,8 @@ def _kernel(
 ) -> Callable[P, None]:
     """Make the kernel ``name`` of a ``body``, for arguments of which ``grid`` and ``light`` may be none."""
     types = f"Voxels Optics {grid} u1:3 {light} {more}"
-    return parallel_kernel(types, LIT_GRID, name=name, fastmath=FLAGS, error_model="numpy")(body)
+    tuples = LIT if grid == "none" else LIT_GRID
+    return parallel_kernel(types, tuples, name=name, fastmath=FLAGS, error_model="numpy")(body)
 
 
 render_tiles = _kernel(_tiles, "render_tiles", VIEW, "none", "none")

@@ -16,7 +16,7 @@ from vvgt_cli.look.function import TransferFunctionLike
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 
-RAYS = 4096  # marched at a time: bounds the memory
+SAMPLES = 4096  # evaluated at a time: bounds the memory
 
 
 def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
@@ -135,16 +135,18 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
     count = max(int(np.ceil(length.max() / (step * scene.step.min()))), 1)
     ds = length / count
     color, trans = np.zeros((len(directions), 3)), np.ones(len(directions))
-    for i in range(count):
-        t = first + (i + 0.5) * ds
-        points = (origin + t[:, None] * directions + scene.half) / scene.step - 0.5
+    together = max(SAMPLES // len(directions), 1)  # steps
+    for begin in range(0, count, together):
+        t = first + (np.arange(begin, min(begin + together, count))[:, None] + 0.5) * ds
+        points = ((origin + t[..., None] * directions + scene.half) / scene.step - 0.5).reshape(-1, 3)
         tau, rgb = optics_at(scene, points)
-        alpha = -np.expm1(-tau * ds)
         if scene.light is not None:
-            factor, white = shade(scene, points, directions)
+            factor, white = shade(scene, points, np.tile(directions, (len(t), 1)))
             rgb = np.minimum(factor[:, None] * rgb + white[:, None], 1)
-        color += (trans * alpha)[:, None] * rgb
-        trans = trans * (1 - alpha)
+        alpha = -np.expm1(-tau.reshape(t.shape) * ds)
+        left = np.cumprod([trans, *(1 - alpha)], axis=0)
+        color += ((left[:-1] * alpha)[..., None] * rgb.reshape(*t.shape, 3)).sum(axis=0)
+        trans = left[-1]
     return np.concatenate([color, 1 - trans[:, None]], axis=1)
 
 
@@ -152,6 +154,6 @@ def render_view_reference(scene: Scene, camera: Camera, step: float = 0.125, sam
     """Render (height, width, 4) float64 premultiplied RGBA by ``samples`` x ``samples`` rays in every pixel."""
     origin, directions = rays(camera, samples)
     flat = directions.reshape(-1, 3)
-    parts = [march(scene, origin, flat[i : i + RAYS], step) for i in range(0, len(flat), RAYS)]
+    parts = [march(scene, origin, flat[i : i + SAMPLES], step) for i in range(0, len(flat), SAMPLES)]
     result: np.ndarray = np.concatenate(parts).reshape(camera.height, camera.width, samples**2, 4).mean(axis=2)
     return result

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
-from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES, Optics, Voxels
+from vvgt_cli.dvr.layout import BRICK_BITS, EXTINCTION, TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
@@ -66,7 +66,7 @@ def _transmittance(
     return math.exp(-depth)
 
 
-@parallel_kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", TUPLES, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", EXTINCTION, fastmath=FLAGS, error_model="numpy")
 def mean_transmittance(
     thread: ThreadSlice,
     voxels: Voxels,

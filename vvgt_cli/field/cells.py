@@ -260,10 +260,10 @@ def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[
     try:
         with open(path, "rb") as stream:
             stream.seek(offset * ROW)
-            content = stream.read(count * ROW)
+            read = stream.readinto(content := bytearray(count * ROW))  # writable, as kernels are compiled for
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if len(content) < count * ROW:
+    if read < count * ROW:
         raise DataError(f"{path}: truncated; remove {path.with_suffix('.npz')} and run the same command again")
     split = count * MOMENTS * 8
     moments = np.frombuffer(content, np.float64, count * MOMENTS).reshape(count, MOMENTS)

@@ -19,7 +19,7 @@ from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.layered import NONE, Content, content_of, open_content
 from vvgt_cli.field.runners import InProcess, Processes, Runner
-from vvgt_cli.field.settings import BlockOptions, block_edge
+from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
@@ -109,8 +109,11 @@ def blocked(
         run.console.message(message)
     settings = _settings(request, needs)
     edge = store.kept_edge(settings) if options.size is None else options.size
-    edge = edge or _edge(request, options)
-    with _runner(options) as runner:
+    volume, voxel = _measured(request)
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+    options = replace(options, workers=worker_count(options, volume, needs.gaussians, threads))
+    edge = edge or block_edge(volume, options, voxel)
+    with _runner(options, threads) as runner:
         run_pass = Pass(runner, store, run.console.bar, options.shard)
         if store.open({**settings, "blocks": edge}, ours=options.shard is None):
             run.console.message(f"resuming with the blocks in {store.folder}")
@@ -133,8 +136,8 @@ def blocked(
         yield Blocked(source, reader, run_pass, edge, visible, key, look)
 
 
-def _edge(request: SourceRequest, options: BlockOptions) -> int:
-    """Return the edge of blocks in voxels, by free memory and bytes per voxel."""
+def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
+    """Return the volume, its values still in the file, and bytes per voxel where they are not those of its type."""
     given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
@@ -143,7 +146,7 @@ def _edge(request: SourceRequest, options: BlockOptions) -> int:
         layered |= request.tf is None and (holds_table(content.path) or named_so(volume))
     else:
         volume = content_of(given).volumes[0]
-    return block_edge(volume, options, LAYERED_BYTES if layered else None)
+    return volume, LAYERED_BYTES if layered else None
 
 
 def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple[SourceRequest, str | None]:
@@ -294,13 +297,13 @@ def needs_histogram(request: SourceRequest) -> bool:
     return any(tf is None or tf.of_histogram for tf in functions)
 
 
-def _runner(options: BlockOptions) -> Runner:
-    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+def _runner(options: BlockOptions, threads: int) -> Runner:
+    workers = options.workers or 1
     if options.scheduler is not None:
         from vvgt_cli.field.dask_runner import DaskRunner
 
-        return DaskRunner(options.scheduler, options.workers, threads)
-    return Processes(options.workers, threads) if options.workers > 1 else InProcess()
+        return DaskRunner(options.scheduler, workers, threads)
+    return Processes(workers, threads) if workers > 1 else InProcess()
 
 
 def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:

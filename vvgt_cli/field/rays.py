@@ -171,18 +171,12 @@ def _piece_rays(
     empty = empty_distance(brick_ranges(box.values), box.optics)
     if empty.all():
         return
-    faces = np.stack([
-        np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), np.array(dims, np.float64)
-    ])  # fmt: skip
-    begin = box.begin.astype(np.float64)
-    cast = _caster(box, empty, None if light is None else light._replace(origin=begin))
+    cast = caster(box, empty, lo, hi, dims, light)
     for k, bundle in enumerate(rays.bundles()):
         near = meeting(bundle, lo - 0.5, hi - 0.5)
         if not len(near):
             continue
-        seen = np.zeros((len(near), len(bundle.offsets), 4), np.float32)
-        pixels = bundle.pixels if len(near) == len(bundle.pixels) else bundle.pixels[near]
-        cast(faces, begin, *bundle[:4], pixels, bundle.offsets, seen)
+        seen = cast(bundle, near)
         shown = np.flatnonzero(seen[..., 3])
         if len(shown):
             each, out = len(bundle.offsets), np.empty(len(shown), RAY)
@@ -191,17 +185,44 @@ def _piece_rays(
             yield k, out
 
 
-def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., None]:
-    """Return the kernel for this kind of box and light, with the box's arguments bound."""
+def caster(
+    box: Box, empty: np.ndarray, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
+) -> Callable[[KernelBundle, np.ndarray], np.ndarray]:
+    """Return the function that casts rays through the voxels ``lo`` to ``hi`` (3,) of a volume, and those alone.
+
+    Args:
+        box: these voxels and those around them.
+        empty: `empty_distance` of the box.
+        lo: first voxel.
+        hi: end of the range.
+        dims: voxels of the volume, (x, y, z).
+        light: lighting of the volume, None for none.
+
+    Returns:
+        A function of a bundle and of the indices (n,) of its pixels, which returns what they show, (n, m, 4) float32.
+    """
     from functools import partial
 
     from vvgt_cli.dvr import march
 
+    faces = np.stack([
+        np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), np.array(dims, np.float64)
+    ])  # fmt: skip
+    begin = box.begin.astype(np.float64)
     if box.texels is None:
         kernel = march.cast_segments if light is None else march.cast_lit_segments
     else:
         kernel = march.cast_grid_segments if light is None else march.cast_lit_grid_segments
-    return partial(kernel, box.voxels, box.optics, box.texels, empty, light)
+    lit = None if light is None else light._replace(origin=begin)
+    bound = partial(kernel, box.voxels, box.optics, box.texels, empty, lit, faces, begin)
+
+    def cast(bundle: KernelBundle, which: np.ndarray) -> np.ndarray:
+        seen = np.zeros((len(which), len(bundle.offsets), 4), np.float32)
+        pixels = bundle.pixels if len(which) == len(bundle.pixels) else bundle.pixels[which]
+        bound(*bundle[:4], pixels, bundle.offsets, seen)
+        return seen
+
+    return cast
 
 
 def meeting(cast: KernelBundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:

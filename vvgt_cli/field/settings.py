@@ -17,6 +17,9 @@ LARGEST, SMALLEST = 256, 16  # voxels along the edge of a block; larger ones are
 SHARED = 256  # edge for shards, whatever the memory of their nodes: all must agree
 MAX_FIELD = 1 << 24  # cells of the opacity field
 BLOCK_SHARE = 0.3  # of a worker's memory that a block's voxels may take; a conversion takes as much again
+MUCH, MANY = 1 << 27, 1_000_000  # voxels, or Gaussians, above which several processes are quicker than one
+A_WORKER = 1 << 30  # bytes of memory of a worker
+EACH = 4  # blocks for each worker, so that none waits long for the last
 COUNTED = 3  # extra bytes per voxel of types whose values are counted
 ALWAYS = 300 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
 
@@ -27,14 +30,14 @@ class BlockOptions:
 
     Attributes:
         size: edge of a block in voxels; None chooses it by free memory.
-        workers: number of processes.
+        workers: number of processes; None chooses it by processors, memory and work.
         scheduler: "local", "slurm" or the address of a Dask scheduler; None runs without Dask.
         shard: index (from 1) and count of a job array; None processes all blocks.
         level: resolution level of a multi-resolution file, or "full"; None chooses the one that matches the screen.
     """
 
     size: int | None = None
-    workers: int = 1
+    workers: int | None = None
     scheduler: str | None = None
     shard: tuple[int, int] | None = None
     level: int | str | None = None
@@ -43,6 +46,25 @@ class BlockOptions:
         """Check the block size."""
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):
             raise UsageError(f"--blocks {self.size}: expected auto, or a power of two of at least {SMALLEST}")
+
+
+def worker_count(options: BlockOptions, volume: Volume, gaussians: int, threads: int) -> int:
+    """Return the number of processes: as many as threads where there is much to do and memory for each.
+
+    Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md).
+
+    Args:
+        options: the user's choice.
+        volume: volume to process.
+        gaussians: budget of Gaussians.
+        threads: threads that the process may use.
+    """
+    if options.workers is not None or options.scheduler is not None or options.shard is not None:
+        return options.workers or 1
+    if volume.data.size < MUCH and gaussians <= MANY:
+        return 1
+    free = free_memory()
+    return max(threads if free is None else min(threads, int(free // A_WORKER)), 1)
 
 
 def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) -> int:
@@ -56,9 +78,12 @@ def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) 
     free = free_memory()
     if options.size is not None or free is None or options.shard is not None:
         return options.size or SHARED
-    room = BLOCK_SHARE * max(free - ALWAYS, 0) / max(options.workers if options.scheduler in (None, "local") else 1, 1)
+    workers = (options.workers or 1) if options.scheduler in (None, "local") else 1
+    room = BLOCK_SHARE * max(free - ALWAYS, 0) / workers
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge, voxel) > room:
+        edge //= 2
+    while edge > 1 << TILE_VOXELS and workers > 1 and len(Boxes(volume.dims, shape_of(volume, edge))) < EACH * workers:
         edge //= 2
     whole = max(edge, 1 << TILE_VOXELS)  # whole tiles are integrated at a time
     if block_bytes(volume, whole, voxel) > max(free - ALWAYS, 0):

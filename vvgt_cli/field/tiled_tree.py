@@ -255,13 +255,23 @@ class TiledTree:
             if row < len(self.tiles):
                 yield self._leaves(row, self._tree(self.tiles[row]), which)
             else:
-                assert self.top is not None, "scores come of a top"
-                yield self._leaves(row, self.top, which + len(self.tiles))
+                yield self._over_tiles(which)
 
-    def cuts(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Leaves]]:
+    def leaves_over_tiles(self, threshold: float) -> Leaves | None:
+        """Return the leaves for a threshold that stand for several tiles each; None if there are none."""
+        assert self.top is not None, "there are tiles"
+        above, capped = self._above[len(self.tiles) :], self._capped[len(self.tiles) :]
+        which = np.flatnonzero((above > threshold) & (capped <= threshold))
+        return self._over_tiles(which) if len(which) else None
+
+    def _over_tiles(self, which: np.ndarray) -> Leaves:
+        assert self.top is not None, "scores come of a top"
+        return self._leaves(len(self.tiles), self.top, which + len(self.tiles))
+
+    def cuts(self, thresholds: np.ndarray, begin: int = 0, least: bool = True) -> Iterator[list[Leaves]]:
         """Yield, per tile from ``begin`` on, the leaves for each of its ``thresholds`` (tiles, n).
 
-        There is always at least the tile's own cell.
+        With ``least`` there is always at least the tile's own cell.
         """
         for row, scores in enumerate(self.scores()):
             if row == len(self.tiles):
@@ -269,7 +279,8 @@ class TiledTree:
             if row < begin:
                 continue
             tree, above = self._tree(self.tiles[row]), scores.above.copy()
-            above[-1] = np.inf
+            if least:
+                above[-1] = np.inf
             kept = [(above > value) & ((scores.capped <= value) | ~scores.inner) for value in thresholds[row]]
             yield [self._leaves(row, tree, np.flatnonzero(which)) for which in kept]
 

@@ -54,7 +54,10 @@ def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[J
 
 
 def usual_types(kernel: Any, volume: str) -> tuple[Any, ...]:
-    """Return the numba types that a kernel declares; `V`: read-only values (nz, ny, nx) of type ``volume``."""
+    """Return the numba types that a kernel declares.
+
+    `V` are read-only values (nz, ny, nx) of type ``volume``, `E` of float32.
+    """
     tuples = {kind.__name__: (kind, fields) for kind, fields in kernel.tuples.items()}
     return _types(kernel.usual, tuples, volume)
 
@@ -67,8 +70,9 @@ def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tupl
         if name in tuples:
             kind, fields = tuples[name]
             found.append(numba.types.BaseTuple.from_types(_types(fields, {}, volume), kind))
-        elif name == "V":
-            found.append(numba.types.Array(getattr(numba.types, volume), 3, "C", readonly=True))
+        elif name in ("V", "E"):
+            values = getattr(numba.types, volume if name == "V" else "float32")
+            found.append(numba.types.Array(values, 3, "C", readonly=True))
         else:
             scalar = getattr(numba.types, name)
             found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)

@@ -28,8 +28,8 @@ def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options:
 
     Args:
         usual: types of the arguments as commands pass them: "f4:2 i8" is a C-contiguous float32 array of two axes and
-            an int64, "V" a volume's values, "none" is None. They are compiled ahead (`vvgt_cli.jit.ahead`), other
-            types when they are met.
+            an int64, "V" a volume's values, "E" an extinction, "none" is None. They are compiled ahead
+            (`vvgt_cli.jit.ahead`), other types when they are met.
         tuples: types of the fields of the named tuples whose names ``usual`` holds.
         **options: of ``numba.njit``.
 

@@ -23,6 +23,7 @@ def optimize(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     free: np.ndarray | None = None,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Minimise the difference between pictures of Gaussians and views by gradient descent.
 
@@ -36,13 +37,14 @@ def optimize(
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
         free: (K,) bool, those that move, of the method "frame"; None: all.
+        weights: of each training view, (h, w) weights of its pixels in the loss; None: 1.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.
     """
     from vvgt_cli.refine.loop import run
 
-    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free)
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free, weights)
 
 
 __all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

@@ -37,6 +37,7 @@ def run(
     progress: Progress | None,
     stop: Callable[[], bool] | None,
     free: np.ndarray | None = None,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Run `optimize` without its defaults."""
     _fit("training", cameras, images)
@@ -62,7 +63,8 @@ def run(
             break
         view = next(order)
         share = _share(options, record.steps, course.elapsed)
-        course.error = step(state, cameras[view], images[view], options, course.error, share, course.speed)
+        weight = None if weights is None else weights[view]
+        course.error = step(state, cameras[view], images[view], options, course.error, share, course.speed, weight)
         record.steps += 1
         expected = _expected(options, record.steps, course.elapsed)
         if progress:
@@ -128,10 +130,11 @@ def step(
     error: float | None,
     share: float,
     speed: float,
+    weight: np.ndarray | None = None,
 ) -> float:
     """Forward, loss, backward, update for one view; takes and returns the running RMS error.
 
-    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
+    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``. ``weight`` (h, w): of the pixels.
     """
     if options.device != "cpu":
         there: Any = state  # an `OwnAxesOnDevice`
@@ -150,6 +153,8 @@ def step(
         add_ssim_gradient(image, target, options.ssim, grad)
     if options.texture > 0:
         add_texture_gradient(image, target, options.texture, grad)
+    if weight is not None:
+        grad *= weight[..., None]
     now = math.sqrt(squares.sum() / ((3 + options.alpha) * camera.height * camera.width))
     error = now if error is None else MEMORY * error + (1 - MEMORY) * now
     state.descend(camera, projection, image, grad, error, share, speed)

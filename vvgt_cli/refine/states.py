@@ -137,7 +137,8 @@ class OwnAxes:
         directions, sizes = np.empty((2, len(rows), count), np.float32)
         steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.step, every, directions, sizes)
         few = sizes[:, :: max(count // MEDIAN, 1)]
-        most = np.array([OUTLIER * np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few])
+        medians = [np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few]
+        most = np.array([OUTLIER * median for median in medians], np.float64)
         floors = np.empty(len(rows), np.float32)
         steps.adam_directions(sizes, most, self.weakest, directions, floors)
         if self.shared is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,20 @@ if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
 
 BATCH = 1 << 16  # Gaussians in a batch
-Node = tuple[list["Gaussians"], list[np.ndarray]]  # by level
+
+
+class Node(NamedTuple):
+    """The Gaussians of a tile.
+
+    Attributes:
+        levels: Gaussians of each level, box frame.
+        spreads: `spread_of` the cells of each level.
+        normals: (n, 3) normals of the first level's; None without a light.
+    """
+
+    levels: list[Gaussians]
+    spreads: list[np.ndarray]
+    normals: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -35,24 +48,22 @@ class Cut:
 
     def gaussians(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
         """Yield batches of a threshold's Gaussians, box frame, and of normals (n, 3), None without a light."""
-        from vvgt_cli.closed_form.lit import MEAN, directions
         from vvgt_cli.field.tiled_tree import batches
 
         for leaves in batches(self.tiled_tree.leaves(threshold), BATCH):
-            lit = self._lit(leaves)
-            yield self.make(leaves), None if lit is None else directions(lit[:, MEAN])
+            yield self.make(leaves), self._normals(leaves)
 
-    def nodes(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Node]]:
-        """Yield groups of tiles from ``begin`` on: Gaussians and `spread_of` cells for each of their thresholds.
+    def nodes(self, thresholds: np.ndarray, begin: int = 0, least: bool = True) -> Iterator[list[Node]]:
+        """Yield groups of nodes from ``begin`` on, with a level for each of their ``thresholds`` (tiles, n).
 
         Tiles are made in groups, since the colours of neighbours depend on each other. So ``begin`` is 0, or where a
-        group of an earlier call ended. ``thresholds`` is (tiles, n).
+        group of an earlier call ended. With ``least`` a level of a tile has at least the tile's own cell.
         """
         from vvgt_cli.closed_form.tree import spread_of
         from vvgt_cli.field.tiled_tree import joined
 
         waiting: list[list[Leaves]] = []
-        for row, leaves in enumerate(self.tiled_tree.cuts(thresholds, begin), begin):
+        for row, leaves in enumerate(self.tiled_tree.cuts(thresholds, begin, least), begin):
             waiting.append(leaves)
             if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.tiled_tree.tiles):
                 continue
@@ -61,7 +72,7 @@ class Cut:
             made = []
             for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
                 gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
-                made.append((gaussians, [spread_of(leaves) for leaves in node]))
+                made.append(Node(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
             yield made
             waiting = []
 
@@ -79,6 +90,19 @@ class Cut:
         if not self.plan.labels:
             made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
         return as_stored(made)
+
+    def over_tiles(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
+        """Yield what `gaussians` yields of cells that stand for several tiles each."""
+        leaves = self.tiled_tree.leaves_over_tiles(threshold)
+        if leaves is not None:
+            yield self.make(leaves), self._normals(leaves)
+
+    def _normals(self, leaves: Leaves) -> np.ndarray | None:
+        """Return the normals (n, 3) of cells; None without a light."""
+        from vvgt_cli.closed_form.lit import MEAN, directions
+
+        lit = self._lit(leaves)
+        return None if lit is None else directions(lit[:, MEAN])
 
     def _lit(self, leaves: Leaves) -> np.ndarray | None:
         """Return the columns of light that the pyramid appends to moments; None without a light."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from vvgt_cli.conversion.shards.level_errors import level_errors
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
     from vvgt_cli.field.block_store import BlockStore
+    from vvgt_cli.gaussians import Gaussians
 
 CUTS = 10
 STEP = 4.0  # factor of the score from a cut to the next: a cell's grows as the fourth power of its edge
@@ -95,6 +97,13 @@ class CutErrors:
         return {"errors": relative, "rms": [float(self.errors[row, index]) for index in choice]}
 
 
+def errors_of(nodes: Sequence[Sequence[Gaussians]]) -> dict[str, np.ndarray]:
+    """Return the fields of `CutErrors` of nodes, each with its cuts, the finest first."""
+    squares, energies, pixels = zip(*map(level_errors, nodes), strict=True)
+    counts = [[len(gaussians) for gaussians in cuts] for cuts in nodes]
+    return dict(zip(FIELDS, map(np.array, (counts, squares, energies, pixels)), strict=True))
+
+
 def measure_cuts(cut: Cut, store: BlockStore, kind: str) -> CutErrors:
     """Make and draw `CUTS` cuts of every node; results of an interrupted run in ``store`` are reused.
 
@@ -111,10 +120,7 @@ def measure_cuts(cut: Cut, store: BlockStore, kind: str) -> CutErrors:
     while not store.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
         found.append(store.load(kind, done))
     for nodes in cut.nodes(np.tile(values, (len(tiled_tree.tiles), 1)), done):
-        squares, energies, pixels = zip(*(level_errors(made) for made, _ in nodes), strict=True)
-        counts = [[len(gaussians) for gaussians in made] for made, _ in nodes]
-        arrays = map(np.array, (counts, squares, energies, pixels))
-        some: dict[str, Any] = dict(zip(FIELDS, arrays, strict=True))
+        some: dict[str, Any] = errors_of([node.levels for node in nodes])
         store.save(kind, done, **some)
         found.append(some)
         done += len(nodes)

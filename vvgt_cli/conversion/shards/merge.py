@@ -34,6 +34,7 @@ from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.surface_offset import Opaque
+    from vvgt_cli.conversion.shards.regions import Refiner
     from vvgt_cli.dvr.layout import Light
     from vvgt_cli.field.tiled_tree import Coarse, TiledTree
     from vvgt_cli.gaussians import Gaussians
@@ -41,26 +42,43 @@ if TYPE_CHECKING:
 SCRATCH = "scores"
 
 
-def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool) -> None:
+def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool, refiner: Refiner | None = None) -> None:
     """Cut the pyramid of all blocks for the plan's budget, write the file and fill in the report.
+
+    Args:
+        run: gets the stages.
+        store: complete blocks.
+        output: a `.ply`, the manifest of levels, or a stream.
+        overwrite: replace an existing file.
+        refiner: refines the levels; None leaves the closed form.
 
     Raises:
         DataError: blocks are missing or damaged, or nothing is visible.
         UsageError: the output may not be written.
     """
-    plan = Plan.load(store)
-    report = run.report
+    cut = cut_of(run, store)
+    plan, report = cut.plan, run.report
     report.volume, report.transfer_function = plan.volume, plan.function
     report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
+    if is_streamed(output):
+        write_streamed(run, store, cut, output, overwrite, refiner)
+        return
+    _write_ply(run, store, cut, output, overwrite)
+
+
+def cut_of(run: Run, store: BlockStore) -> Cut:
+    """Return the pyramid of all blocks, ready to be cut.
+
+    Raises:
+        NothingVisible, DataError: see `pyramid`.
+    """
+    plan = Plan.load(store)
     light = load_light(store, plan)
     run.compile(for_degree((*MERGE, *(SHADE if light else ())), plan.degree))
     with run.stage("pyramid") as stage:
         tiled_tree, opaque = pyramid(store, plan, light)
         stage.note = f"{tiled_tree.base} cells in {len(tiled_tree.tiles)} tiles"
-    if is_streamed(output):
-        write_streamed(run, store, Cut(tiled_tree, opaque, plan, light), output, overwrite)
-        return
-    _write_ply(run, store, Cut(tiled_tree, opaque, plan, light), output, overwrite)
+    return Cut(tiled_tree, opaque, plan, light)
 
 
 def _write_ply(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:

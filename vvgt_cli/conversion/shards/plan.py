@@ -51,6 +51,11 @@ class Plan:
     labels: bool = False
     degree: int = 0
 
+    @property
+    def written_degree(self) -> int:
+        """Degree of the harmonics in the file."""
+        return self.degree if self.ply.sh_degree is None else self.ply.sh_degree
+
     def save(self, store: BlockStore, light: Light | None) -> None:
         """Write the light, if any, and then the plan beside the blocks."""
         if light is not None:

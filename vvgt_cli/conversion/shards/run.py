@@ -1,19 +1,28 @@
-"""`vvgt init` in blocks: count, choose the size of cells, integrate, cut, write; at once, or by shards and a merge."""
+"""Conversion to a file in batches: count, choose the size of cells, integrate, cut, refine, write; or by shards."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from vvgt_cli.cameras.sets import RADIUS
 from vvgt_cli.conversion.convert import degree_of, ply_options
+from vvgt_cli.conversion.part_descent import PartDescent
 from vvgt_cli.conversion.place import placement_warnings
+from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.shards.merge import write_merged
+from vvgt_cli.conversion.shards.merge import cut_of, write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
+from vvgt_cli.conversion.shards.regions import Refiner
 from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.conversion.shards.streamed import folder_of
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, thin
+from vvgt_cli.conversion.stages.refinement import HARMONICS
+from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks
@@ -21,13 +30,19 @@ from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.open import FieldNeeds, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import tf_record, volume_record
+from vvgt_cli.field.workload import pace
 from vvgt_cli.files import check_disk_space
+from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
-from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks, for_degree
+from vvgt_cli.gaussians.rules import rule_of
+from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.jit.ahead import DRAW, INIT, OPTIMIZE, RENDER, for_blocks, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
+
+A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
 
 
 def writes_streaming(request: ConvertRequest) -> bool:
@@ -50,17 +65,21 @@ def writes_streaming(request: ConvertRequest) -> bool:
     return options is not None and not other
 
 
-def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Convert a volume to a `.ply` by the closed form, with only blocks of it in memory.
+def convert_in_batches(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Convert a volume to a `.ply` or to levels, with only blocks of it and batches of Gaussians in memory.
 
     With ``shard`` of ``request.blocks`` the output is a folder of blocks for `merge`.
+
+    Args:
+        request: the request.
+        console: destination of messages.
 
     Raises:
         UsageError, DataError: see `vvgt_cli.conversion.convert.initialise_only`; shards with other options.
     """
     options = request.blocks or BlockOptions()
     _check_options(request, options)
-    run = Run(console or Console(), ConversionReport("init"))
+    run = Run(console or Console(), ConversionReport("init" if request.fit.steps == 0 else "convert"))
     if options.shard is not None:
         assert request.output is not None
         _shard(run, request, options, BlockStore(Path(request.output).absolute()))
@@ -69,14 +88,64 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         _written(request.output, request) as outputs,
         claimed(outputs, request.inputs(), request.overwrite),
         store_beside(request.output) as store,
+        _opened(run, request, options, store) as field,
     ):
-        make_blocks(run, request, options, store)
-        write_merged(run, store, request.output or STDOUT, request.overwrite)
+        make_blocks(run, request, field)
+        write_merged(run, store, request.output or STDOUT, request.overwrite, refiner_of(run, request, field))
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
         store.remove()
     return run.report
+
+
+def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> Gaussians:
+    """Return the Gaussians of a volume, box frame, refined region by region.
+
+    Raises:
+        NothingVisible, DataError: see `write_merged`.
+    """
+    budget = request.limits.gaussians(request.fit.max_gaussians, degree_of(request, field.source))
+    request = replace(request, fit=replace(request.fit, max_gaussians=budget))
+    make_blocks(run, request, field)
+    cut = cut_of(run, field.run_pass.store)
+
+    def closed_form(budget: int) -> tuple[float, int, bool]:
+        threshold = cut.tiled_tree.threshold(budget)
+        logits = np.concatenate([made.opacity_logits for made, _ in cut.gaussians(threshold)])
+        return threshold, len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
+
+    with run.stage("closed form") as stage:
+        threshold, removed = thin(cut.plan.budget, closed_form)
+        stage.note = f"{cut.tiled_tree.count(threshold)} Gaussians"
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
+    thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
+    refiner = refiner_of(run, request, field)
+    if refiner is None:
+        return concatenate([made for made, _ in cut.gaussians(threshold)])
+    refined = refiner(run, cut, thresholds, [RADIUS], least=False)
+    parts = [node.levels[0] for nodes in refined.nodes() for node in nodes]
+    return concatenate([*parts, *(made for made, _ in cut.over_tiles(threshold))])
+
+
+def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | None:
+    """Return the refiner of a request's steps, as many as there is time for; None for no steps."""
+    fit, limits = request.fit, request.limits
+    ended = limits.target_psnr is not None or limits.time_budget is not None
+    steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
+    degree = degree_of(request, field.source)
+    if limits.time_budget is not None:
+        each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
+        left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
+        steps = min(steps, max(int(left / each), 0))
+        if steps < FEWEST_STEPS:
+            run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
+            return None
+    if not steps:
+        return None
+    run.compile(for_degree(OPTIMIZE, degree))
+    return Refiner(field, PartDescent(steps, fit.size, rule_of(fit.rule), fit.seed, limits.target_psnr))
 
 
 def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
@@ -118,7 +187,8 @@ def _check_options(request: ConvertRequest, options: BlockOptions) -> None:
 def _shard(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
     """Process the blocks of a shard that can be processed now, and report what remains."""
     try:
-        make_blocks(run, request, options, store)
+        with _opened(run, request, options, store) as field:
+            make_blocks(run, request, field)
     except MissingBlocks as later:
         run.console.message(
             f"{later.what}: this shard is done, {later.missing} blocks of other shards are missing; run the same array "
@@ -128,32 +198,38 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, store: Bloc
         run.console.message(f"all blocks are complete; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def make_blocks(run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore) -> None:
+def _opened(
+    run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore
+) -> AbstractContextManager[Blocked]:
+    budget = request.fit.max_gaussians
+    wanted = FieldNeeds(budget, request.fit.size, request.ply.sh_degree, most_cells(budget))
+    return blocked(run, request.source, options, store, wanted)
+
+
+def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     """Make all blocks, reusing existing ones, and the plan of the file.
 
     Raises:
         MissingBlocks: other shards' blocks are missing.
     """
-    budget, size = request.fit.max_gaussians, request.fit.size
-    wanted = FieldNeeds(budget, size, request.ply.sh_degree, most_cells(budget))
-    with blocked(run, request.source, options, store, wanted) as field:
-        source, ply = field.source, ply_options(request, field.source)
-        for line in placement_warnings(source.volume, ply):
-            run.console.message(line)
-        degree = degree_of(request, source)
-        run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
-        field.views.expect(scored_views(size))
-        cells = field.cells(size, budget, wanted.most)
-        assert cells.rays is not None
-        Plan(
-            cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
-            tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree,
-        ).save(store, cells.light)  # fmt: skip
-        _check_disk(run, field, cells, budget, degree)
-        with run.stage("integrate") as stage:
-            done = field.run_pass(cells, "integrate")
-            workers = field.run_pass.runner.workers
-            stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
+    budget, size, store = request.fit.max_gaussians, request.fit.size, field.run_pass.store
+    source, ply = field.source, ply_options(request, field.source)
+    for line in placement_warnings(source.volume, ply):
+        run.console.message(line)
+    degree = degree_of(request, source)
+    run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
+    field.views.expect(scored_views(size))
+    cells = field.cells(size, budget, most_cells(budget))
+    assert cells.rays is not None
+    Plan(
+        cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
+        tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree,
+    ).save(store, cells.light)  # fmt: skip
+    _check_disk(run, field, cells, budget, degree)
+    with run.stage("integrate") as stage:
+        done = field.run_pass(cells, "integrate")
+        workers = field.run_pass.runner.workers
+        stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
 
 
 def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree: int) -> None:

@@ -32,12 +32,14 @@ from vvgt_cli.score.record import Run, plain
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.cut import Cut
+    from vvgt_cli.conversion.shards.cut import Cut, Node
+    from vvgt_cli.conversion.shards.regions import Refiner
     from vvgt_cli.field.block_store import BlockStore
 
 # Scale of the unit frame. The engine shows level 0 within 5 (`lodBaseDistance`) and level 1 within 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
+NEAREST = 5 / SCALE  # distance in the unit frame up to which level 0 is shown; each further level three times as far
 REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
@@ -56,10 +58,20 @@ def folder_of(output: str) -> Iterator[None]:
                 folder.rmdir()
 
 
-def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool) -> None:
+def write_streamed(
+    run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool, refiner: Refiner | None = None
+) -> None:
     """Write the files and, last, the manifest.
 
-    Progress is recorded in ``store``: errors of groups of nodes, and complete files.
+    Progress is recorded in ``store``: errors of groups of nodes, refined regions, and complete files.
+
+    Args:
+        run: gets the stages.
+        store: blocks of the cut.
+        cut: pyramid to take the levels from.
+        output: path of the manifest.
+        overwrite: replace an existing one.
+        refiner: refines the levels, each at the distance at which it is shown; None leaves the closed form.
 
     Raises:
         UsageError: the frame is not the unit frame.
@@ -73,13 +85,19 @@ def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite
         choices = errors.levels()
         levels = [Level(number) for number in range(len(choices))]
         stage.note = f"{len(levels)} levels of {len(tiled_tree.tiles)} nodes"
+    thresholds = errors.thresholds[np.stack(choices, axis=1)]
+    groups = cut.nodes(thresholds)
+    if refiner is not None:
+        refined = refiner(run, cut, thresholds, [NEAREST * 3 ** (level.number - 0.5) for level in levels])
+        key, groups, errors = refined.key, refined.nodes(), refined.errors()
+        choices = [np.full(len(tiled_tree.tiles), level.number) for level in levels]
     before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
     files = Files(folder, store, f"written-{digest(key, str(folder))[:16]}")
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
-        for some in cut.nodes(errors.thresholds[np.stack(choices, axis=1)]):
-            for made, spreads in some:
+        for some in groups:
+            for node in some:
                 own = [choice[len(nodes)] for choice in choices]
-                nodes.append(_node(cut, files, levels, made, spreads) | errors.facts(len(nodes), own))
+                nodes.append(_node(cut, files, levels, node) | errors.facts(len(nodes), own))
         for level in levels:
             files.write(level)
         facts = [errors.rms(choice) for choice in choices]
@@ -95,16 +113,14 @@ def write_streamed(run: Run, store: BlockStore, cut: Cut, output: str, overwrite
     run.report.gaussians, run.report.bytes = levels[0].gaussians, total
 
 
-def _node(
-    cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
-) -> dict[str, Any]:
+def _node(cut: Cut, files: Files, levels: list[Level], node: Node) -> dict[str, Any]:
     """Add a node to the files, and return its entry in the manifest."""
     axes, options = (
         np.array(cut.plan.axes).reshape(3, 3),
         replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),
     )
     lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
-    for level, gaussians, spread in zip(levels, made, spreads, strict=True):
+    for level, gaussians, spread in zip(levels, node.levels, node.spreads, strict=True):
         splats = _scaled(gaussians, axes, options)
         reach = REACH * np.exp(splats.log_scales.max(axis=1, keepdims=True))
         low = np.minimum(low, (splats.means - reach).min(axis=0))
@@ -114,7 +130,7 @@ def _node(
     return {
         "bound": {"min": low.tolist(), "max": high.tolist()},
         "lods": lods,
-        "spreads": [SCALE * float(np.sqrt(square / weight)) for weight, square in spreads],
+        "spreads": [SCALE * float(np.sqrt(square / weight)) for weight, square in node.spreads],
     }
 
 

@@ -1,0 +1,239 @@
+"""Refinement region by region: pictures of parts, levels and large clouds, and what their bytes depend on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli
+from tests.test_scale import bodies
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.conversion.shards.regions import RegionDescent
+from vvgt_cli.dvr import RenderSettings, render_view
+from vvgt_cli.dvr.render import Box as Frame
+from vvgt_cli.dvr.scene import Scene, kernel_rule
+from vvgt_cli.field.part import Part
+from vvgt_cli.field.reader import Place, Scalars
+from vvgt_cli.field.settings import BlockOptions, worker_count
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.refine import OptimizeOptions, optimize
+from vvgt_cli.splat import render
+from vvgt_cli.volume import ReadOptions
+
+FIT = ("--max-gaussians", "6000", "--size", "150", "--up", "z", "-q")
+STEPS = ("--steps", "24")
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("regions") / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(volume: Path) -> Path:
+    from vvgt_cli.cli.main import run
+
+    out = volume.parent / "out"
+    assert run(["convert", str(volume), *FIT, *STEPS, "--blocks", "64", "-o", str(out / "lod-meta.json")]) == 0
+    return out
+
+
+def files_in(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def moved(camera: Camera, part: Part) -> Camera:
+    """The same camera in the frame of a part."""
+    eye = (camera.position - part.centre) * part.scale
+    return replace(camera, translation=-camera.rotation @ eye)
+
+
+def parts_of(path: Path, light: str | None, *edges: tuple[int, int]) -> tuple[list[Part], Scene]:
+    """Parts between ``edges`` along x, and the scene of the volume."""
+    source = load(SourceRequest(str(path), light=LightOptions(lights=() if light is None else (light,))))
+    scene, dims = source.scene(), source.volume.dims
+    reader = Scalars(Place(str(path), ReadOptions()), kernel_rule(source.volume, lambda: (0, 255)), scene.optics)
+    frame = Frame(scene.half, scene.step)
+    made = [Part(reader, frame, dims, np.array([a, 0, 0]), np.array([b, *dims[1:]]), scene.light) for a, b in edges]
+    return made, scene
+
+
+@pytest.mark.parametrize("light", [None, "headlight"])
+def test_pictures_of_parts_compose_to_that_of_the_volume(volume: Path, light: str | None) -> None:
+    (left, right), scene = parts_of(volume, light, (0, 43), (43, 100))
+    settings = RenderSettings(samples=1)  # one ray: means of products are not products of means
+    for camera in default_views("test", size=90)[:3]:
+        front, back = (left, right) if camera.position[0] < left.centre[0] else (right, left)
+        first, second = (part.view(moved(camera, part), settings) for part in (front, back))
+        if not left.centre[0] < camera.position[0] < right.centre[0]:
+            whole = render_view(scene, camera, settings)
+            assert whole[..., 3].max() > 0.5
+            np.testing.assert_allclose(first + (1 - first[..., 3:]) * second, whole, atol=2e-4)
+
+
+def test_a_part_is_shown_through_what_lies_before_it(volume: Path) -> None:
+    (near, far), _ = parts_of(volume, None, (30, 46), (46, 100))
+    camera = next(c for c in default_views("train", size=60) if c.position[0] < -2)
+    single = RenderSettings(step=1.0, samples=1)
+    before = near.view(moved(camera, near), single)[..., 3]
+    shown = far.shown(moved(camera, far))
+    behind = far.view(moved(camera, far), single)[..., 3] > 0.01
+    assert behind.any()
+    assert before[behind].max() > 0.5
+    apart = np.abs(shown[behind] - (1 - before[behind]))  # bricks of the two begin elsewhere
+    assert apart.max() < 0.06
+    assert apart.mean() < 1e-3
+
+
+def test_a_box_that_nothing_hides_is_shown_whole(volume: Path) -> None:
+    (whole,), _ = parts_of(volume, None, (0, 100))
+    assert (whole.shown(default_views("train", size=64)[0]) == 1).all()
+
+
+def ball(count: int = 200) -> Gaussians:
+    rng = np.random.default_rng(3)
+    turned = np.tile([1.0, 0, 0, 0], (count, 1))
+    return Gaussians(
+        rng.uniform(-0.6, 0.6, (count, 3)), np.full((count, 3), -2.5), turned, np.zeros(count), rng.random((count, 3))
+    )
+
+
+def test_pixels_without_weight_change_nothing() -> None:
+    start, cameras = ball(), default_views("train", size=64)
+    images = np.zeros((len(cameras), 64, 64, 4), np.float32)
+    options = OptimizeOptions(steps=6)
+    same = optimize(start, cameras, images, options)[0]
+    ones = optimize(start, cameras, images, options, weights=[np.ones((64, 64), np.float32)] * len(cameras))[0]
+    none = optimize(start, cameras, images, options, weights=[np.zeros((64, 64), np.float32)] * len(cameras))[0]
+    assert (same.opacity_logits == ones.opacity_logits).all()
+    assert np.abs(same.opacity_logits - start.opacity_logits).max() > 0.05
+    np.testing.assert_allclose(none.opacity_logits, start.opacity_logits, atol=1e-6)
+
+
+def scores(path: Path, *files: Path | str) -> list[float]:
+    """Mean PSNR (dB) of files of one volume in three views that nothing is fitted to."""
+    scene, cameras = load(SourceRequest(str(path))).scene(), default_views("test", size=150)[:3]
+    views = [render_view(scene, camera)[..., :3] for camera in cameras]
+    return [
+        float(np.mean([
+            psnr(view, render(vvgt_cli.read_ply(str(file))[0], camera)[..., :3])
+            for view, camera in zip(views, cameras, strict=True)
+        ]))
+        for file in files
+    ]  # fmt: skip
+
+
+def test_every_level_is_nearer_to_the_volume_than_the_closed_form(vvgt, volume: Path, folder: Path) -> None:
+    closed = volume.parent / "closed"
+    assert vvgt("init", volume, *FIT, "-o", closed / "lod-meta.json").code == 0
+    before, after = (json.loads((place / "lod-meta.json").read_text()) for place in (closed, folder))
+    assert after["counts"] == before["counts"]
+    assert len(after["counts"]) >= 2
+    for level in range(2):
+        old, new = scores(volume, f"{closed}#{level}", f"{folder}#{level}")
+        assert new > old + 1, level
+    for node in after["tree"]["children"]:
+        assert node["errors"][0] == 0 <= node["errors"][1]
+    errors = [node["errors"] for node in after["tree"]["children"]]
+    assert errors != [node["errors"] for node in before["tree"]["children"]]
+
+
+def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
+    for command, more, name in (("convert", ("--steps", "0"), "a"), ("init", (), "b")):
+        assert vvgt(command, volume, *FIT, *more, "-o", tmp_path / name / "lod-meta.json").code == 0
+    assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
+
+
+def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "32")
+    assert vvgt(*line, "--workers", "2").code == 0
+    assert files_in(tmp_path / "out") == files_in(folder)
+
+
+def test_an_interrupted_refinement_goes_on_where_it_ended(
+    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
+    monkeypatch.setattr("vvgt_cli.conversion.shards.regions.ENOUGH", 1)  # the tiles are regions
+    whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
+    assert vvgt(*whole).code == 0
+    call, seen = RegionDescent.__call__, list[int]()
+
+    def stopped(task: RegionDescent, number: int) -> None:
+        seen.append(number)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        call(task, number)
+
+    monkeypatch.setattr(RegionDescent, "__call__", stopped)
+    assert vvgt(*line).code == 130
+    assert not (tmp_path / "out" / "lod-meta.json").exists()
+    assert vvgt(*line).code == 0
+    assert seen.count(seen[0]) == 1  # what was complete is not computed again
+    assert files_in(tmp_path / "out") == files_in(tmp_path / "whole")
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_target_that_is_reached_leaves_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
+    for name, options in (("a", ("--target-psnr", "5")), ("b", ("--steps", "0"))):
+        assert vvgt("convert", volume, *FIT, *options, "-o", tmp_path / name / "lod-meta.json").code == 0
+    manifests = [json.loads((tmp_path / name / "lod-meta.json").read_text()) for name in "ab"]
+    assert manifests[0]["counts"] == manifests[1]["counts"]
+    first, second = (files_in(tmp_path / name) for name in "ab")
+    assert all(first[path] == second[path] for path in first if path.suffix == ".webp")
+
+
+def test_no_time_for_steps_is_said(vvgt, volume: Path, tmp_path: Path) -> None:
+    found = vvgt("convert", volume, *FIT[:-1], "--time-budget", "0.01", "-o", tmp_path / "o" / "lod-meta.json")
+    assert found.code == 0
+    assert "skipped: refinement" in found.err
+
+
+@pytest.mark.parametrize("options", [(), ("--light", "headlight"), ("--blocks", "32")])
+def test_large_clouds_are_refined_by_regions_in_every_format(
+    vvgt, volume: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr("vvgt_cli.conversion.convert.MANY", 5000)
+    light = options if "--light" in options else ()
+    assert vvgt("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply").code == 0
+    found = vvgt("convert", volume, *FIT[:-1], *STEPS, *options, "-o", tmp_path / "a.ply")
+    assert found.code == 0, found.err
+    assert "region by region" in found.err
+    assert len(read_splats(str(tmp_path / "a.ply"))[0]) == len(read_splats(str(tmp_path / "closed.ply"))[0])
+    assert read_splats(str(tmp_path / "a.ply"))[1].certificate is not None
+    if not light:
+        old, new = scores(volume, tmp_path / "closed.ply", tmp_path / "a.ply")
+        assert new > old + 1
+        assert vvgt("convert", volume, *FIT, *STEPS, "-o", tmp_path / "a.spz").code == 0
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_workers_are_as_many_as_threads_memory_and_work_allow(volume: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = load(SourceRequest(str(volume))).volume
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 5 << 30)
+    assert worker_count(BlockOptions(), small, 100_000, 8) == 1
+    assert worker_count(BlockOptions(), small, 2_000_000, 8) == 5
+    assert worker_count(BlockOptions(), small, 2_000_000, 2) == 2
+    assert worker_count(BlockOptions(workers=3), small, 100, 1) == 3
+    assert worker_count(BlockOptions(shard=(1, 2)), small, 2_000_000, 8) == 1
+    large = replace(small, data=np.broadcast_to(np.uint8(0), (1024, 1024, 1024)))
+    assert worker_count(BlockOptions(), large, 100, 4) == 4
+
+
+def test_results_of_another_number_of_steps_are_not_taken(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    line = ("convert", volume, *FIT, "--steps", "8", "-o", out / "lod-meta.json", "--overwrite")
+    assert vvgt(*line).code == 0
+    assert files_in(out) != files_in(folder)
