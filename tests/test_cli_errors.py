@@ -72,6 +72,18 @@ CASES = {
     "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
     "method": ((*CONVERT, "--init", "magic"), 2, "magic"),
     "degree": ((*CONVERT, "--sh-degree", 4), 2, "--sh-degree"),
+    "max-size unit": (
+        (*CONVERT, "--max-size", "5MX"),
+        2,
+        "'5MX' is not a file size; expected a number above 0, with b, kb",
+    ),
+    "max-size": ((*CONVERT, "--max-size", "100B"), 2, "no Gaussian fits"),
+    "time budget": ((*CONVERT, "--time-budget", "0m"), 2, "is not a time"),
+    "an expanded glob": (
+        ("convert", "good.json", "v.raw", "broken.json", "-o", "out.ply"),
+        2,
+        "3 files, good.json to broken.json; expected",
+    ),
     "no directory": (("convert", "v.raw", *RAW, "-o", "no/out.ply"), 2, "no"),
     "suffix": (("convert", "v.raw", *RAW, "-o", "out.splat"), 2, ".ply"),
     "a directory": (("convert", "v.raw", *RAW, "-o", "."), 2, "."),

@@ -31,7 +31,12 @@ def commands():
 
 
 def options(command):
-    return [option for parameter in command.params if isinstance(parameter, click.Option) for option in parameter.opts]
+    return [
+        option
+        for parameter in command.params
+        if isinstance(parameter, click.Option)
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    ]
 
 
 @pytest.mark.parametrize(("page", "command"), list(commands()), ids=lambda value: getattr(value, "name", value))

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -17,6 +21,7 @@ from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import render
@@ -117,7 +122,7 @@ LOOK: dict[str, Any] = {
 }  # fmt: skip
 DRAG = """(() => {
   document.querySelector('#live.folded .fold')?.click();
-  const svg = document.querySelector('#live svg'), node = svg.querySelectorAll('circle')[1].getBoundingClientRect();
+  const svg = document.querySelector('#live svg'), node = svg.querySelectorAll('.node')[1].getBoundingClientRect();
   const at = { clientX: node.x + node.width / 2, clientY: node.y + node.height / 2, bubbles: true, pointerId: 1 };
   svg.setPointerCapture = () => {};
   const fire = (name, y) => svg.dispatchEvent(new PointerEvent(name, { ...at, clientY: y }));
@@ -175,9 +180,55 @@ def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
     assert lit[1] + lit[2] > 0.95 * lit[0]  # the view is oblique: both may cover a pixel
 
 
+def test_the_page_of_a_volume_shows_its_conversion_until_the_function_is_changed(tmp_path: Path) -> None:
+    how = ["example:marschner-lobb:32", "--max-gaussians", "3000", "--size", "200", "--steps", "0", "--quiet"]
+    assert run(["convert", *how, "-o", str(tmp_path / "both.html")]) == 0
+    assert run(["convert", *how, "--no-live", "-o", str(tmp_path / "small.html")]) == 0
+    wanted, _ = shoot((tmp_path / "small.html").as_uri(), tmp_path)
+    url = (tmp_path / "both.html").as_uri()
+    begun, _ = shoot(url, tmp_path)
+    assert psnr(wanted, begun) > 60
+    step = "(() => { const list = document.querySelector('#live .function select'); list.value = 'step';"
+    step += "list.dispatchEvent(new Event('change')) })()"
+    changed, _ = shoot(url, tmp_path, before=step)
+    assert psnr(wanted, changed) < 30
+    undone, _ = shoot(url, tmp_path, before=f"{step}; document.querySelector('#live .undo').click()")
+    assert psnr(wanted, undone) > 60
+
+
+def test_a_page_runs_under_the_policy_it_names_and_else_says_why_not(live: Path, tmp_path: Path) -> None:
+    content = live.with_suffix(".html").read_bytes()
+    with sent_with(content, policy(content.decode())) as url:
+        shot, _ = shoot(url, tmp_path)
+    assert (shot.max(axis=-1) > 0.1).mean() > 0.02
+    with sent_with(content, "default-src 'self'") as url, pytest.raises(AssertionError, match="which does not run"):
+        shoot(url, tmp_path)
+
+
+@contextmanager
+def sent_with(content: bytes, policy: str) -> Iterator[str]:
+    """Address of a page that a server sends with a content security policy."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Security-Policy", policy)
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *said: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
 def test_a_live_page_reports_that_a_browser_has_no_webgl(live: Path, tmp_path: Path) -> None:
     off = "HTMLCanvasElement.prototype.getContext = () => null"
     text = live.with_suffix(".html").read_text("utf-8").replace("<head>", f"<head><script>{off}</script>", 1)
     (tmp_path / "off.html").write_text(text, "utf-8")
-    with pytest.raises(AssertionError, match="it has no WebGL 2"):
+    with pytest.raises(AssertionError, match="WebGL 2 is missing"):
         shoot((tmp_path / "off.html").as_uri(), tmp_path)

@@ -47,6 +47,7 @@ NAMES = {
     "functions": [("bone", "x_bone.ply"), ("skin", "x_skin.ply")],
     "labels": [("label 1", "x_1-label-1.ply"), ("label 2", "x_2-label-2.ply")],
 }
+SHOWN = {"frames": ["t = 1 s", "t = 6 s"]}  # on a page: not the names of files
 FACTS = {
     "frames": {"frame": 2, "time": 6.0, "time_unit": "s"},
     "functions": {"function": "skin.json"},
@@ -72,7 +73,7 @@ def test_what_an_index_says(vvgt, at, kind, blocks):
     assert {key: last[key] for key in FACTS[kind]} == FACTS[kind]
     shown = vvgt("view", "x_index.json", "-o", "page.html")
     assert shown.code == 0, shown.err
-    assert list(clouds(Path("page.html"))) == [name for name, _ in NAMES[kind]]
+    assert list(clouds(Path("page.html"))) == SHOWN.get(kind, [name for name, _ in NAMES[kind]])
     told = vvgt("info", "x_index.json")
     assert told.code == 0, told.err
     assert f"index of {kind}" in told.out.decode()

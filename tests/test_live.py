@@ -70,7 +70,7 @@ def statistics(counts: np.ndarray) -> Statistics:
 
 
 def facts(tf: TransferFunction = RAMP) -> LiveFacts:
-    return LiveFacts(LO, HI, (9, 8, 7), tuple(range(256)), "HU", function_text(tf, LO, HI))
+    return LiveFacts(LO, HI, (9, 8, 7), tuple(range(256)), "HU", function_text(tf, LO, HI), quantity="density")
 
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW])

@@ -138,12 +138,12 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
     assert run([*source, "--quiet", "-o", str(tmp_path / "all.html")]) == 0
     assert run([*source, "--quiet", "-o", str(tmp_path / "f_{}.ply")]) == 0
     wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]
-    shot = after(tmp_path / "all.ply", [{"select": "#series select", "text": "f1.npy"}], tmp_path)
+    shot = after(tmp_path / "all.ply", [{"select": "#series select", "text": "frame 1"}], tmp_path)
     print(f"the second frame: {psnr(wanted[1], shot):.2f} dB, not {psnr(wanted[0], shot):.2f}")
     assert psnr(wanted[1], shot) > max(32, psnr(wanted[0], shot) + 5)
     ramp: Actions = [{"select": "#live select[aria-label=function]", "text": "step"}]
-    other = after(tmp_path / "all.ply", [*ramp, {"select": "#series select", "text": "f1.npy"}], tmp_path)
-    again = after(tmp_path / "all.ply", [{"select": "#series select", "text": "f1.npy"}, *ramp], tmp_path)
+    other = after(tmp_path / "all.ply", [*ramp, {"select": "#series select", "text": "frame 1"}], tmp_path)
+    again = after(tmp_path / "all.ply", [{"select": "#series select", "text": "frame 1"}, *ramp], tmp_path)
     assert psnr(other, again) > 40
     assert psnr(other, shot) < 30
 
@@ -162,7 +162,7 @@ def test_a_frame_of_several_layers_is_shown_in_its_page(tmp_path: Path) -> None:
     off = ("--layer", f"map,labels={tmp_path / 'off.json'}")
     wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]
     hidden = ours(tmp_path / "f_1.ply", tmp_path, *off)
-    second: Actions = [{"select": "#series select", "text": "f1.npy"}]
+    second: Actions = [{"select": "#series select", "text": "frame 1"}]
     shot = after(tmp_path / "all.ply", second, tmp_path)
     print(f"the second frame: {psnr(wanted[1], shot):.2f} dB, not {psnr(wanted[0], shot):.2f}")
     assert psnr(wanted[1], shot) > max(32, psnr(wanted[0], shot) + 5)

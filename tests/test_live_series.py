@@ -47,7 +47,7 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
     content = (tmp_path / "p.html").read_bytes()
     scene = scene_of(content)
     live = scene["live"]
-    assert [frame["name"] for frame in scene["frames"]] == ["f0.npy", "f1.npy", "f2.npy"]
+    assert [frame["name"] for frame in scene["frames"]] == ["frame 0", "frame 1", "frame 2"]
     assert live["held"] == ["values-0", "values-1", "values-2"]
     largest = []
     for k in range(3):

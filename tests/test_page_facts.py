@@ -150,7 +150,7 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
 def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     points = [{"x": 10, "rgb": [1, 0, 0], "opacity": 0}, {"x": 30, "rgb": [1, 0, 0], "opacity": 0.5}]
     points += [{"x": 30, "rgb": [0, 1, 0], "opacity": 1}, {"x": 90, "rgb": [0, 0, 1], "opacity": 1}]
-    text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU")
+    text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU", "density")
     assert text is not None
     stream = io.BytesIO()
     write_ply(stream, one(), PlyOptions(legend=text, date="2026-11-25"))
@@ -160,7 +160,7 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     assert layout_of(header).date is None  # of what is written then
     facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
     found = facts["legend"]
-    assert (found["values"], found["unit"]) == ([0, 60], "HU")
+    assert (found["values"], found["unit"], found["quantity"]) == ([0, 60], "HU", "density")
     assert [(n["x"], n["y"]) for n in found["nodes"]] == [(0, 0), (10, 0), (30, 0.5), (30, 1), (60, 1)]
     np.testing.assert_allclose(found["nodes"][-1]["rgb"], (0, 0.5, 0.5), atol=3e-3)
     for damaged in ("{", "[1]", "3"):
@@ -170,17 +170,17 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     assert world_of(splats_of(one(), PlyOptions(legend=long)), tmp_path)["facts"]["legend"] is None
 
 
-def test_the_error_is_that_of_the_certificate(tmp_path: Path) -> None:
+def test_the_quality_is_that_of_the_certificate(tmp_path: Path) -> None:
     given = Certificate("v", None, "0", 400, "inria", 41.234, 3)
 
     def error(certificate: Certificate) -> Any:
-        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get("error")
+        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get("quality")
 
-    assert error(given) == "41.2 dB on test views of 400 px"
-    assert error(replace(given, live_psnr=33.33)) == "33.3 dB live, on test views of 400 px"
+    assert error(given) == "41.2 dB PSNR on test views of 400 px (higher is better)"
+    assert error(replace(given, live_psnr=33.33)) == "33.3 dB PSNR on test views of 400 px (higher is better)"
     splats = splats_of(one(), PlyOptions(certificate=given))
     broken = tuple(line.replace("41.234", '"41"') for line in splats.comments)
-    assert world_of(replace(splats, comments=broken), tmp_path)["facts"].get("error") is None
+    assert world_of(replace(splats, comments=broken), tmp_path)["facts"].get("quality") is None
 
 
 def test_a_legend_of_labels_names_those_that_are_shown() -> None:

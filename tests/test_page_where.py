@@ -138,14 +138,16 @@ VIEWS = {"A": "y", "P": "Shift+Y", "L": "x", "R": "Shift+X", "S": "z", "I": "Shi
 def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path: Path) -> None:
     """From six sides, and after a drag, of a volume whose index axes are mirrored and oblique."""
     person("open", marked)
-    person("eval", "window.vvgt.where.lens.set({ ...window.vvgt.where.lens.pose(), target: [0, 0, 0] })")
-    middle, gizmo = np.array(person("eval", MIDDLE)), np.array([54, person.size[1] - 106])
+    distance, gizmo = person("eval", "window.vvgt.where.lens.pose().distance"), np.array([54, person.size[1] - 58])
     away: dict[str, np.ndarray] = {}
     for seen_from in [*VIEWS, *([] if person.touch else ["drag"])]:
         if seen_from == "drag":
             person("drag", 600, 600, 700, 560)
         else:
             person("press", VIEWS[seen_from])
+            pose = f"{{ ...window.vvgt.where.lens.pose(), target: [0, 0, 0], distance: {distance} }}"
+            person("eval", f"window.vvgt.where.lens.set({pose})")
+        middle = np.array(person("eval", MIDDLE))
         place, _ = found(person.picture(tmp_path, f"{seen_from}.png"), 0)
         letters = {text: np.array([x, y - 5]) - gizmo for text, x, y in person("eval", LETTERS) if text in "RLAPSI"}
         told = np.zeros(2)
@@ -189,7 +191,7 @@ def test_what_is_seen_is_whole_and_uncovered_at_first_sight(marked: str, person:
     assert shares[2] == pytest.approx(shares[0], abs=0.01)
     assert shares[3] > 0.6
     assert shares[4] == pytest.approx(shares[0], abs=0.01)
-    person("press", "x")
+    person("press", "ArrowLeft")
     away = "window.vvgt.where.lens.pose().distance"
     far, before = person("eval", away), person("eval", MIDDLE)
     person("eval", FOLD)
@@ -212,8 +214,8 @@ def test_the_scale_bar_has_the_length_of_its_label(dots: str, person: Person, tm
     person("open", dots)
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
     away = 3 * max(person.size) / min(person.size)  # both are in the window, whichever way
-    person("eval", f"window.vvgt.where.lens.set({{ ...window.vvgt.where.lens.pose(), distance: {away} }})")
     person("press", "y")
+    person("eval", f"window.vvgt.where.lens.set({{ ...window.vvgt.where.lens.pose(), distance: {away} }})")
     for flat in (False, True):
         if flat:
             person("press", "o")
@@ -263,8 +265,8 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     person("open", marked)
     away = 3 * max(person.size) / min(person.size)  # so far that rays are nearly parallel
     pose = f"{{ ...window.vvgt.where.lens.pose(), target: [0, 0, 0], distance: {away} }}"
-    person("eval", f"window.vvgt.where.lens.set({pose})")
     person("press", "y")
+    person("eval", f"window.vvgt.where.lens.set({pose})")
     mark, _ = found(person.picture(tmp_path, "front.png"), 0)
     assert mark is not None
     person("click", "#tools .measure")
@@ -280,6 +282,63 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     np.testing.assert_allclose(offset[[0, 2]], MARK[[0, 2]], atol=1.5)
     assert 1 < offset[1] - MARK[1] < 6.5  # its face
     assert np.linalg.norm(np.array(on_ball["world"]) - CENTRE) == pytest.approx(16.5, abs=1.5)
+
+
+def test_every_view_fits(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    near = "{ ...window.vvgt.where.lens.pose(), target: [9, 0, 0], distance: 2 }"
+    for key in ("x", "Shift+Z", "f", "r"):
+        person("eval", f"window.vvgt.where.lens.set({near})")
+        person("press", key)
+        assert uncovered(person, person.picture(tmp_path, f"{key}.png")) > 0.5
+
+
+def test_a_click_marks_the_label(person: Person, tmp_path: Path) -> None:
+    z, y, x = np.mgrid[:12, :12, :12] // 6
+    np.save(tmp_path / "map.npy", (1 + x + 2 * y + 4 * z).astype(np.uint8))
+    source = ["convert", str(tmp_path / "map.npy"), "--live", "--labels", "auto", "--max-gaussians", "400"]
+    assert run([*source, "--size", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
+    person("open", (tmp_path / "map.html").as_uri())
+    across, down = person("eval", MIDDLE)
+    person("click", across + 20, down + 20)
+    person("settled")
+    text = person("eval", "document.querySelector('#places').textContent")
+    chosen = person("eval", "[...document.querySelectorAll('#live li.chosen span')].map((row) => row.textContent)")
+    print(f"{person.size}: {text}; {chosen}")
+    assert len(chosen) == 1
+    assert text.endswith(f": {chosen[0]}")
+    assert person("eval", "window.vvgt.where.lens.pose().target") == pytest.approx([0, 0, 0], abs=0.1)  # not moved
+
+
+def test_keys_alone_turn_the_view_and_change_the_function(marked: str, person: Person) -> None:
+    person("open", marked)
+    active = "[document.activeElement.tagName, document.activeElement.getAttribute('class')]"
+    person("press", "Tab")
+    assert person("eval", active)[0] == "CANVAS"
+    yaw = person("eval", "window.vvgt.where.lens.pose().yaw")
+    person("press", "ArrowRight")
+    assert person("eval", "window.vvgt.where.lens.pose().yaw") == pytest.approx(yaw + 5)
+    if person.touch:
+        person("eval", FOLD)
+    reached = []
+    for _ in range(40):
+        person("press", "Tab")
+        reached.append(person("eval", active))
+        if reached[-1][1] == "node chosen":
+            break
+    before = person("eval", "window.vvgt.live.nodes()[0].y")
+    person("press", "ArrowUp")
+    assert person("eval", "window.vvgt.live.nodes()[0].y") > before
+    for _ in range(40):
+        person("press", "Tab")
+        reached.append(person("eval", active))
+    assert ["BUTTON", "help"] in reached
+    person("press", "h")
+    assert "Delete" in person("eval", "document.querySelector('#help').innerText")
+    small = "[...document.querySelectorAll('button, .node, canvas, select, input')]"
+    small += ".map((e) => [e, e.getBoundingClientRect()])"
+    small += ".filter(([, r]) => r.width && Math.min(r.width, r.height) < 24).map(([e]) => e.outerHTML)"
+    assert person("eval", small) == []
 
 
 AXIS = "document.querySelector('#live .axis')"
@@ -322,20 +381,20 @@ def test_a_saved_picture_has_legend_scale_and_letters(marked: str, person: Perso
     person("open", marked)
     person("press", "y")
     page = person.picture(tmp_path, "page.png", bare=False)
-    assert person("save", "#tools .picture", str(tmp_path / "saved.png")) == "marked.png"
+    assert person("save", "#tools .picture", str(tmp_path / "saved.png")) == "volume-60-x-50-x-40.png"
     picture, (wide, high) = read_png(tmp_path / "saved.png")[..., :3], person.size
     assert picture.shape == (high, wide, 3)
-    legend = picture[high - 202 : high - 72, wide - 30 : wide - 12]
+    legend = picture[high - 154 : high - 24, wide - 30 : wide - 12]
     assert found(legend, 0)[1] > 300  # red, and grey below
     assert ((abs(legend - 0.6) < 0.02).all(axis=-1)).sum() > 200
-    assert (picture[high - 78 : high - 66, 108:].min(axis=-1) > 0.9).sum() > 60  # the bar
-    assert (picture[high - 160 : high - 60, :100, 2] > 0.6).sum() > 10  # letters
-    over = np.s_[high - 210 : high - 60, :]  # where the page has nothing but the drawing over the picture
+    assert (picture[high - 30 : high - 18, 108:].min(axis=-1) > 0.9).sum() > 60  # the bar
+    assert (picture[high - 112 : high - 12, :100, 2] > 0.6).sum() > 10  # letters
+    over = np.s_[high - 162 :, : wide - 60]  # where the page has nothing but the drawing over the picture
     assert np.abs(picture[over] - page[over]).mean() < 5e-3
     person("click", "#tools .about")
     person.picture(tmp_path, "about.png", bare=False)
     text = person("eval", "document.querySelector('#about').innerText")
-    for word in ("marked", "live", "marks", "RAS, in mm", "vvgt"):
+    for word in ("volume, 60 x 50 x 40", "function and light can be changed", "marks", "RAS, in mm", "vvgt"):
         assert word in text
 
 
@@ -344,7 +403,7 @@ def test_names_are_text(dots: str, person: Person) -> None:
     person("click", "#tools .about")
     text = person("eval", "document.querySelector('#about').innerText")
     assert "<img src=x onerror=alert(1)>" in text
-    assert "baked" in text
+    assert "fixed" in text
     assert person("eval", "document.querySelectorAll('img').length") == 0
 
 
@@ -388,7 +447,7 @@ def test_a_baked_page_has_legend_error_and_date(person: Person, tmp_path: Path) 
     assert person("eval", "window.vvgt.where.legend") == [0, 20, 40, 60, 80]
     person("click", "#tools .about")
     text = person("eval", "document.querySelector('#about').innerText")
-    assert re.search(r"\d\d\.\d dB on test views of 100 px", text)
+    assert re.search(r"\d\d\.\d dB PSNR on test views of 100 px", text)
     assert re.search(r"1970-01-01, by vvgt", text)  # SOURCE_DATE_EPOCH
     person("open", (tmp_path / "two.html").as_uri())
     assert person("eval", "window.vvgt.where.legend") == [0, 20, 40, 60, 80]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
@@ -56,13 +57,13 @@ def test_a_file_of_several_steps_is_a_page_of_them(vvgt, steps):
     assert done.code == 0, done.err
     assert vvgt("convert", steps / "four.nii", "-o", steps / "f_{}.ply", *how).code == 0
     held = clouds(page)
-    assert list(held) == ["four.nii time 0", "four.nii time 2"]  # the other one shows nothing
-    assert same(held["four.nii time 0"], steps / "f_0.ply")
-    assert same(held["four.nii time 2"], steps / "f_2.ply")
-    assert not same(held["four.nii time 0"], steps / "f_2.ply")
+    assert list(held) == ["frame 0", "frame 2"]  # the other one shows nothing
+    assert same(held["frame 0"], steps / "f_0.ply")
+    assert same(held["frame 2"], steps / "f_2.ply")
+    assert not same(held["frame 0"], steps / "f_2.ply")
     assert "2 clouds" in done.err
     one = vvgt("convert", steps / "four.nii", "--time", "2", "-o", steps / "one.html", *how)
-    assert (one.code, list(clouds(steps / "one.html"))) == (0, ["one"])
+    assert (one.code, list(clouds(steps / "one.html"))) == (0, ["volume, 12 x 12 x 12"])
     again = vvgt("convert", steps / "four.nii", "-o", page, *how)
     assert (again.code, "four.html" in again.error) == (2, True)
     assert vvgt("convert", steps / "four.nii", "-o", page, "--overwrite", "--light", "headlight", *how).code == 0
@@ -72,18 +73,18 @@ def test_a_file_of_several_steps_is_a_page_of_them(vvgt, steps):
 def test_a_glob_of_volumes_is_a_page_and_one_of_slices_a_volume(vvgt, steps):
     done = vvgt("convert", str(steps / "run_*.npy"), "--tf", steps / "tf.json", "-o", steps / "run.html", *HOW)
     assert done.code == 0, done.err
-    assert list(clouds(steps / "run.html")) == ["run_0.npy", "run_1.npy"]
+    assert list(clouds(steps / "run.html")) == ["frame 0", "frame 1"]
     import tifffile
 
     for k in range(6):
         tifffile.imwrite(steps / f"slice_{k}.tif", np.full((8, 9), 40 * k, np.uint8))
     assert vvgt("convert", str(steps / "slice_*.tif"), "-o", steps / "stack.html", *HOW).code == 0
-    assert list(clouds(steps / "stack.html")) == ["stack"]
+    assert list(clouds(steps / "stack.html")) == ["volume, 9 x 8 x 6"]
     for k in range(6):
         tifffile.imwrite(steps / f"color_{k}.tif", np.full((8, 9, 3), 40 * k, np.uint8), photometric="rgb")
     assert vvgt("convert", str(steps / "color_*.tif"), "-o", steps / "color.html", *HOW).code == 0
     assert vvgt("convert", str(steps / "run_0*.npy"), "--tf", steps / "tf.json", "-o", steps / "r.html", *HOW).code == 0
-    assert list(clouds(steps / "r.html")) == ["run_0.npy"]
+    assert list(clouds(steps / "r.html")) == ["frame 0"]
     assert not list(steps.glob(".*"))
 
 
@@ -148,3 +149,55 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
     assert vvgt("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply").code == 0
     done = vvgt("view", "a.ply", "a.ply", "-o", "b.spz")
     assert (done.code, "expected a page (.html), which holds several" in done.error) == (2, True)
+
+
+def held_bytes(page: Path) -> bytes:
+    """A page with everything it holds in base64."""
+    content = page.read_bytes()
+    return content + b"".join(map(base64.b64decode, re.findall(rb'id="(?:splats|live)-\d">([^<]+)<', content)))
+
+
+def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path):
+    x, y, z = np.mgrid[-1:1:14j, -1:1:14j, -1:1:14j]
+    np.save(tmp_path / "Mueller_Hans.npy", np.exp(-3 * (x**2 + y**2 + z**2)))
+    np.save(tmp_path / "Mueller_Eva.npy", np.exp(-3 * (x**2 + 2 * y**2 + z**2)))
+    source = tmp_path / "Mueller_Hans.npy"
+    assert vvgt("convert", source, "-o", tmp_path / "a.ply", *HOW).code == 0
+    done = vvgt("convert", source, "-o", tmp_path / "a.html", *HOW)
+    assert "a.html holds Gaussians, data values, their histogram, a checksum of the volume; its title is" in done.err
+    assert vvgt("view", source, "-o", tmp_path / "b.html").code == 0
+    assert vvgt("convert", tmp_path / "Mueller_*.npy", "-o", tmp_path / "c.html", *HOW).code == 0
+    for name in ("a.ply", "a.html", "b.html", "c.html"):
+        content = held_bytes(tmp_path / name)
+        assert b"Mueller" not in content, name
+        assert b"volume, 14 x 14 x 14" in content, name
+    assert list(clouds(tmp_path / "c.html")) == ["frame 0", "frame 1"]
+    assert vvgt("convert", source, "-o", tmp_path / "d.html", "--title", "Case <17>", *HOW).code == 0
+    assert b"<title>Case &lt;17&gt;</title>" in (tmp_path / "d.html").read_bytes()
+    assert vvgt("view", tmp_path / "a.ply", "--title", "other", "-o", tmp_path / "e.html").code == 0
+    assert b"<title>other</title>" in (tmp_path / "e.html").read_bytes()
+
+
+def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path):
+    values = np.random.default_rng(1).uniform(size=(10, 11, 12)).astype(np.float32)
+    np.save(tmp_path / "v.npy", values)
+    np.save(tmp_path / "rgb.npy", np.stack([values] * 3, axis=-1))
+
+    def scene(name: str, *args: str, code: int = 0) -> dict:
+        done = vvgt("convert", tmp_path / args[0], "-o", tmp_path / name, "--overwrite", *HOW, *args[1:])
+        assert done.code == code, done.err
+        text = (tmp_path / name).read_text("utf-8")
+        assert ("no function editor" in done.err) == ("why" in name)
+        return dict(json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1]))
+
+    both = scene("both.html", "v.npy")
+    assert both["converted"]["held"] == "splats-0"
+    assert both["frames"][0]["held"] == "live-0"
+    assert len(both["live"]["layers"][0]["nodes"]) > 1
+    assert vvgt("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW).code == 0
+    assert same(np.sort(read_splats(tmp_path / "both.html")[0].opacity_logits), tmp_path / "v.ply")
+    assert not {"live", "converted"} & set(scene("no.html", "v.npy", "--no-live"))
+    lit = ("--light", "1,0,0", "--shadows")
+    assert "live" not in scene("why-shadows.html", "v.npy", *lit)
+    assert "live" not in scene("why-time.html", "v.npy", "--time-budget", "5")
+    assert "live" not in scene("why-rgb.html", "rgb.npy", "--component", "color")

@@ -43,11 +43,11 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
         done = subprocess.run(command, capture_output=True, text=True, timeout=2400)
     assert done.returncode == 0, done.stderr
     noted = json.loads(done.stdout.splitlines()[-1])
-    assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == ("live", "live", "live", "")
+    assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == (*["preview"] * 3, "")
     assert noted["better"].startswith("converted, ")
     assert float(noted["better"].split()[1]) > 30
     assert max(noted["moved"]) < 2e-3  # it may still glide
-    assert (noted["cut"], noted["uncut"], noted["changed"]) == ("live", noted["better"], "live")
+    assert (noted["cut"], noted["uncut"], noted["changed"]) == ("preview", noted["better"], "preview")
     assert noted["refused"] == "not now"
     assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]
     function = json.loads((tmp_path / "tf.json").read_text())
@@ -93,5 +93,8 @@ def test_a_result_is_shown_within_a_notebooks_page(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr
     noted = json.loads(done.stdout.splitlines()[-1])
-    assert noted == {"asked": [], "errors": [], "kind": "live", "saved": "tf.json"}
+    wrong, changed = sorted(noted.pop("heard"), key=lambda one: one["vvgt"] == "changed")
+    assert wrong == {"vvgt": "error", "message": "cut.normal: expected 3 numbers"}
+    assert changed == {"vvgt": "changed", "yaw": 90, "at": 0.25, "normal": [0, 0, 1]}
+    assert noted == {"asked": [], "errors": [], "stored": False, "covered": [], "saved": "tf.json"}
     assert (read_png(tmp_path / "a.png")[..., :3].max(axis=-1) > 0.2).mean() > 0.02

@@ -55,6 +55,15 @@ def test_netcdf4_is_hdf5_with_dimension_scales(tmp_path: Path) -> None:
     check_grid(read_volume(path))
 
 
+@pytest.mark.parametrize("name", ["v.nc", "v.h5"])
+def test_values_have_the_name_and_unit_of_their_file(tmp_path: Path, name: str) -> None:
+    path = write_netcdf(tmp_path / name)
+    with netCDF4.Dataset(path, "a") as file:
+        file["field"].setncatts({"units": "K", "long_name": "air temperature"})
+    volume = read_volume(path)
+    assert (volume.quantity, volume.values_in) == ("air temperature", "K")
+
+
 def test_netcdf_descending_axes_are_turned(tmp_path: Path) -> None:
     turned = {"x": X[::-1], "y": Y, "z": Z[::-1]}
     check_grid(read_volume(write_netcdf(tmp_path / "v.nc", axes=turned)))

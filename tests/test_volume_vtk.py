@@ -144,7 +144,10 @@ def test_arrays_by_name(save) -> None:
 def test_active_scalars_are_the_default(save) -> None:
     data = image(a=VALUES.astype("u1"), b=VALUES[::-1].astype("f4"))
     data.GetPointData().SetActiveScalars("b")
-    np.testing.assert_array_equal(read_volume(save(data)).data, VALUES[::-1])
+    with pytest.warns(UserWarning, match=r"array b, its scalars; --array takes another: a"):
+        volume = read_volume(save(data))
+    np.testing.assert_array_equal(volume.data, VALUES[::-1])
+    assert volume.quantity == "b"
 
 
 def test_components(save) -> None:

@@ -1,5 +1,5 @@
 // framed.mjs JOB.json MODULES: a page that holds the page of Gaussians in a frame, as notebooks do, in headless Chromium. JOB:
-// {"browser", "url", "out": .png}; prints {"asked": [other URLs], "errors", "kind": what the frame shows, "saved": name of a file}.
+// {"browser", "url", "out": .png}; prints {"asked": [other URLs], "errors", "heard": what the page sends when a view and something wrong are asked for, "stored": whether the frame has a storage, "covered": buttons under something else, "saved": name of a file}.
 import fs from 'node:fs';
 import path from 'node:path';
 import { createRequire } from 'node:module';
@@ -25,8 +25,21 @@ while (!await frame.evaluate('window.vvgt !== undefined')) {
   await page.waitForTimeout(300);
 }
 await page.waitForTimeout(3000);
-const kind = await frame.evaluate(() => document.querySelector('#live .named i').textContent);
+await page.evaluate(() => {
+  window.heard = [];
+  addEventListener('message', ({ data }) => window.heard.push(data));
+  for (const what of [{ camera: 'left', cut: { kind: 'plane', normal: [0, 0, 2], at: 0.25 } }, { cut: { kind: 'plane', normal: [0, 0] } }]) {
+    document.querySelector('iframe').contentWindow.postMessage({ vvgt: 'set', ...what }, '*');
+  }
+});
+await page.waitForFunction('window.heard.length > 1');
+const heard = await page.evaluate(() => window.heard.map(({ vvgt, camera, cut, message }) => ({ vvgt, yaw: camera?.yaw, at: cut?.at, normal: cut?.normal, message })));
+const stored = await frame.evaluate(() => { try { return Boolean(localStorage); } catch { return false; } });
+const covered = await frame.evaluate(() => [...document.querySelectorAll('button')].filter((button) => {
+  const { x, y, width, height } = button.getBoundingClientRect(), over = document.elementFromPoint(x + width / 2, y + height / 2);
+  return width && over !== button && !button.contains(over);
+}).map((button) => button.title));
 const [file] = await Promise.all([page.waitForEvent('download'), frame.click('#live .save button:text-is("tf.json")')]);
 await page.screenshot({ path: job.out });
-console.log(JSON.stringify({ asked, errors, kind, saved: file.suggestedFilename() }));
+console.log(JSON.stringify({ asked, errors, heard, stored, covered, saved: file.suggestedFilename() }));
 await browser.close();

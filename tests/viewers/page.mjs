@@ -62,7 +62,7 @@ const shoot = async ({ camera, frame }) => {
     camera ?? { ...JSON.parse(document.getElementById('scene').textContent).camera, up: [0, 1, 0] };
   const { lens } = window.vvgt.where ?? {}, away = position.map((x, k) => x - target[k]), distance = Math.hypot(...away);
   lens?.set({ ...lens.pose(), target, distance });  // a light at the eye is where the page's own camera is
-  lens?.look(away.map((x) => x / distance), up);
+  if (lens) lens.set({ ...lens.pose(), ...lens.toward(away.map((x) => x / distance), up) });
   app.on('update', () => {  // after the viewer's own, which may still be on its way
     entity.setPosition(...position);
     entity.lookAt(...target, ...up);
@@ -71,7 +71,7 @@ const shoot = async ({ camera, frame }) => {
     entity.translateLocal(shift, 0, 0);
   });
   if (frame !== null) await show(frame);
-  document.querySelectorAll('.sse-ui, #series, #live').forEach((element) => { element.style.display = 'none'; });
+  document.querySelectorAll('#series, #live').forEach((element) => { element.style.display = 'none'; });
   return settled((by) => { shift = by; }, () => new Promise((done) => {
     app.renderNextFrame = true;
     app.once('frameend', () => done(canvas.toDataURL('image/png')));

@@ -27,7 +27,7 @@ const place = () => page.evaluate(() => {
 });
 const grasp = async (k) => {
   const box = await page.evaluate((n) => {
-    const { x, y, width: w, height: h } = document.querySelectorAll('#live circle')[n].getBoundingClientRect();
+    const { x, y, width: w, height: h } = document.querySelectorAll('#live .node')[n].getBoundingClientRect();
     return [x + w / 2, y + h / 2];
   }, k);
   await page.mouse.move(...box);

@@ -38,7 +38,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #about, .sse-ui { opacity: 0 !important; transition: none !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
   refused: async (url) => {

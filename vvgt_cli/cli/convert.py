@@ -16,6 +16,7 @@ from vvgt_cli.cli.options import (
     overwrite_option,
     placed_read_options,
     tfs_options,
+    title_option,
 )
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import ASIDE, command_line
@@ -37,6 +38,7 @@ from vvgt_cli.progress import Console
     "--preview", metavar="P.png", help="Save volume, splats and difference side by side, in three test views."
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
+@title_option
 @overwrite_option
 @rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
@@ -45,8 +47,9 @@ from vvgt_cli.progress import Console
     "time budget.",
 )  # fmt: skip
 @click.option(
-    "--live", is_flag=True,
-    help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function.",
+    "--live/--no-live", default=None,
+    help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function. By default, a "
+    "page (.html) of one volume holds this form as well, for its editor of the function; --no-live omits it.",
 )  # fmt: skip
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @ply_options
@@ -65,8 +68,8 @@ from vvgt_cli.progress import Console
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool, console: Console,
-    blocks: dict[str, Any], **options: Any,
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool | None, title: str | None,
+    console: Console, blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
@@ -100,11 +103,16 @@ def command(
     """
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.gaussian_files import is_page
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
     line = command_line(click.get_current_context(), ASIDE, folders=False)
-    request = replace(convert_request(volume, **options), blocks=block_options_of(blocks), live=live, command=line)
+    request = convert_request(volume, **options)
+    editor = live is None and is_page(request.output)
+    request = replace(
+        request, blocks=block_options_of(blocks), live=bool(live), editor=editor, command=line, title=title
+    )  # fmt: skip
     plan = convert_files(
         request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console
     )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.options import group
+from vvgt_cli.cli.options import MEGABYTES, SECONDS, Measure, group
 from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
 
 if TYPE_CHECKING:
@@ -51,12 +51,12 @@ limit_options = group(
         help="Stop at this PSNR, skipping stages and Gaussians that are not needed for it.",
     ),
     time_budget=click.option(
-        "--time-budget", type=float, metavar="SECONDS",
-        help="Time for the whole run; stages that do not fit are skipped.",
+        "--time-budget", type=Measure("time", SECONDS), metavar="TIME",
+        help="Time for the whole run, such as 90, 10m or 1h; stages that do not fit are skipped.",
     ),
     max_megabytes=click.option(
-        "--max-size", "max_megabytes", type=float, metavar="MB",
-        help="Maximum file size in 10^6 bytes; reduces the number of Gaussians.",
+        "--max-size", "max_megabytes", type=Measure("file size", MEGABYTES), metavar="MB",
+        help="Maximum file size in 10^6 bytes, also as 5MB or 800kB; reduces the number of Gaussians.",
     ),
 )  # fmt: skip
 

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, device_option, overwrite_option
+from vvgt_cli.cli.options import SECONDS, Measure, common_options, device_option, overwrite_option
 from vvgt_cli.progress import Console
 
 
@@ -19,8 +19,8 @@ from vvgt_cli.progress import Console
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N", help="Maximum number of steps, one view each."
 )
 @click.option(
-    "--time-budget", type=click.FloatRange(0, min_open=True), metavar="SECONDS",
-    help="Time for the descent, instead of --steps.",
+    "--time-budget", type=Measure("time", SECONDS), metavar="TIME",
+    help="Time for the descent, such as 90 or 10m, instead of --steps.",
 )  # fmt: skip
 @click.option(
     "--target-psnr", type=click.FloatRange(0, 150), metavar="DB", help="Stop when the check views reach this PSNR."

@@ -8,6 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import click
@@ -113,7 +114,10 @@ LABELS = dict(
     ),
 )  # fmt: skip
 
-TF_HELP = "Transfer function: a file or the name of a matplotlib colour map. Default: made from the data."
+TF_HELP = (
+    "Transfer function: a file, a preset such as ct-bone ('vvgt tf list' shows all), or the name of a matplotlib "
+    "colour map. Default: made from the data."
+)
 tf_options = group(
     "optics",
     tf=click.option("--tf", metavar="TF", help=TF_HELP),
@@ -160,6 +164,37 @@ light_options = group(
         "--ambient-occlusion", "occlusion", type=float, is_flag=False, flag_value=0.1, metavar="[RADIUS]",
         help="Darken crevices within RADIUS, where the volume's longest edge is 2. RADIUS is 0.1 if omitted.",
     ),
+)  # fmt: skip
+
+SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+MEGABYTES = {"": 1.0, "b": 1e-6, "kb": 1e-3, "mb": 1.0, "gb": 1e3}
+
+
+class Measure(click.ParamType[float]):
+    """A number with an optional unit, converted to the first one of ``units``."""
+
+    def __init__(self, name: str, units: dict[str, float]) -> None:
+        """Take the name of the quantity and the factor of each unit."""
+        self.name, self.units = name, units
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number.
+
+        Raises:
+            click.BadParameter: not a number, or an unknown unit.
+        """
+        found, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
+        with suppress(ValueError, TypeError, KeyError):
+            number = float(found[1]) * self.units[found[2]]  # type: ignore[index]  # None: TypeError
+        if not number > 0:
+            units = ", ".join(filter(None, self.units))
+            self.fail(f"{value!r} is not a {self.name}; expected a number above 0, with {units} or no unit")
+        return number
+
+
+title_option = click.option(
+    "--title", metavar="TEXT",
+    help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
 )  # fmt: skip
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import click
 
 SECTIONS = {  # parameters by name, in the order shown; all others come first, under "Options"
@@ -15,6 +17,25 @@ SECTIONS = {  # parameters by name, in the order shown; all others come first, u
 
 class SectionedCommand(click.Command):
     """A command whose ``--help`` lists its options under the headings of `SECTIONS`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; where there are more files than expected, say how a series is given.
+
+        Raises:
+            click.UsageError: invalid arguments.
+        """
+        given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            files = [word for word in given if os.path.exists(word)]
+            if "unexpected extra argument" not in error.message or len(files) < 2:
+                raise
+            raise click.UsageError(
+                f"{len(files)} files, {files[0]} to {files[-1]}; expected one: for a series, quote the pattern so that "
+                "the shell does not expand it, as 'run_*.vti'",
+                ctx,
+            ) from None
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options under their headings."""

@@ -14,7 +14,8 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("threads", "memory", "workers", "scheduler", "block_size"),
 }
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
-_LAYER_FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
+_SETTINGS = re.compile(r",(?=[a-z]+=)")  # of a layer, FILE,tf=TF (`vvgt_cli.field.source.parse_layer`)
+_LAYER_FOLDERS = re.compile(r"(?<==)[^=]*/(?=[^/])")  # before the name in tf=TF
 _SHARD = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
@@ -29,13 +30,14 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     Args:
         ctx: context of the call.
         without: names of parameters to omit.
-        folders: whether paths keep their folders.
+        folders: whether paths keep their folders, and volumes their names, which may be a patient's.
     """
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):
         value = ctx.params.get(parameter.name or "")
-        before = None if folders else _LAYER_FOLDERS if parameter.name == "layers" else _FOLDERS
-        values = [_without_folders(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
+        values = [str(v) for v in (value if isinstance(value, tuple) else [value])]
+        if not folders:
+            values = [_anonymous(parameter.name or "", v) for v in values]
         if parameter.name in without:
             continue
         if isinstance(parameter, click.Argument):
@@ -47,5 +49,11 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     return shlex.join(words)
 
 
-def _without_folders(value: str, folders: re.Pattern[str] | None) -> str:
-    return value if folders is None or _SHARD.fullmatch(value) else folders.sub("", value)
+def _anonymous(name: str, value: str) -> str:
+    """Return the value of a parameter without folders and without names of volumes, examples excepted."""
+    if name == "volume":
+        return value if value.startswith("example:") else "VOLUME"
+    if name == "layers":
+        file, *rest = _SETTINGS.split(value)
+        return ",".join([file if file.startswith("example:") else "LAYER", *(_LAYER_FOLDERS.sub("", x) for x in rest)])
+    return value if _SHARD.fullmatch(value) else _FOLDERS.sub("", value)

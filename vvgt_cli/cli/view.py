@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options, title_option
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -28,6 +28,11 @@ from vvgt_cli.progress import Console
     flag_value=False,
     help="Print the address without opening a browser.",
 )
+@click.option(
+    "--no-live", "live", is_flag=True, default=True, flag_value=False,
+    help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
+)  # fmt: skip
+@title_option
 @tf_options
 @placed_read_options
 @overwrite_option
@@ -37,6 +42,8 @@ def command(
     output: str | None,
     port: int | None,
     browser: bool,
+    live: bool,
+    title: str | None,
     read: dict[str, Any],
     optics: dict[str, Any],
     overwrite: bool,
@@ -71,6 +78,8 @@ def command(
 
     if output is not None and (port is not None or not browser):
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
+    if not live and output is None:
+        raise UsageError("--no-live is for a page that is saved; give -o OUT.html, or omit it")
     source = source_request(files[0], read, optics)
-    request = ViewRequest(files, source, output, port or 0, browser, overwrite)
+    request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, title)
     view(request, lambda url: click.echo(url), console)

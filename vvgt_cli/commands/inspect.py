@@ -20,6 +20,7 @@ from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply, write_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
+from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
@@ -78,8 +79,14 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         head = stream.read(_HEAD)
     known = format_of(name)
     if head.startswith(_PLY) or known:
-        facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}
-        return facts | ({"bytes": path.stat().st_size, "format": known.suffix} if known else {})
+        gaussians, header = read_splats(file)
+        facts = {"kind": "gaussians", "name": name.name, **describe(gaussians, header)}
+        if known is None:
+            return facts
+        size = path.stat().st_size
+        more = {"policy": policy(path.read_text("utf-8"))} if known.suffix == ".html" else {}
+        stated = {"bytes": size, "bytes_per_gaussian": round(size / len(gaussians), 1), "format": known.suffix}
+        return facts | stated | more
     if is_index(name):
         index = read_index(name)
         about: dict[str, Any] = {key: index[key] for key in ("volume", "table") if key in index}

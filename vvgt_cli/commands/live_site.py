@@ -72,10 +72,12 @@ class Cloud:
         """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str) -> Resource:
-        """Return the file to save, in the format of an ending."""
+    def file(self, suffix: str, live: Cloud | None = None) -> Resource:
+        """Return the file to save, in the format of an ending; ``live`` is the form for the editor of a page."""
+        editor = None if live is None or not live.live else (live.gaussians, live.options)
         if (other := format_of(f"x.{suffix}")) is not None:
-            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, f"{self.name}.{suffix}"))
+            name = f"{self.name}.{suffix}"
+            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, editor))
         if self.ply is not None:
             return Resource(BYTES, lambda: self.ply or b"")
         stream = io.BytesIO()
@@ -313,6 +315,8 @@ class PageController:
     def save(self, sent: Any) -> Resource:
         """Return a file of what is shown: a conversion by its number, else the first cloud under the look that is sent.
 
+        A page of a conversion holds that as well, for its function editor.
+
         Raises:
             DataError: an invalid request, or a conversion that was replaced.
         """
@@ -325,14 +329,20 @@ class PageController:
         if number is not None and (better is None or number != self.state["number"]):
             raise DataError("that conversion was replaced by another; try again")
         assert self.first is not None
-        cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
+        cloud = self.first()
         if sent.get("function") is not None and cloud.live:
             cloud = cloud.with_function(parse_function(sent["function"]), sent.get("light"))
         if sent.get("labels") is not None and cloud.live:
             cloud = cloud.with_labels(sent["labels"], sent.get("light"))
         if sent.get("layers") is not None and cloud.live:
             cloud = cloud.with_layers(sent["layers"], sent.get("light"))
-        return cloud.file(sent["file"])
+        if number is None or better is None:
+            return cloud.file(sent["file"])
+        conversion = Cloud.of(better, self.name)
+        if not {"function", "labels"} & set(sent):
+            return conversion.file(sent["file"])
+        options = replace(cloud.options, certificate=conversion.options.certificate)
+        return conversion.file(sent["file"], replace(cloud, options=options))
 
     def on_message(self, number: int, message: Message) -> None:
         """Handle a message of the converter, on its thread."""

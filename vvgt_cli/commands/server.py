@@ -18,16 +18,14 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.gaussians.formats.page_file import policy, waiting_page
 
 ADDRESS = "127.0.0.1"
 MOST = 1 << 20  # bytes of what a page may send: a function of 4096 nodes has 400 KB
 NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
-_PANELS = "sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I="  # event.stopPropagation(), in the viewer's elements
 _HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; "
-    f"script-src 'self' 'unsafe-hashes' '{_PANELS}' blob:; worker-src blob:; "
-    "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:; frame-ancestors 'none'",
+    "Content-Security-Policy": policy(waiting_page("", ""), "'self'") + "; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",

@@ -24,6 +24,7 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
+from vvgt_cli.gaussians.formats.page_live import LiveForm
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, claimed
@@ -48,6 +49,8 @@ class ViewRequest:
         port: of the server; 0 takes a free one.
         browser: open one, if there is a display.
         overwrite: replace the file if it exists.
+        live: let a page of a volume have a function editor.
+        title: title of the page; None: the file's own.
     """
 
     files: tuple[str, ...]
@@ -56,6 +59,8 @@ class ViewRequest:
     port: int = 0
     browser: bool = True
     overwrite: bool = False
+    live: bool = True
+    title: str | None = None
 
 
 def view(request: ViewRequest, announce: Callable[[str], None], console: Console | None = None) -> None:
@@ -81,8 +86,8 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         return
     file = clouds[0][1]
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
-        gaussians, options = _opened(run, request, file)
-        write_gaussians(run, request.output, gaussians, options, request.overwrite)
+        gaussians, options, editor = _opened(run, request, file)
+        write_gaussians(run, request.output, gaussians, options, request.overwrite, editor=editor)
         run.compile(for_degree(DRAW, gaussians.degree))
         report_agreement(run, request.output, gaussians, options)
 
@@ -152,18 +157,22 @@ def expanded(names: Sequence[str]) -> list[str]:
     return files
 
 
-def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions]:
-    """Return Gaussians in the unit frame and how to write them; a volume is converted."""
+def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, LiveForm | None]:
+    """Return Gaussians in the unit frame, how to write them, and the live form for a page; a volume is converted."""
     given = request.source
     if name == STDIN or is_splats(name):
         _refuse_reading(given, name)
         gaussians, header = open_gaussians(name)
-        return gaussians, layout_of(header)
+        options = layout_of(header)
+        return gaussians, replace(options, title=request.title or options.title), None
     from vvgt_cli.conversion.convert import convert_in_memory
     from vvgt_cli.conversion.request import ConvertRequest
 
-    conversion = convert_in_memory(ConvertRequest(replace(given, volume=name)), run.console)
-    return conversion.gaussians, conversion.ply
+    editor = request.live and is_page(request.output)
+    conversion = convert_in_memory(
+        ConvertRequest(replace(given, volume=name), editor=editor, title=request.title), run.console
+    )
+    return conversion.gaussians, conversion.ply, conversion.live_form(run) if editor else None
 
 
 def _serve(
@@ -211,7 +220,7 @@ def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
         return stored(gaussians, layout_of(header))
 
     first, frames = content(0), [{"name": name, "file": f"{k}.ply"} for k, (name, _) in enumerate(clouds)]
-    text = page(f"{clouds[0][0]} - vvgt", columns_of(first, clouds[0][1]), frames, SCRIPT)
+    text = page(clouds[0][0], columns_of(first, clouds[0][1]), frames, SCRIPT)
     resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
     return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
 

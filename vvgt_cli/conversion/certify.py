@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ def with_certificate(
     if not ply.comments or scores is None:
         return ply
     found = Certificate(
-        volume=PurePath(field.source.volume.name).name,
+        volume=ply.title or field.source.title,
         sha256=field.digest(),
         look=field.source.shown_as(),
         size=fit.size,

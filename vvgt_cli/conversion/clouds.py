@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.gaussian_files import is_page
-from vvgt_cli.conversion.index import entry, index_of, index_output, is_pattern, psnr_of, put_name, write_index
+from vvgt_cli.conversion.index import (
+    entry,
+    index_of,
+    index_output,
+    is_pattern,
+    psnr_of,
+    put_name,
+    shown_name,
+    write_index,
+)
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
@@ -37,6 +46,10 @@ class Cloud(Result):
     stem: str
     facts: dict[str, Any]
     directions: np.ndarray | None
+
+    def shown_name(self) -> str:
+        """Return the name in the list of a page."""
+        return shown_name(self.name, self.facts)
 
     def normals(self) -> np.ndarray | None:
         """Implement `Result.normals`."""
@@ -140,13 +153,13 @@ class Clouds(Mapping[str, Result]):
         """Return one page of all clouds."""
         from vvgt_cli.gaussians.formats.page_live import page_of_several
 
-        return page_of_several([(cloud.name, cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
+        return page_of_several([(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
 
     def _repr_html_(self) -> str | None:
         """Return the page for a notebook; None where a library is missing."""
         from vvgt_cli.gaussians.formats.page_file import iframe
 
         try:
-            return iframe(self._html(self.volume), self.volume)
+            return iframe(self._html(self.kind), self.kind)
         except DataError:
             return None

@@ -6,12 +6,13 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.file_layout import degree_of, harmonics_warning, ply_options
-from vvgt_cli.conversion.gaussian_files import write_gaussians
-from vvgt_cli.conversion.live import check_live, convert_live
+from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+from vvgt_cli.conversion.live import check_live, convert_live, editor_form
 from vvgt_cli.conversion.place import placement_warnings, to_unit_frame
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import report_format_cost
@@ -273,8 +274,9 @@ def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Co
     """Return a conversion without scores."""
     source = work.field.source
     return Conversion(
-        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field
-    )
+        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field,
+        partial(editor_form, request),
+    )  # fmt: skip
 
 
 @contextmanager
@@ -304,7 +306,8 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
             field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, most, values=request.live)
+    values = request.live or request.editor
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, most, values=values)
     with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
         _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
@@ -359,7 +362,8 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     assert request.output is not None
     if conversion.ply.certificate is not None or not written:
         file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
-        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage)
+        editor = conversion.live_form(run) if request.editor and is_page(request.output) else None
+        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, editor=editor)
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

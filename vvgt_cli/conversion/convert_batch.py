@@ -33,6 +33,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.open import automatic
 from vvgt_cli.files import claim
+from vvgt_cli.gaussians.formats.page_live import contents
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import check_outputs, claimed
 from vvgt_cli.progress import Console
@@ -267,6 +268,7 @@ def convert_files(
         kind, page = FRAMES, True
         check_options(PAGE, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
+    request = replace(request, editor=request.editor and not page)
     looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
     batch = _batch(kind, request, looks, share, page)
     if page:
@@ -290,6 +292,7 @@ def _save_page(batch: Batch, request: ConvertRequest, output: str, console: Cons
         with run.stage("write") as stage:
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
+        run.console.message(contents(clouds.clouds[0].ply, output, [cloud.shown_name() for cloud in clouds.clouds]))
         run.finish()
 
 

@@ -44,8 +44,15 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         function=source.name if len(source.layers) > 1 else source.tf.name,
         optics=source.optics(),
         legend=_legend(source),
+        title=request.title or _example(request) or source.title,
     )
     return with_place(ply, source.volume)
+
+
+def _example(request: ConvertRequest) -> str | None:
+    """Return the name of a volume that comes with the program."""
+    volume = request.source.volume
+    return volume.split(":")[1] if isinstance(volume, str) and volume.startswith("example:") else None
 
 
 def _legend(source: Source) -> str | None:
@@ -55,4 +62,4 @@ def _legend(source: Source) -> str | None:
     labelled, volume = isinstance(source.tf, LabelTable), source.volume
     numbers = None if labelled else source.statistics
     lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
-    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
+    return legend_text(source.tf, lo, hi, volume.values_in, volume.quantity)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -116,14 +116,22 @@ def read_index(path: str | Path) -> dict[str, Any]:
     return index
 
 
+def shown_name(name: str, facts: Mapping[str, Any]) -> str:
+    """Return the name of a cloud in the list of a page: of a frame, whose own name is a file's, its time or number."""
+    if "frame" not in facts:
+        return name
+    time = facts.get("time")
+    return f"frame {facts['frame']}" if time is None else f"t = {time:g} {facts.get('time_unit', '')}".rstrip()
+
+
 def files_of(path: str | Path) -> list[tuple[str, str]]:
-    """List the name and file of each cloud of an index.
+    """List the name on a page and the file of each cloud of an index.
 
     Raises:
         DataError: see `read_index`; a file is missing.
     """
     folder = Path(path).parent
-    found = [(row["name"], folder / row["file"]) for row in read_index(path)["files"]]
+    found = [(shown_name(row["name"], row), folder / row["file"]) for row in read_index(path)["files"]]
     if gone := [file for _, file in found if not file.is_file()]:
         raise DataError(f"{path}: its file {gone[0]} is missing; run the conversion again")
     return [(name, str(file)) for name, file in found]

@@ -200,11 +200,11 @@ def _options(
     """Return the layout of a file of a look."""
     from vvgt_cli.conversion.gaussian_files import layout_of
 
-    old = header if isinstance(header, PlyOptions) else layout_of(header)
+    old, live = header if isinstance(header, PlyOptions) else layout_of(header), header.live
     return replace(
         old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
         sh_degree=None, function=shown.name, optics=None,
-        legend=legend_text(shown, header.live.lo, header.live.hi, header.live.unit) if header.live else None,
+        legend=None if live is None else legend_text(shown, live.lo, live.hi, live.unit, live.quantity),
     )  # fmt: skip
 
 

@@ -111,7 +111,9 @@ class ConvertRequest:
         checkpoint: folder for the results of stages until the output is written; None for none.
         blocks: how the volume is processed in blocks; None: blocks only where the volume is large.
         live: let the Gaussians carry values, so that they can be shown under any function (docs/live.md).
+        editor: a page also holds the live form, so that its function can be changed.
         command: command line that the file records; None from Python.
+        title: title of pages; None: kind and size of the volume, or the name of an example.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
     """
 
@@ -126,8 +128,10 @@ class ConvertRequest:
     overwrite: bool = False
     checkpoint: str | None = None
     live: bool = False
+    editor: bool = False
     all_views: bool = False
     command: str | None = None
+    title: str | None = None
     blocks: BlockOptions | None = None
 
     def budget(self) -> int:

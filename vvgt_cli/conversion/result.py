@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -22,11 +22,13 @@ from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
 from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.score.record import ConversionReport, StageRecord
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run, StageRecord
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
+    from vvgt_cli.gaussians.formats.page_live import LiveForm
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
@@ -71,6 +73,7 @@ class Result:
         up: str | None = None,
         sh_degree: int | None = None,
         comments: bool | None = None,
+        editor: bool = True,
         overwrite: bool = True,
     ) -> int:
         """Write a standard ``.ply``, or another format by the ending of the name, atomically.
@@ -82,6 +85,7 @@ class Result:
                 unit frame of an anatomical space); None with another frame: "auto".
             sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
             comments: describe the file in its header.
+            editor: a page of a conversion also holds the live form, so that its function can be changed.
             overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:
@@ -110,7 +114,8 @@ class Result:
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path)))
+            live = self.live_form() if known.suffix == ".html" and editor and ply.comments else None
+            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), live))
 
     def recolor(
         self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
@@ -140,13 +145,20 @@ class Result:
         found = apply_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
+    def live_form(self, run: Run | None = None) -> LiveForm | None:
+        """Return Gaussians that carry values under the same look, with their layout; None without the volume.
+
+        ``run`` times the stages.
+        """
+        return None
+
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
         return None
 
     def _repr_html_(self) -> str | None:
         """Return the viewer page for a notebook; None where a library is missing."""
-        name = str(self.report.volume.get("name") or "result")
+        name = self.ply.title or "result"
         page = format_of("x.html")
         assert page is not None
         try:
@@ -181,9 +193,17 @@ class Conversion(Result):
 
     Attributes:
         field: the volume under its function, labels, layers and light.
+        make_live: makes `live_form`; None if the Gaussians carry values themselves.
     """
 
     field: Field
+    make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
+
+    def live_form(self, run: Run | None = None) -> LiveForm | None:
+        """Implement `Result.live_form`; None, with a message, if there is no live form."""
+        if self.make_live is None:
+            return None
+        return self.make_live(run or Run(Console(quiet=True), ConversionReport("init")), self.field, self.ply)
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""

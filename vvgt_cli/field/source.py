@@ -153,6 +153,12 @@ class Source:
         return self.layers[0].unit_label
 
     @property
+    def title(self) -> str:
+        """Kind and size of the volume, which identify no file and nobody."""
+        kind = "CT" if self.volume.hounsfield else "label map" if self.labels_alone else "volume"
+        return f"{kind}, {' x '.join(map(str, self.volume.dims))}"
+
+    @property
     def name(self) -> str:
         """Name of the function, or the names of all layers."""
         return " + ".join(layer.name for layer in self.layers) if self.gridded else self.tf.name

@@ -24,7 +24,7 @@ class Certificate:
     """Measurements made during a conversion, valid only for the Gaussians of that file.
 
     Attributes:
-        volume: name of the volume, without its folder.
+        volume: title of the volume, which names no file unless it was chosen.
         sha256: hexadecimal digest of its values; None for a volume too large to be read twice.
         look: digest of functions, label tables, unit distances and light.
         size: edge of the target screen in pixels.
@@ -37,7 +37,8 @@ class Certificate:
             nothing is opaque and smooth.
         position_error: largest distance of a stored centre from the computed one, in world units.
         seconds: wall time up to the scores; None if `SOURCE_DATE_EPOCH` requests reproducible files.
-        command: the command line without folders, outputs and options that do not affect the result; None from Python.
+        command: the command line without folders, outputs, names of volumes and options that do not affect the
+            result; None from Python.
     """
 
     volume: str

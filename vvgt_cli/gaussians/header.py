@@ -54,6 +54,7 @@ class FileFacts:
         certificate: measurements of the conversion; None if the Gaussians were changed since.
         legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
         date: date of writing, YYYY-MM-DD, in pages only.
+        title: title of pages, which names no file unless it was chosen.
     """
 
     frame: str = "unit"
@@ -74,6 +75,7 @@ class FileFacts:
     certificate: Certificate | None = None
     legend: str | None = None
     date: str | None = None
+    title: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return the facts by name."""
@@ -259,8 +261,8 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         return {"space": text}
     if word == "light":
         return {"light": parse_lighting(text)}
-    if word == "function":
-        return {"function": str(json.loads(text))}
+    if word in ("function", "title"):
+        return {word: str(json.loads(text))}
     if word == "legend":
         return {"legend": checked(text)}
     if word == "affine":
@@ -286,8 +288,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines += [f"comment vvgt space {facts.space or 'none'}", f"comment vvgt affine {numbers}"]
     if facts.length_unit is not None:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
-    if facts.function is not None:
-        lines.append(f"comment vvgt function {json.dumps(facts.function)}")
+    named = (("title", facts.title), ("function", facts.function))
+    lines += [f"comment vvgt {word} {json.dumps(text)}" for word, text in named if text is not None]
     for word, text in (("legend", None if facts.live else facts.legend), ("date", facts.date)):
         if text is not None:
             lines.append(f"comment vvgt {word} {text}")

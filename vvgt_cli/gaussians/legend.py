@@ -13,14 +13,15 @@ from vvgt_cli.look.labels import LabelTable
 MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: space in a header is limited
 
 
-def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
-    """Return one line of JSON: value range, unit and nodes (value, opacity, colour), or labels (name, colour).
+def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "") -> str | None:
+    """Return one line of JSON: value range, unit, quantity, nodes (value, opacity, colour); or labels (name, colour).
 
     Args:
         tf: function on data values or label table; anything else has no legend, and None is returned.
         lo: smallest value.
         hi: largest value.
         unit: unit of the values, "" if unknown.
+        quantity: what the values are, "" if unknown.
     """
     if isinstance(tf, LabelTable):
         shown = [label for label in tf.labels if label.opacity > 0]
@@ -37,7 +38,7 @@ def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
     for x in places.tolist():
         below, above = (_node(tf, x, np.nextafter(x, side)) for side in (-np.inf, np.inf))
         nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
-    return json.dumps({"values": [lo, hi], "unit": unit, "nodes": nodes})
+    return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
 
 
 def _node(tf: TransferFunction, x: float, beside: float) -> list[Any]:

@@ -42,6 +42,7 @@ class LiveFacts:
         name: name of the volume, for one of several layers.
         distance: world length that the opacity refers to, for one of several layers.
         others: the layers or channels after the first.
+        quantity: what the values are, "" if unknown.
     """
 
     lo: float
@@ -54,6 +55,7 @@ class LiveFacts:
     name: str = ""
     distance: float | None = None
     others: tuple[LiveFacts, ...] = ()
+    quantity: str = ""
 
     @property
     def layers(self) -> tuple[LiveFacts, ...]:
@@ -74,9 +76,9 @@ class LiveFacts:
     def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction, several: int = 1) -> LiveFacts:
         """Return the facts for a volume, its statistics and function; ``several`` is the file's number of layers."""
         counts = tuple(int(n) for n in numbers.histogram)
-        unit = "HU" if volume.hounsfield else ""
         lo, hi = numbers.lo, numbers.hi
-        return cls(lo, hi, volume.dims, counts, unit, function_text(tf, lo, hi, several))
+        function = function_text(tf, lo, hi, several)
+        return cls(lo, hi, volume.dims, counts, volume.values_in, function, quantity=volume.quantity)
 
     def statistics(self) -> Statistics:
         """Return the statistics that place functions on the data."""
@@ -101,7 +103,8 @@ class LiveFacts:
         if self.others:
             return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
-        unit = ["comment vvgt live unit " + self.unit] if self.unit else []
+        named = (("unit", self.unit), ("quantity", self.quantity))
+        unit = [f"comment vvgt live {word} {text}" for word, text in named if text]
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
         if self.labels:
             return [values, *(f"comment vvgt live label {label_text(label)}" for label in self.labels)]
@@ -158,8 +161,8 @@ def one_comment(text: str) -> dict[str, Any]:
         if not 0 < float(distance) < math.inf:
             raise ValueError(text)
         return {"name": _quoted(name), "distance": float(distance)}
-    if word == "unit":
-        return {"unit": text}
+    if word in ("unit", "quantity"):
+        return {word: text}
     if word == "histogram":
         counts = tuple(int(count) for count in words)
         if len(counts) != BINS or min(counts) < 0:

@@ -90,7 +90,7 @@ def convert(
         raise UsageError("after: expected the result of convert for one volume and look")
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
-    request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live)
+    request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live, editor=not live)
     requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, several=several, split_labels=split_labels, after=after, console=console_of(progress)

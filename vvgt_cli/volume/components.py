@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -89,6 +90,12 @@ def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) ->
     order = sorted(range(len(infos)), key=lambda index: infos[index].where == "cell")
     fits = (k for k in order if (infos[k].active if wanted is None else infos[k].name == wanted))
     if (first := next(fits, None)) is not None:
+        if wanted is None and len(infos) > 1:
+            others = ", ".join(printable(infos[k].name) for k in order if k != first)
+            warnings.warn(
+                f"{source}: array {printable(infos[first].name)}, its scalars; --array takes another: {others}",
+                stacklevel=3,
+            )
         return first
     names = [infos[k].name for k in order]
     note = " and none marked as scalars"

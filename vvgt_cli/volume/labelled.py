@@ -26,6 +26,7 @@ from vvgt_cli.volume.types import Volume, float_dtype, triple
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
 MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
+NAMING = ("long_name", "standard_name", "units")  # of the values
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
@@ -177,7 +178,7 @@ def labelled_volume(
         field = np.transpose(values, order)
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
-    return _placed(field, spatial, (slope, intercept), options, source, name)
+    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes)
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -306,6 +307,18 @@ def _stored(value: Any) -> list[Any]:
     return [] if found.dtype.kind not in "iuf" else found.tolist()
 
 
+def _named(volume: Volume, attributes: Mapping[str, Any]) -> Volume:
+    """Return the volume with the name and unit that the attributes give its values, as CF has them."""
+    long, standard, unit = (_text(attributes.get(key, "")) for key in NAMING)
+    bare = unit in ("1", "none", "unitless", "dimensionless")
+    return replace(volume, quantity=long or standard, value_unit="" if bare else unit)
+
+
+def _text(value: Any) -> str:
+    """Return an attribute of text, of HDF5 too, for a legend."""
+    return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()[:40]
+
+
 def _placed(
     field: np.ndarray, axes: list[Axis], scaling: tuple[float, float], options: ReadOptions, source: str, name: str
 ) -> Volume:
@@ -381,7 +394,8 @@ def _left(
         return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
-    return _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
+    volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
+    return _named(volume, attributes)
 
 
 def _descends(a: Axis, source: str) -> bool:

@@ -67,6 +67,8 @@ class Volume:
         hounsfield: whether the file says that data values are Hounsfield units.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
+        quantity: what the values are, as the file calls them ("temperature"); "" unknown.
+        value_unit: unit of the values; "" unknown.
         unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
 
     Raises:
@@ -85,6 +87,8 @@ class Volume:
     reference: str | None = None
     density: bool = False
     unit: str = ""
+    quantity: str = ""
+    value_unit: str = ""
 
     def __post_init__(self) -> None:
         """Check the attributes."""
@@ -112,6 +116,11 @@ class Volume:
         """Voxels along (x, y, z)."""
         nz, ny, nx = self.data.shape
         return nx, ny, nz
+
+    @property
+    def values_in(self) -> str:
+        """Unit of the values, "" if unknown."""
+        return "HU" if self.hounsfield else self.value_unit
 
     @property
     def extent(self) -> tuple[float, float, float]:

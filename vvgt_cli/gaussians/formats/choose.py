@@ -34,8 +34,8 @@ class Format:
         read: maps bytes and the file's name, for errors, to columns.
         needs: given a name for errors, raises DataError if a library is not installed.
         layout: maps the options for a `.ply` to those for this format.
-        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`; None if the
-            format cannot store values.
+        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, and for the
+            form without values to show first, or None; None if the format cannot store values.
     """
 
     suffix: str
@@ -43,7 +43,7 @@ class Format:
     read: Callable[[bytes, str], Splats]
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
-    live: Callable[[Gaussians, PlyOptions, str], bytes] | None = None
+    live: Callable[[Gaussians, PlyOptions, str, Splats | None], bytes] | None = None
 
 
 FORMATS = (  # the first whose ending fits is taken: a longer ending stands before a shorter one
@@ -79,8 +79,17 @@ def ready(path: str | Path) -> None:
         known.needs(str(path))
 
 
-def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
+def encoded(
+    known: Format, gaussians: Gaussians, options: PlyOptions, name: str, editor: page_live.LiveForm | None = None
+) -> bytes:
     """Encode Gaussians (unit frame) in another format, with the layout of `PlyOptions`.
+
+    Args:
+        known: the format.
+        gaussians: Gaussians, unit frame.
+        options: layout.
+        name: of the file, for errors and titles.
+        editor: live form of the same volume under the same look, for the function editor of a page.
 
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
@@ -88,12 +97,15 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     if known.suffix == ".html":
         options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
-        return known.live(gaussians, options, name)
+        return known.live(gaussians, options, name, None)
     if gaussians.live is not None:
         why = f"{known.suffix} cannot store values for other functions"
         warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
-    return known.write(splats_of(gaussians, known.layout(options)), name)
+    splats = splats_of(gaussians, known.layout(options))
+    if editor is not None and known.live is not None:
+        return known.live(editor[0], replace(editor[1], date=options.date), name, splats)
+    return known.write(splats, name)
 
 
 def is_splats(path: str | Path) -> bool:

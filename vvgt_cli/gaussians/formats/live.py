@@ -105,6 +105,7 @@ def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, A
         "labels": labels,
         "values": [layer.lo, layer.hi],
         "unit": layer.unit,
+        "quantity": layer.quantity,
         "histogram": list(layer.histogram),
         "name": layer.baked().get("name", ""),
         "unit_distance": unit_distance,

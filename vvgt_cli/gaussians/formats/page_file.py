@@ -7,9 +7,11 @@ PlayCanvas engine (CONTRIBUTING.md, "Dependencies").
 from __future__ import annotations
 
 import base64
+import gzip
+import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from html import escape
@@ -32,7 +34,9 @@ from vvgt_cli.gaussians.rules import INRIA, RULES
 PROGRAM = "viewer.js.gz"
 _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
+_TITLE = re.compile(r"vvgt title (\".*\")$")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
+_SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
 _FAR = 99  # percentile of distances from the middle that counts as the radius of a cloud
 _SEEN = -3.0  # smallest opacity logit of a Gaussian that counts as visible
 _DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
@@ -129,15 +133,38 @@ def waiting_page(title: str, elements: str) -> str:
 
 def _text(title: str, scene: Mapping[str, Any], elements: str) -> str:
     document = json.dumps(scene).replace("<", "\\u003c")  # so that no name can end the script
-    text = asset("page.html").decode("utf-8")
-    for place, value in (("TITLE", escape(title)), ("SCENE", document), ("PARTS", elements)):
+    text, style = (asset(name).decode("utf-8") for name in ("page.html", "page.css"))
+    for place, value in (("STYLE", style), ("TITLE", escape(title)), ("SCENE", document), ("PARTS", elements)):
         text = text.replace(f"<!--{place}-->", value, 1)
     return text
 
 
+def policy(text: str, source: str = "") -> str:
+    """Return the content security policy that a page needs, with the hashes of its scripts and style.
+
+    Args:
+        text: the page.
+        source: where it loads further files from, such as "'self'"; "" for a page in a file.
+    """
+    scripts = [found.encode("utf-8") for found in _SCRIPTS.findall(text)]
+    if 'id="program"' in text:
+        scripts.append(gzip.decompress(asset(PROGRAM)))
+    styles = [found.encode("utf-8") for found in _STYLES.findall(text)]
+    script, style = (" ".join(f"'sha256-{_digest(one)}'" for one in some) for some in (scripts, styles))
+    also = f"{source} " if source else ""
+    return (
+        f"default-src 'none'; script-src {also}{script} blob:; worker-src blob:; style-src {style}; "
+        f"img-src data: blob:; connect-src {also}data: blob:"
+    )
+
+
+def _digest(content: bytes) -> str:
+    return base64.b64encode(hashlib.sha256(content).digest()).decode("ascii")
+
+
 def html(splats: Splats, name: str) -> bytes:
     """Return the page of one cloud as a single file."""
-    return html_of_several([(title_of(name), splats)], name)
+    return html_of_several([(title_of(name, splats.comments), splats)], name)
 
 
 def html_of_several(
@@ -145,6 +172,7 @@ def html_of_several(
     name: str,
     embedded: Mapping[str, bytes] = MappingProxyType({}),
     more: Mapping[str, Any] = MappingProxyType({}),
+    prefix: str = "splats",
 ) -> bytes:
     """Return the page as a single file: the viewer by gzip, and each cloud as a `.compressed.ply`, in base64.
 
@@ -155,35 +183,38 @@ def html_of_several(
         name: name of the file.
         embedded: further content of the page, by element id.
         more: further entries of the scene for the viewer.
+        prefix: of the ids of the elements with the clouds; `read_html` finds "splats".
     """
     held = [("program", "text/plain", asset(PROGRAM))]
     held += [(key, "application/octet-stream", content) for key, content in embedded.items()]
     shown = held_frames(clouds)
-    held += [(f"splats-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
+    held += [(f"{prefix}-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
         for key, kind, content in held
     ]
     elements.append(f"<script>{asset('inflate.js').decode('utf-8')}</script>")
     frames: list[dict[str, Any]] = [
-        {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
+        {"name": cloud, "file": f"{k}.compressed.ply", "held": f"{prefix}-{k}"} for k, (cloud, _) in enumerate(clouds)
     ]
     for frame, (_, whole) in zip(frames, shown, strict=True):
         frame |= {} if whole is None else {"whole": whole}
     more = {"outermost": outermost([splats for _, splats in clouds]), **more}
-    return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
+    return page(title_of(name, clouds[0][1].comments), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
 def iframe(content: bytes, name: str) -> str:
     """Return an iframe for notebooks that shows a page without access to the enclosing page or the network."""
     text = escape(content.decode("utf-8"))
     style = "width: 100%; height: 540px; border: 0; background: #000"
-    allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen"'
+    allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen; clipboard-write; xr-spatial-tracking"'
     return f'<iframe title="{escape(name)}" {allowed} style="{style}" srcdoc="{text}"></iframe>'
 
 
-def title_of(name: str) -> str:
-    """Return the title for a file name: without folder and ending."""
+def title_of(name: str, comments: Iterable[str] = ()) -> str:
+    """Return the title that a file states, else its name without folder and ending."""
+    for found in filter(None, map(_TITLE.match, comments)):
+        return str(json.loads(found[1]))
     return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
 

@@ -14,6 +14,7 @@ from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.constants import DILATION
+from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.live import BYTES, ROW, live_bytes, live_json, log_lengths
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
@@ -31,17 +32,26 @@ _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
 
-def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
+LiveForm = tuple[Gaussians, PlyOptions]  # Gaussians (unit frame) that carry values, and how they are written
+
+
+def live_html(gaussians: Gaussians, options: PlyOptions, name: str, converted: Splats | None = None) -> bytes:
     """Return the page as a single file, for ``gaussians`` in the unit frame.
+
+    ``converted`` is a conversion under the same look, shown in their place until the look is changed.
 
     Raises:
         DataError, UsageError: see `splats_of`; also if a library is not installed.
     """
-    return live_html_of_several([(title_of(name), gaussians, options)], name)
+    return live_html_of_several([(options.title or title_of(name), gaussians, options)], name, converted)
 
 
-def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
+def live_html_of_several(
+    clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str, converted: Splats | None = None
+) -> bytes:
     """Return the page of several named clouds that are shown under one function, which `shared_facts` must allow.
+
+    ``converted``: see `live_html`.
 
     Raises:
         DataError, UsageError: see `live_html`.
@@ -51,9 +61,16 @@ def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], na
     if light is not None and light.headlight + len(light.directions) > 1:
         warnings.warn(f"{name}: the page shows one light at a time, and begins with the first", stacklevel=2)
     held = dict(zip(facts["held"], planes, strict=True))
-    return html_of_several(
-        [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)], name, held, {"live": facts}
-    )
+    more: dict[str, Any] = {"live": facts}
+    if converted is not None:
+        held["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
+        found = clouds[0][2].certificate
+        score = "" if found is None else f", {found.psnr:.1f} dB"
+        more["converted"] = {
+            "file": "converted.compressed.ply", "held": "splats-0", "said": f"converted{score}", "count": len(converted)
+        }  # fmt: skip
+    named = [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)]
+    return html_of_several(named, name, held, more, "splats" if converted is None else "live")
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
@@ -69,6 +86,23 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
         for cloud, gaussians, options in clouds
     ]
     return html_of_several(baked, name)
+
+
+def contents(options: PlyOptions, name: str, names: Sequence[str] = ()) -> str:
+    """Return one line that says what a page holds, for whoever sends it.
+
+    Args:
+        options: of the Gaussians that carry values, if there are any.
+        name: of the page.
+        names: in its list, of several clouds.
+    """
+    layers = () if options.live is None else options.live.layers
+    parts = ["Gaussians", *(["data values, their histogram"] if layers else [])]
+    parts += [f"names of {sum(len(layer.labels) for layer in layers)} labels"] if any(x.labels for x in layers) else []
+    stated = [layer.name for layer in layers if layer.name] if len(layers) > 1 else list(names)
+    parts += [f"the names {', '.join(stated[:3])}{', ...' if len(stated) > 3 else ''}"] if stated else []
+    parts += ["a checksum of the volume"] if options.certificate else []
+    return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"
 
 
 def shared_facts(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:

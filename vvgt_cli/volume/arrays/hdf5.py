@@ -18,7 +18,16 @@ from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.labelled import CF_ATTRIBUTES, DESCRIBES, GEOMETRY, Axis, axis, described_by, labelled_volume
+from vvgt_cli.volume.labelled import (
+    CF_ATTRIBUTES,
+    DESCRIBES,
+    GEOMETRY,
+    NAMING,
+    Axis,
+    axis,
+    described_by,
+    labelled_volume,
+)
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.options import ReadOptions
@@ -47,7 +56,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         mapped = _mapped(dataset, path)
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
-        attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY) if key in dataset.attrs}
+        attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})

@@ -47,7 +47,7 @@ def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
     """
     facts, values = _asked(program, path, options, "volume")
     place = {key: tuple(facts[key]) for key in ("spacing", "origin", "direction")}
-    return Volume(values, name=facts["name"], **place)  # type: ignore[arg-type]  # three numbers each
+    return Volume(values, name=facts["name"], quantity=facts["quantity"], **place)  # type: ignore[arg-type]  # three numbers each
 
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
@@ -244,7 +244,13 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
         volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
     values = np.ascontiguousarray(volume.data)
     place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}
-    return {"name": volume.name, "dtype": values.dtype.str, "shape": values.shape, **place}, values
+    return {
+        "name": volume.name,
+        "quantity": volume.quantity,
+        "dtype": values.dtype.str,
+        "shape": values.shape,
+        **place,
+    }, values
 
 
 def bound(free: int | None, seconds: int) -> None:

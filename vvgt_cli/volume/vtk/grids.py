@@ -6,6 +6,7 @@ Declared sizes are checked against the file before VTK allocates, cells against 
 from __future__ import annotations
 
 import mmap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import Volume
@@ -117,7 +119,7 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
     infos = arrays_of(mesh)
     info = infos[choose_array(infos, options.array, source)]
     if mesh.IsA("vtkImageData"):
-        return _image(mesh, info, options, source, name)
+        return replace(_image(mesh, info, options, source, name), quantity=printable(info.name))
     if options.spacing is not None:
         raise UsageError(
             f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
@@ -126,7 +128,8 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
     mesh = shown(mesh)
     values = values_of(mesh, info).reshape(1, 1, -1, info.components)
     field = select_from_array(values, info, options.component, source)
-    return resample(mesh, field.ravel(), info.where, options.dims, source, name)
+    found = resample(mesh, field.ravel(), info.where, options.dims, source, name)
+    return replace(found, quantity=printable(info.name))
 
 
 def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:

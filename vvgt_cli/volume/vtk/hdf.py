@@ -15,6 +15,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -79,7 +80,8 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     read = partial(_read, path, name, before, behind, dtype)
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
     values = stored_or_held(read, dtype, shape, chunks, source, options.stored)
-    return Volume(values, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
+    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
+    return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 
 
 def _read(

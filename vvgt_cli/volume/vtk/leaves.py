@@ -14,6 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
@@ -109,9 +110,11 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         _paint(leaf.data, values, info.where, grid, out)
     inside = ~np.isnan(out)
     if lattice is None:
-        return sampled_volume(out, inside, dtype, grid, options.dims, source, name)
+        found = sampled_volume(out, inside, dtype, grid, options.dims, source, name)
+        return replace(found, quantity=printable(info.name))
     whole = inside.all() and dtype.kind in "iu"
-    return Volume(out.astype(dtype) if whole else out, grid.spacing, grid.origin, name=name)
+    kept = out.astype(dtype) if whole else out
+    return Volume(kept, grid.spacing, grid.origin, name=name, quantity=printable(info.name))
 
 
 def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:

@@ -248,4 +248,6 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
             )
         values = _values(parser, array, (dims[2], dims[1], dims[0]))
     field = select_from_array(values, array.info, options.component, str(path))
-    return placed(field, np.diag(spacing), origin, options, volume_name(path))
+    return placed(
+        field, np.diag(spacing), origin, options, volume_name(path), quantity=printable(array.info.name)
+    )  # fmt: skip

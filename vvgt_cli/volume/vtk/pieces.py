@@ -18,6 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import SHARE, check_memory, data_file
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
@@ -64,7 +65,8 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
     if not options.stored and (not options.packed or free is None or field.nbytes <= SHARE * free):
         check_memory(field.nbytes, str(path))
         field = field[:, :, :]
-    return Volume(field, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
+    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
+    return Volume(field, *place, volume_name(path), quantity=printable(info.name))
 
 
 class _Pieces:

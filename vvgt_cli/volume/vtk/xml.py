@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.headers import type_of
+from vvgt_cli.volume.headers import printable, type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
@@ -218,7 +218,8 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     info = infos[choose_array(infos, options.array, str(path))]
     grid = image_grid(found.image, info.where, path)
     values = image_values(found, info, grid, options, path)
-    return Volume(values, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
+    place = options.spacing_or(grid.spacing), grid.origin, grid.direction
+    return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 
 
 def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:

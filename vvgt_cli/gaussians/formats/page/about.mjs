@@ -1,19 +1,21 @@
 // What is shown: a list of names and values, of what the file says of itself.
 import { shown } from './facts.mjs';
 
-export function rowsOf(name, { facts, world, count, live }) {
+export function rowsOf(name, { facts, world, count, live, converted }) {
   const number = (n) => n.toLocaleString('en'), length = (n) => `${shown(n)}${world.unit && ` ${world.unit}`}`;
   const kinds = new Set(live?.layers.map(({ labels }) => (labels.length ? 'labels' : 'function')));
   return [
-    ['file', name],
-    ['look', live ? `live: ${[...kinds, 'light'].join(' and ')} can be changed` : 'baked'],
+    ['name', name],
+    ['contains', [`Gaussians${live ? ', the data values under them and their histogram' : ''}`, ...(live?.layers.some(({ labels }) => labels.length) ? ['names of labels'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
+    ['look', live ? `${[...kinds, 'light'].join(' and ')} can be changed` : 'fixed'],
     ['function', live ? live.layers.map(({ name }) => name).filter(Boolean).join('; ') : facts.function],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],
-    ['error', facts.error],
-    ['Gaussians', number(count)],
-    ['made for', facts.size && `${facts.size} px, drawn by ${facts.rule}`],
-    ['axes', world.anatomical ? `${facts.space}, in mm` : `of the file${world.unit && `, in ${world.unit}`}`],
+    ['quality', facts.quality],
+    ['Gaussians', count && (converted ? `${number(converted.count)}, and ${number(count)} to edit` : number(count))],
+    ['made for', facts.size && `screens of ${facts.size} px; drawing rule: ${facts.rule}`],
+    ['axes', world.anatomical ? `${facts.space}, in mm` : `the file's own${world.unit && `, in ${world.unit}`}`],
+    ['drawn with', 'SuperSplat viewer and PlayCanvas engine (MIT)'],
     ['written', facts.version && `${facts.date ? `${facts.date}, ` : ''}by vvgt ${facts.version}`],
   ].filter(([, value]) => value);
 }

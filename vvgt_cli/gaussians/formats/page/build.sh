@@ -4,21 +4,36 @@
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 out=$(cd "${1:-$here}" && pwd)
-cache=${XDG_CACHE_HOME:-$HOME/.cache}/vvgt-page
+cache=${XDG_CACHE_HOME:-$HOME/.cache}/vvgt-page-viewer
 mkdir -p "$cache"
 if ! cmp -s "$here/package.json" "$cache/installed.json"; then
   cp "$here/package.json" "$cache/package.json"
   (cd "$cache" && npm install --no-audit --no-fund --no-package-lock >&2)
   cp "$here/package.json" "$cache/installed.json"
 fi
-# the viewer's handle does not lead to its camera: how far what it turns about is away, and a pose to go to at once
-handle=$cache/node_modules/@playcanvas/supersplat-viewer/dist/viewer.js
-grep -q 'cameraManager: ()' "$handle" || sed -i 's/^        seek: (time) => viewer.seek(time),$/        cameraManager: () => viewer.cameraManager,\n&/' "$handle"
-grep -q 'cameraManager: ()' "$handle" || { echo "the viewer's handle is another one: see build.sh" >&2; exit 1; }
-grep -q 'this.resetCamera = resetCamera' "$handle" || sed -i 's/^        this.camera.copy(resetCamera);$/        this.resetCamera = resetCamera;\n&/' "$handle"
-grep -q 'this.resetCamera = resetCamera' "$handle" || { echo "the viewer's camera is another one: see build.sh" >&2; exit 1; }
+# our own controls and keys instead of the viewer's; its camera, which its handle does not lead to; no double-click of its
+# own; no glide where less motion is asked for
+viewer=$cache/node_modules/@playcanvas/supersplat-viewer/dist
+python3 - "$viewer" <<'PY'
+import sys
+from pathlib import Path
+
+folder = Path(sys.argv[1])
+text = (folder / "viewer.js").read_text("utf-8")
+for old, new in (
+    ("config.ui", "false"),
+    ("        seek: (time) =>", "        cameraManager: () => viewer.cameraManager,\n        seek: (time) =>"),
+    ("        this.camera.copy(resetCamera);", "        this.resetCamera = resetCamera;\n        this.camera.copy(resetCamera);"),
+    ("    async _pickSceneTarget(offsetX, offsetY) {", "    async _pickSceneTarget(offsetX, offsetY) {\n        return null;"),
+    ("DAMPING = 0.95;", "DAMPING = matchMedia('(prefers-reduced-motion: reduce)').matches ? 0 : 0.95;"),
+):
+    if old not in text:
+        sys.exit(f"the viewer has no {old!r}: see build.sh")
+    text = text.replace(old, new)
+(folder / "ours.js").write_text(text, "utf-8")
+PY
 NODE_PATH="$cache/node_modules" "$cache/node_modules/.bin/esbuild" "$here/page.mjs" --bundle --minify --format=iife \
-  --target=es2022 --charset=utf8 --loader:.css=text --loader:.glsl=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
+  --alias:@playcanvas/supersplat-viewer/viewer="$viewer/ours.js" --target=es2022 --charset=utf8 --loader:.glsl=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
 python3 - "$cache/viewer.js" "$out/viewer.js.gz" <<'PY'
 import gzip
 import sys

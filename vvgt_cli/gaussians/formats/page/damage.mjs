@@ -19,7 +19,7 @@ export function wholePly(bytes) {
 // what `promise` gives, unless an asset or anything else fails before
 export function unlessFailing(app, promise) {
   return new Promise((done, fail) => {
-    const failed = () => { end(); fail(new Damaged('its Gaussians cannot be read')); };
+    const failed = () => { end(); fail(new Damaged('its Gaussians could not be read')); };
     const end = () => { app.assets.off('error', failed); removeEventListener('unhandledrejection', failed); };
     app.assets.on('error', failed);
     addEventListener('unhandledrejection', failed);

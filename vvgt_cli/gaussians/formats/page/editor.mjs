@@ -1,10 +1,11 @@
 // The function of one layer of a live page over the histogram of its values: nodes to be dragged.
 import { hex, rgbOf } from './color.mjs';
 import { functionAt } from './live_table.mjs';
+import { element } from './svg.mjs';
 
-const WIDE = 276, HIGH = 92, NEAR = 16, TWICE = 350;  // px; milliseconds between the taps that add a node
+const WIDE = 276, HIGH = 92, NEAR = matchMedia('(pointer: coarse)').matches ? 22 : 16, TWICE = 350;  // px; milliseconds between the taps that add a node
 const MANY = 14, CLOSE = 0.03;  // nodes that are all offered, and how far fewer of them may be from the function
-const SVG = 'http://www.w3.org/2000/svg', EDITED = 'edited';
+const EDITED = 'edited';
 const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one">
 <defs><linearGradient></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
@@ -79,18 +80,17 @@ export function editor(apply, layer, key, history) {
     const curve = Array.from({ length: WIDE - 11 }, (_, k) => `${k + 6},${height(functionAt(exact ?? nodes, value(k + 6)).y).toFixed(2)}`).join('L');
     find('.line').setAttribute('d', `M${curve}`);
     find('.area').setAttribute('d', `M6,${HIGH - 4}L${curve}L${WIDE - 6},${HIGH - 4}Z`);
-    find('linearGradient').replaceChildren(...nodes.map(({ x, rgb }) => {
-      const stop = document.createElementNS(SVG, 'stop');
-      stop.setAttribute('offset', (x - lo) / span);
-      stop.setAttribute('stop-color', hex(rgb));
-      return stop;
-    }));
+    find('linearGradient').replaceChildren(...nodes.map(({ x, rgb }) => element('stop', { offset: (x - lo) / span, 'stop-color': hex(rgb) })));
     const group = find('g');
     while (group.childElementCount > nodes.length) group.lastChild.remove();
-    while (group.childElementCount < nodes.length) group.append(document.createElementNS(SVG, 'circle'));
+    while (group.childElementCount < nodes.length) {
+      const node = element('g', { tabindex: 0, role: 'slider', 'aria-valuemin': lo, 'aria-valuemax': hi });
+      node.append(element('circle', { r: 12, fill: 'transparent' }), element('circle', { r: 4.5, class: 'dot' }));  // the first to be hit
+      group.append(node);
+    }
     nodes.forEach(({ x, y, rgb }, k) => {
-      const is = { cx: across(x), cy: height(y), r: 4.5, fill: hex(rgb), tabindex: 0, role: 'slider', class: k === chosen ? 'chosen' : '',
-        'aria-label': `node ${k + 1}`, 'aria-valuenow': x, 'aria-valuetext': text(nodes[k]) };
+      group.children[k].lastChild.setAttribute('fill', hex(rgb));
+      const is = { transform: `translate(${across(x)},${height(y)})`, class: k === chosen ? 'node chosen' : 'node', 'aria-label': `node ${k + 1}`, 'aria-valuenow': x, 'aria-valuetext': text(nodes[k]) };
       for (const [name, is_] of Object.entries(is)) group.children[k].setAttribute(name, is_);
     });
     find('input[type=color]').value = hex(nodes[chosen].rgb);
@@ -168,8 +168,9 @@ export function editor(apply, layer, key, history) {
     const k = nearest(place(event));
     if (k >= 0) remove(k);
   });
-  find('g').addEventListener('focusin', (event) => choose([...find('g').children].indexOf(event.target)));
-  svg.addEventListener('keydown', (event) => {
+  root.addEventListener('focusin', ({ target }) => { if (target.matches('.node')) choose([...find('g').children].indexOf(target)); });  // on the group, Chromium would let it have the focus
+  root.addEventListener('keydown', (event) => {
+    if (!event.target.matches('.node')) return;
     const step = event.shiftKey ? 5 : 1, { x, y } = now.nodes[now.chosen], up = opacity(height(y) - step), down = opacity(height(y) + step);
     const moves = { ArrowLeft: [x - (step * span) / 200, y], ArrowRight: [x + (step * span) / 200, y], ArrowUp: [x, up], ArrowDown: [x, down] };
     if (moves[event.key]) {

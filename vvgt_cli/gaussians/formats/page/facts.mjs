@@ -9,22 +9,22 @@ const OPPOSITE = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' };
 // The legend of a baked look, of JSON {values, unit, nodes} or {labels, of}; null where it is damaged
 function legendOf(text) {
   try {
-    const { values, unit, nodes, labels, of } = JSON.parse(text), rgb = (hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
+    const { values, unit, quantity, nodes, labels, of } = JSON.parse(text), rgb = (hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
     if (labels) return { labels: labels.map(([name, hex]) => ({ name: String(name), rgb: rgb(hex) })), of };
     if (!values.every(Number.isFinite)) return null;
-    return { values, unit, nodes: nodes.map(([x, y, hex]) => ({ x, y, rgb: rgb(hex) })) };
+    return { values, unit, quantity, nodes: nodes.map(([x, y, hex]) => ({ x, y, rgb: rgb(hex) })) };
   } catch { return null; }
 }
 
-// The error that the conversion measured, of the JSON of a certificate (docs/certificate.md); null where it is damaged
-function errorOf(text) {
+// How near the volume's the pictures are, as the conversion measured, of the JSON of a certificate (docs/certificate.md); null where it is damaged
+function qualityOf(text) {
   try {
     const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
-    return Number.isFinite(dB) ? `${dB.toFixed(1)} dB ${live == null ? '' : 'live, '}on test views of ${Number(size)} px` : null;
+    return Number.isFinite(dB) ? `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)` : null;
   } catch { return null; }
 }
 
-// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, error, date}: text and numbers
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, quality, date}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {
@@ -37,7 +37,7 @@ export function factsOf(comments) {
     else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
     else if (key === 'function') facts.function = JSON.parse(text);
     else if (key === 'legend') facts.legend = legendOf(text);
-    else if (key === 'certificate') facts.error = errorOf(text);
+    else if (key === 'certificate') facts.quality = qualityOf(text);
     else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
     else if (text) facts[key] = text;
     else facts.version = key;
@@ -48,8 +48,9 @@ export function factsOf(comments) {
 
 // The file's world beside the viewer's axes, which have PLY (x, y, z) at (-x, -y, z): directions of its axes there, the letters
 // at both ends of each, the unit of lengths ('' unknown), and how long one of the viewer's lengths is in it.
-export function worldOf(facts) {
-  const rows = UP[facts.up], half = [-1, -1, 1], unit = facts.frame === 'unit' && facts.scale ? facts.scale : 1;
+// What is streamed is shown `enlarged` times as large.
+export function worldOf(facts, enlarged = 1) {
+  const rows = UP[facts.up], half = [-1, -1, 1], unit = enlarged * (facts.frame === 'unit' && facts.scale ? facts.scale : 1);
   const centre = facts.frame === 'unit' && facts.centre ? facts.centre : [0, 0, 0];
   const axes = [0, 1, 2].map((k) => [0, 1, 2].map((row) => half[row] * rows[row][k]));
   const anatomical = /^[RL][AP][SI]$/.test(facts.space);

@@ -1,56 +1,65 @@
-// The first view: from the file's direction, so near that all that is seen fits into the part of the window that nothing lies over, in its middle.
+// Views that fit: so near that all that is seen fits into the part of the window that nothing lies over, in its middle.
 import { dot, plus } from './lens.mjs';
 
+const DEGREES = Math.PI / 180;
 const FITS = 0.9;  // share of that part that is filled
 const FARTHEST = 3;  // times that the eye may stand back for it; where the rest is smaller yet, the whole window
 const ALIKE = 1.1;  // times the least distance: of those parts the one nearest the middle of the window
 const OVER = '#live, #named, #series, #tools, #where .over';
 
-// {position, target, fov} of a part of some pixels; the viewer's field of view is along the longer side of the window
-export function firstView({ camera: { position, target, fov }, outermost = [] }, wide = innerWidth, high = innerHeight) {
-  const longer = Math.max(innerWidth, innerHeight, 1), away = plus(position, target, -1), far = Math.hypot(...away);
-  if (!outermost.length) return { position: plus(target, away, longer / Math.max(Math.min(wide, high), 1)), target, fov };
-  const d = away.map((x) => x / far), level = Math.hypot(d[0], d[2]), right = [d[2] / level, 0, -d[0] / level];
-  const up = [d[1] * right[2], d[2] * right[0] - d[0] * right[2], -d[1] * right[0]], t = (FITS * Math.tan((fov * Math.PI) / 360)) / longer;
-  const middle = [0, 1, 2].map((k) => (Math.min(...outermost.map((p) => p[k])) + Math.max(...outermost.map((p) => p[k]))) / 2);
-  const back = Math.max(...outermost.map((p) => plus(p, middle, -1)).map((q) => dot(q, d) + Math.max(Math.abs(dot(q, right)) / (t * Math.max(wide, 1)), Math.abs(dot(q, up)) / (t * Math.max(high, 1)))));
-  return { position: plus(middle, d, back), target: middle, fov };
+// the angles of the first view, degrees, as lens.pose() has them
+export function firstAngles({ camera: { position, target } }) {
+  const [x, y, z] = plus(position, target, -1);
+  return { pitch: -Math.asin(y / Math.hypot(x, y, z)) / DEGREES, yaw: Math.atan2(x, z) / DEGREES };
 }
 
-const distance = ({ position, target }) => Math.hypot(...plus(position, target, -1));
+// {target, distance} of a view into a part of some pixels; the viewer's field of view is along the longer side of the window
+export function fitting({ camera: { position, target, fov }, outermost = [] }, { pitch, yaw }, wide = innerWidth, high = innerHeight) {
+  const longer = Math.max(innerWidth, innerHeight, 1);
+  if (!outermost.length) return { target, distance: (Math.hypot(...plus(position, target, -1)) * longer) / Math.max(Math.min(wide, high), 1) };
+  const [p, q] = [pitch * DEGREES, yaw * DEGREES], right = [Math.cos(q), 0, -Math.sin(q)], d = [Math.sin(q) * Math.cos(p), -Math.sin(p), Math.cos(q) * Math.cos(p)];
+  const up = [Math.sin(q) * Math.sin(p), Math.cos(p), Math.cos(q) * Math.sin(p)], t = (FITS * Math.tan((fov * DEGREES) / 2)) / longer;
+  const middle = [0, 1, 2].map((k) => (Math.min(...outermost.map((at) => at[k])) + Math.max(...outermost.map((at) => at[k]))) / 2);
+  const back = outermost.map((at) => plus(at, middle, -1)).map((at) => dot(at, d) + Math.max(Math.abs(dot(at, right)) / (t * Math.max(wide, 1)), Math.abs(dot(at, up)) / (t * Math.max(high, 1))));
+  return { target: middle, distance: Math.max(...back) };
+}
 
-// {x, y: its middle, far: how far the eye stands back} of that part
-function freePart(scene) {
+// {x, y: its middle, target, distance} of that part
+function freePart(scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
     .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, innerWidth), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, innerHeight) }))
     .filter(({ left, right, top, bottom }) => left < right && top < bottom);
-  const [x, y] = [innerWidth / 2, innerHeight / 2], far = (wide, high) => distance(firstView(scene, wide, high)), most = FARTHEST * far(innerWidth, innerHeight), found = [];
+  const whole = { x: innerWidth / 2, y: innerHeight / 2, ...fitting(scene, angles) }, found = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', innerWidth)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', innerHeight)) {
     if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, far: far(right - left, bottom - top) });
+    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, ...fitting(scene, angles, right - left, bottom - top) });
   }
-  const least = Math.min(...found.map((part) => part.far)), aside = (part) => Math.hypot(part.x - x, part.y - y);
-  if (!(least < most)) return { x, y, far: most / FARTHEST };
-  return found.filter((part) => part.far <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.far - b.far)[0];
+  const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
+  if (!(least < FARTHEST * whole.distance)) return whole;
+  return found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0];
 }
 
-// Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the view, all fits. draw(): letters and legend where they belong in the window as it is.
+// Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the
+// view, all fits. draw(): letters and legend where they belong in the window as it is. Returns fit(angles): a view that fits.
 export function stayFree(lens, scene, draw) {
-  let begun = null;
-  const numbers = ({ target, pitch, yaw, distance: away }) => [...target, pitch, yaw, away];
-  const moved = () => begun && numbers(lens.pose()).some((x, k) => Math.abs(x - begun[k]) > 1e-3);
-  const place = () => {
+  let fitted = null;
+  const numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
+  const fit = (angles) => {
     draw();
-    const { x, y, far } = freePart(scene);
-    if (!moved()) {
-      lens.set({ ...lens.pose(), target: firstView(scene).target, distance: far });
-      lens.begin();
-      begun = numbers(lens.pose());
-    }
+    const { x, y, ...place } = freePart(scene, angles);
+    lens.set({ ...angles, ...place });
+    lens.middle = [x, y];
+    fitted = numbers(lens.pose());
+  };
+  const place = () => {
+    if (numbers(lens.pose()).every((x, k) => Math.abs(x - fitted[k]) < 1e-3)) return fit(lens.pose());
+    draw();
+    const { x, y } = freePart(scene, lens.pose());
     lens.middle = [x, y];
   };
   document.querySelector('#live .fold')?.addEventListener('click', place);
   addEventListener('resize', place);
-  place();
+  fit(firstAngles(scene));
+  return fit;
 }

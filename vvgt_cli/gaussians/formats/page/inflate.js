@@ -1,10 +1,13 @@
-// Of a page in one file: the viewer's program, packed, becomes a script.
+// In a page that is one file, the viewer's program is packed; it becomes a script.
 (async () => {
   const text = atob(document.getElementById('program').textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
   const script = document.createElement('script');
   script.textContent = await new Response(stream).text();
+  document.addEventListener('securitypolicyviolation', ({ effectiveDirective: what }) => {
+    if (what.startsWith('script')) document.getElementById('said').textContent = 'The content security policy of the site blocks the 3D view: it has hashes of another version.';
+  });
   document.getElementById('program').remove();
   document.body.append(script);
-})().catch((error) => { document.getElementById('said').textContent = `This browser does not show it: ${error}`; });
+})().catch((error) => { document.getElementById('said').textContent = `This browser cannot show the 3D view: ${error}`; });

@@ -32,7 +32,7 @@ export function drawLegend(group, { nodes, live, right, bottom }) {
     group.append(element('path', { d: `M${right - WIDE - 4},${height(v)}h4`, stroke: '#ccc' }));
     group.append(label(shown(v, 5), right - WIDE - 7, height(v) + 4, { 'text-anchor': 'end', 'font-size': 12 }));
   }
-  group.append(label(live.unit || 'value', right, top - 9, { 'text-anchor': 'end', 'font-size': 12 }));
+  group.append(label([live.quantity, live.unit].filter(Boolean).join(', ') || 'value', right, top - 9, { 'text-anchor': 'end', 'font-size': 12 }));
   return values;
 }
 

@@ -5,7 +5,7 @@ const DEGREES = Math.PI / 180;
 const of = (v) => [v.x, v.y, v.z], vec = (a) => new Vec3(...a);
 export const plus = (a, b, s = 1) => a.map((x, i) => x + s * b[i]), dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// {pose, set, begin, look, project, ray, perPixel, flat, middle}; places are in the viewer's axes, pixels are of CSS
+// {pose, set, toward, orbit, move, project, ray, perPixel, flat, middle}; places are in the viewer's axes, pixels are of CSS
 export function lensOf(viewer) {
   const { app } = viewer, canvas = app.graphicsDevice.canvas, entity = app.root.findComponent('camera').entity, { camera } = entity;
   const rig = viewer.cameraManager();
@@ -58,13 +58,20 @@ export function lensOf(viewer) {
       now.position.copy(vec(at)).sub(focus);
       rig.snap();
     },
-    // the pose is the one that the viewer's reset goes back to
-    begin: () => rig.resetCamera.copy(rig.camera),
-    // from a direction onto what is looked at; up is shown upwards where the direction is vertical
-    look(from, up) {
-      const { target: at, distance } = lens.pose(), level = Math.hypot(from[0], from[2]) > 1e-3;
-      const [x, z] = level ? [from[0], from[2]] : from[1] > 0 ? [-up[0], -up[2]] : [up[0], up[2]];
-      lens.set({ target: at, pitch: -Math.asin(Math.max(-1, Math.min(1, from[1]))) / DEGREES, yaw: Math.atan2(x, z) / DEGREES, distance });
+    // the angles of a view from a direction; up is shown upwards where the direction is vertical
+    toward(from, up) {
+      const level = Math.hypot(from[0], from[2]) > 1e-3, [x, z] = level ? [from[0], from[2]] : from[1] > 0 ? [-up[0], -up[2]] : [up[0], up[2]];
+      return { pitch: -Math.asin(Math.max(-1, Math.min(1, from[1]))) / DEGREES, yaw: Math.atan2(x, z) / DEGREES };
+    },
+    // about the target, to the right and up, in degrees, and so many times as far
+    orbit(right, up, times = 1) {
+      const { pitch, yaw, distance, ...rest } = lens.pose();
+      lens.set({ ...rest, pitch: Math.max(-90, Math.min(90, pitch - up)), yaw: yaw + right, distance: distance * times });
+    },
+    // the target, to the right and up, by pixels
+    move(x, y) {
+      const { right, up } = basis(), { target: at, ...rest } = lens.pose(), by = lens.perPixel();
+      lens.set({ ...rest, target: plus(plus(at, right, x * by), up, y * by) });
     },
     // [x, y] in pixels of a place, null behind the eye
     project(p) {

@@ -17,7 +17,7 @@ async function unpacked(id, alone, size) {
     const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
     if (bytes.length === size) return bytes;
   } catch { /* said below */ }
-  throw new Damaged('its values are not whole');
+  throw new Damaged('its values are incomplete');
 }
 
 // {live, layers, bytes, count, sums, rows, planes, apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so

@@ -82,7 +82,7 @@ export function looksOf(look) {
   };
 }
 
-// {value, in: its unit} of the layer that is most at a place: the mean of its Gaussians there, each rising along its gradient, or the name of the
+// {value, in: its unit, layer, row: of its labels} of the layer that is most at a place: the mean of its Gaussians there, each rising along its gradient, or the name of the
 // label that is most there. Of several layers, and of labels, what is not shown does not count; a value of null: nothing is there.
 export function valueAt(look, numbers, place) {
   const looks = looksOf(look), found = new Map();  // by row
@@ -93,7 +93,7 @@ export function valueAt(look, numbers, place) {
     const { sum, weights } = found.get(row) ?? { sum: 0, weights: 0 };
     found.set(row, { sum: sum + weight * (value + spread * r * Math.min(Math.max(z, -2), 2)), weights: weights + weight });
   }
-  const [[row, { sum, weights }] = [0, { weights: 0 }]] = [...found].sort((a, b) => b[1].weights - a[1].weights), { labels, row: first, values: [lo, hi], unit } = look.layers[layerOf(look, row)];
+  const [[most, { sum, weights }] = [0, { weights: 0 }]] = [...found].sort((a, b) => b[1].weights - a[1].weights), layer = layerOf(look, most), { labels, row: first, values: [lo, hi], unit } = look.layers[layer], row = most - first;
   if (!weights) return { value: null, in: '' };
-  return labels.length ? { value: labels[row - first].name, in: '' } : { value: Math.min(Math.max(sum / weights, lo), hi), in: unit };
+  return labels.length ? { value: labels[row].name, in: '', layer, row } : { value: Math.min(Math.max(sum / weights, lo), hi), in: unit, layer };
 }

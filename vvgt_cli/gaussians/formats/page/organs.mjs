@@ -9,18 +9,18 @@ function row({ name, number }, k) {
   element.innerHTML = '<button class="eye" aria-pressed="true">●</button><input type="color"><span></span><input type="range" min="0" max="1" step="0.01"><button class="solo" aria-pressed="false">solo</button>';
   const [eye, color, text, slider, solo] = element.children;
   text.textContent = text.title = name;  // never markup
-  for (const [part, what] of [[eye, 'show'], [color, 'colour of'], [slider, 'opacity of'], [solo, 'only']]) {
+  for (const [part, what] of [[eye, 'show'], [color, 'colour of'], [slider, 'opacity of'], [solo, 'solo']]) {
     part.setAttribute('aria-label', `${what} ${name}`);
     part.title = `${what} ${name} (${number})`;
   }
   return element;
 }
 
-// {root, rows(): of each label number, name, color, and the opacity that is seen}; apply(rows) shows them; `key` of links and `history` as light.mjs has it
+// {root, select(k): shows a label's row, rows(): of each label number, name, color, and the opacity that is seen}; apply(rows) shows them; `key` of links and `history` as light.mjs has it
 export function organs(apply, labels, key, history) {
   const root = document.createElement('div');
   root.className = 'organs';
-  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><input type="search" placeholder="${labels.length} labels" aria-label="search the labels"><button class="all" title="show all">all</button><button class="none" title="hide all">none</button></div><ul></ul>`;
+  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><input type="search" placeholder="${labels.length} labels" aria-label="search the labels"><button class="all" title="show all labels">all</button><button class="none" title="hide all labels">none</button></div><ul></ul>`;
   const find = (selector) => root.querySelector(selector), list = find('ul');
   find('[type=search]').hidden = labels.length <= SEARCHED;
   list.append(...labels.map(row));
@@ -73,5 +73,25 @@ export function organs(apply, labels, key, history) {
   show();
   const digits = (x, n) => Number(x.toFixed(n));
   const rows = () => seen().map(({ rgb, opacity }, k) => ({ number: labels[k].number, name: labels[k].name, color: rgb.map((c) => digits(c, 4)), opacity: digits(opacity, 6) }));
-  return { root, rows };
+  function select(k) {
+    [...list.children].forEach((one, j) => one.classList.toggle('chosen', j === k));
+    if (list.children[k].hidden) find('[type=search]').value = '';
+    for (const one of list.children) one.hidden = one.hidden && find('[type=search]').value !== '';
+    list.children[k].scrollIntoView({ block: 'nearest' });
+  }
+  // looks of some labels: [{number, opacity, color}]; opacity 0 hides
+  function set(list) {
+    const some = list.map(({ number, opacity, color }) => {
+      const k = labels.findIndex((one) => one.number === number), { rgb, opacity: old } = now.rows[k] ?? {};
+      if (k < 0) throw new Error(`label ${number}: not in this file`);
+      const next = { rgb: color ?? rgb, opacity: opacity || old, on: opacity === undefined ? now.rows[k].on : opacity > 0 };
+      if (![...next.rgb, next.opacity].every((x) => x >= 0 && x <= 1) || next.rgb.length !== 3) throw new Error(`label ${number}: expected color and opacity in [0, 1]`);
+      return [k, next];
+    });
+    history.keep();
+    now = { ...now, solo: -1 };
+    some.forEach(([k, next]) => change(k, next));
+    show();
+  }
+  return { root, rows, select, set };
 }

@@ -6,14 +6,14 @@ const RADIUS = 30, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];
 const HIDDEN = 0.45;  // projected length below which the end that looks away is covered by the other
 
 export function drawLetters(group, { lens, world, left, high }) {
-  const { right, up, forward } = lens.basis(), middle = [left + RADIUS + 12, high - 76 - RADIUS], ends = [];
+  const { right, up, forward } = lens.basis(), middle = [left + RADIUS + 12, high - 28 - RADIUS], ends = [];
   world.axes.forEach((axis, k) => {
     for (const sign of [-1, 1]) {
       const [x, y, far] = [right, up, forward].map((of) => sign * dot(of, axis));
       ends.push({ letter: world.letters[k][sign < 0 ? 0 : 1], x, y, far, color: COLORS[k], seen: far < 0 || Math.hypot(x, y) > HIDDEN });
     }
   });
-  group.append(element('rect', { x: left, y: high - 148, width: 84, height: 84, fill: 'none' }));  // as large from every side
+  group.append(element('rect', { x: left, y: high - 100, width: 84, height: 84, fill: 'none' }));  // as large from every side
   ends.sort((a, b) => b.far - a.far);
   const seen = ends.filter((end) => end.seen), short = 0.6 * RADIUS, opacity = ({ far }) => (0.75 - 0.25 * far).toFixed(2);
   group.append(...seen.map((end) => element('line', { x1: middle[0], y1: middle[1], x2: middle[0] + short * end.x, y2: middle[1] - short * end.y, stroke: end.color, 'stroke-width': 2, opacity: opacity(end) })));
@@ -30,9 +30,9 @@ export function sides({ letters, anatomical }) {
   return [['front', ...towards('A', [1, -1])], ['left', ...towards('L', [0, -1])], ['top', ...towards('S', [2, 1])]];
 }
 
-// The view from one end of an axis
+// The angles of the view from one end of an axis
 export function seenFrom(lens, world, axis, sign) {
   const from = world.axes[axis].map((x) => sign * x);
   const [, front, facing] = sides(world)[0], ahead = world.axes[front].map((x) => (world.anatomical ? facing : -facing) * x);
-  lens.look(from, axis === front ? world.axes[2] : ahead);
+  return lens.toward(from, axis === front ? world.axes[2] : ahead);
 }

@@ -1,16 +1,12 @@
 // The page of `vvgt view` and of `-o out.html`: SuperSplat's viewer, its camera where `vvgt render --orbit` begins, and a
 // slider and a list where there are several frames, functions or labels. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
-import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { Damaged, unlessFailing, wholePly } from './damage.mjs';
-import { firstView } from './free.mjs';
 import { liveLook } from './live.mjs';
-import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
 import { patched } from './patch.mjs';
 import { served, waiting } from './server.mjs';
-import whereCss from './where.css';
 import { where } from './where.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
@@ -26,14 +22,14 @@ const settings = {
     grading: { ...off, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
     vignette: { ...off, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 }, fringing: { ...off, intensity: 0.5 },
   },
-  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: firstView(scene) }],
+  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: scene.camera }],
 };
 
 // what the file itself holds (base64), or the server's answer
 function content({ file, held, whole }) {
   if (!held) return fetch(file);
   const own = heldBytes(held), bytes = whole === undefined ? own : patched(heldBytes(scene.frames[whole].held), own);
-  if (!wholePly(bytes)) throw new Damaged('its Gaussians are not whole');
+  if (!wholePly(bytes)) throw new Damaged('its Gaussians are incomplete');
   if (scene.frames.length === 1) document.getElementById(held).remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
 }
@@ -61,7 +57,7 @@ function series(viewer, live) {
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
   const box = document.createElement('div');
   box.id = 'series';
-  box.innerHTML = '<button aria-label="play">▶</button><input type="range" min="0" value="0" aria-label="frame"><select aria-label="name"></select>';
+  box.innerHTML = '<button aria-label="play" title="play">▶</button><input type="range" min="0" value="0" aria-label="frame"><select aria-label="choose a frame"></select>';
   const [button, slider, list] = box.children;
   slider.max = scene.frames.length - 1;
   list.append(...scene.frames.map((frame) => new Option(frame.name)));
@@ -107,7 +103,7 @@ function series(viewer, live) {
         shown = k;
       } catch (error) {
         assets.delete(k);
-        said.textContent = `${scene.frames[k].name} cannot be read: ${error}`;
+        said.textContent = `${scene.frames[k].name} could not be loaded: ${error}`;
         shown = -1;  // asked for again, it is tried again
         if (wanted === k) return;
       }
@@ -133,32 +129,23 @@ function series(viewer, live) {
   button.addEventListener('click', () => {
     playing = !playing;
     button.textContent = playing ? '❚❚' : '▶';
+    button.title = playing ? 'pause' : 'play';
+    button.setAttribute('aria-label', button.title);
     if (playing) play();
   });
   return show;
 }
 
-// At first sight without the viewer's list of keys over the picture; its button shows it.
-function hideKeys() {
-  try {
-    if (localStorage.getItem('controlsPanelOpen') === null) localStorage.setItem('controlsPanelOpen', 'false');
-  } catch { /* storage is not to be had everywhere */ }
-}
-
 async function start() {
-  if (!document.createElement('canvas').getContext('webgl2')) throw new Error('it has no WebGL 2, or it is turned off');
-  hideKeys();
-  const style = document.createElement('style');
-  style.textContent = css + panelCss + whereCss;
-  document.head.append(style);
+  if (!document.createElement('canvas').getContext('webgl2')) throw new Error('WebGL 2 is missing or turned off');
   if (scene.waits) return waiting(said);
   document.body.className = scene.streamed ? '' : 'begins';  // what is shown before its place is known
   const { file } = scene.frames[0];
   const response = scene.streamed ? null : await content(scene.frames[0]);  // what is streamed the engine fetches itself
-  if (response && !response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
+  if (response && !response.ok) throw new Error(`${scene.frames[0].name} could not be loaded`);
   let deliver;
   const viewer = await createViewer({
-    container: document.getElementById('view'), contentUrl: file, contentFilename: file, settings,
+    container: document.getElementById('view'), contentUrl: file, contentFilename: file, settings, ui: false,
     contents: response ? new Promise((done) => { deliver = done; }) : undefined, aa: scene.rule.compensate,
     noanim: true,
     renderer: 'webgl',  // the one whose pictures are measured; WebGPU leaves more splats out
@@ -169,24 +156,22 @@ async function start() {
   if (scene.streamed) viewer.app.scene.gsplat.splatBudgetMode = GSPLAT_BUDGET_LIMIT;  // levels by distance, not as many as fit
   deliver?.(response);
   if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
-  viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
-  if (scene.streamed) {
-    said.textContent = '';
-    window.vvgt = { viewer, show: null };
-    return;
-  }
-  if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
+  Object.assign(viewer.state, { cameraMode: 'orbit', inputEnabled: false });  // the viewer would turn the object; keys are ours
+  if (scene.frames.length === 1 && !scene.live) document.body.append(named());
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
-  if (live) served(live, viewer, scene.server);
+  const { converted } = scene;
+  if (live) await served(live, viewer, scene.server, converted && { ...converted, contents: await content(converted) });
   const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
   await here.restored;
   document.body.className = '';
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };
+  here.site.loaded();
 }
 
 start().catch((error) => {
   const text = error.message ?? String(error);
-  said.textContent = error instanceof Damaged ? `This page is damaged: ${text}; get it anew` : `This browser does not show it: ${text}`;
+  said.textContent = error instanceof Damaged ? `This page is damaged: ${text}. Download it again.` : `This browser cannot show the 3D view: ${text}.`;
   document.getElementById('view').hidden = true;
+  if (parent !== window) parent.postMessage({ vvgt: 'error', message: said.textContent }, '*');
 });

@@ -4,12 +4,12 @@ import { editor } from './editor.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
 
-const HTML = `<header><span class="named"><b></b><i></i></span><output></output><button class="fold" aria-label="panel" title="panel">▾</button></header>
-<select class="layer" aria-label="layer" title="layer"></select>`;
+const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
+<output></output><select class="layer" aria-label="layer" title="layer"></select>`;
 const STEPS = 200;  // that undo goes back
 
 // the file's name and what kind it is
-export function named(kind, element = document.createElement('div')) {
+export function named(kind = '', element = document.createElement('header')) {
   if (!element.className) element.id = 'named';
   element.replaceChildren(document.createElement('b'), document.createElement('i'));
   [element.firstChild.textContent, element.lastChild.textContent] = [document.title, kind];
@@ -21,9 +21,10 @@ export function named(kind, element = document.createElement('div')) {
 export function panel(look, viewer, live) {
   const root = document.createElement('section');
   root.id = 'live';
+  root.setAttribute('aria-label', 'look');
   root.innerHTML = HTML;
   document.body.append(root);
-  named('live', root.querySelector('.named'));
+  named('', root.querySelector('.named'));
   const find = (selector) => root.querySelector(selector), list = find('.layer'), undone = [], parts = [], layers = [];
   let told = () => {}, chosen = 0;
 
@@ -62,6 +63,12 @@ export function panel(look, viewer, live) {
     history.chosen();
     told(true);
   }
+  // what is clicked: its layer, and of a label its row
+  function select({ layer, row }) {
+    if (layer === undefined) return;
+    if (layer !== chosen) choose(list.selectedIndex = layer);
+    if (row !== undefined) layers[layer].select?.(row);
+  }
   list.append(...layers.map(({ layer }, k) => new Option(layer.title || `layer ${k}`)));
   list.hidden = layers.length < 2;
   list.addEventListener('change', () => choose(list.selectedIndex));
@@ -73,7 +80,6 @@ export function panel(look, viewer, live) {
   };
   find('.fold').addEventListener('click', () => fold(!root.classList.contains('folded')));
   root.addEventListener('click', ({ target }) => { if (target.className === 'undo') undo(); });
-  for (const name of ['keydown', 'keyup']) root.addEventListener(name, (event) => event.stopPropagation());  // not the viewer's
   window.addEventListener('keydown', (event) => {
     if ((event.ctrlKey || event.metaKey) && !event.shiftKey && event.key.toLowerCase() === 'z') {
       event.preventDefault();
@@ -85,7 +91,7 @@ export function panel(look, viewer, live) {
   enable();
   choose(0);
   return {
-    root, look, cut, parts, layers, at: () => layers[chosen], changed(f) { told = f; },
+    root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
     alone: () => cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };

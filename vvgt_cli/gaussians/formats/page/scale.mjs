@@ -11,7 +11,7 @@ export function round(most) {
 export function drawScale(group, { lens, world, wide, high, left }) {
   const pixel = lens.perPixel() * world.length, most = Math.min(160, wide / 3) * pixel;
   if (!(most > 0 && most < Infinity)) return null;
-  const length = round(most), across = length / pixel, y = high - 72;
+  const length = round(most), across = length / pixel, y = high - 24;
   const path = `M${left},${y - 5}v10M${left},${y}h${across}M${left + across},${y - 5}v10`;
   group.append(element('path', { d: path, fill: 'none', stroke: '#000', 'stroke-width': 5, 'stroke-opacity': 0.6 }), element('path', { d: path, fill: 'none', stroke: '#fff', 'stroke-width': 2 }));
   const text = `${shown(length)}${world.unit && ` ${world.unit}`}`;

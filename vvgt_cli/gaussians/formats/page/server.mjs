@@ -1,5 +1,5 @@
-// The server behind a live page: it converts the volume for the function that the page shows, and what it makes is swapped
-// in; files to save. Of a page in a file: the function alone.
+// The better form of what a live page shows: the server converts the volume under the function of the page, or the file holds the
+// conversion under its own; it is swapped in. Files to save.
 import { Asset, Entity } from 'playcanvas';
 
 const QUIET = 300, ASK = 300;  // milliseconds without a change after which the server is asked; between two looks
@@ -13,7 +13,7 @@ export async function waiting(said) {
     try {
       found = await (await fetch('state')).json();
     } catch {
-      if (said.textContent === 'loading' || !said.dataset.failed) said.textContent = 'vvgt view has ended';
+      if (said.textContent === 'loading' || !said.dataset.failed) said.textContent = 'vvgt view has stopped';
       return;
     }
     if (found.state !== 'first' && found.state !== 'failed') return location.reload();
@@ -64,8 +64,8 @@ function substitute({ app }) {
     app.assets.remove(asset);
     asset.unload();
   }
-  async function load(file, still) {
-    const asset = new Asset(file, 'gsplat', { url: file, filename: file });
+  async function load(file, still, contents) {
+    const asset = new Asset(file, 'gsplat', { url: file, filename: file, contents });
     await new Promise((done, fail) => {
       asset.once('load', done);
       asset.once('error', fail);
@@ -84,8 +84,9 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
-export function served(panel, viewer, server) {
+// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file;
+// converted: {file, contents, said} of the conversion under the file's own function, in a page in a file. Resolves once that is shown.
+export async function served(panel, viewer, server, converted) {
   const { root, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
@@ -102,11 +103,12 @@ export function served(panel, viewer, server) {
     text.className = failed ? 'failed' : '';
   };
 
-  const improved = () => number !== null && !panel.alone();
+  const begun = JSON.stringify(shown());
+  const improved = () => number !== null && !panel.alone() && (!converted || JSON.stringify(shown()) === begun);
   function put() {
     better.put(improved());
-    const [what, ...rest] = (improved() ? told : 'live').split(/(?=, |: )/);
-    kind.textContent = what;
+    const [what, ...rest] = (improved() ? told : 'preview').split(/(?=, |: )/);
+    kind.textContent = server?.converts || converted ? what : '';
     kind.append(Object.assign(document.createElement('span'), { textContent: rest[0] ?? '' }));  // where there is room
     if (!busy) say(rest.length ? told : '');
   }
@@ -136,12 +138,12 @@ export function served(panel, viewer, server) {
             put();
           }
           if (state.scored) return;
-        } else say(`converting for this function: ${state.said}`);
+        } else say(`converting under this function: ${state.said}`);
         await pause(ASK);
       }
       if (mine === change && busy) end();
     } catch (error) {
-      if (mine === change) end(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
+      if (mine === change) end(error instanceof TypeError ? 'vvgt view has stopped' : error.message, true);
     }
   }
 
@@ -168,11 +170,11 @@ export function served(panel, viewer, server) {
       return download(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: 'application/json' }), rows ? 'labels.json' : 'tf.json');
     }
     try {
-      const answer = await send('save', improved() ? { file, number } : { file, ...shown(), light: panel.lit() });
+      const answer = await send('save', improved() ? { file, number, ...shown() } : { file, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       download(await answer.blob(), `${name}.${file}`);
     } catch (error) {
-      say(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
+      say(error instanceof TypeError ? 'vvgt view has stopped' : error.message, true);
     }
   }
 
@@ -186,6 +188,12 @@ export function served(panel, viewer, server) {
     root.addEventListener('change', tell);
     button.addEventListener('click', () => save(file));
     row.append(button);
+  }
+  if (converted) {
+    await better.load(converted.file, () => true, converted.contents);
+    [number, told] = [0, converted.said];
+    panel.changed(put);
+    put();
   }
   if (server?.converts) {
     for (const event of ['pointerdown', 'pointerup', 'pointercancel']) {

@@ -1,10 +1,12 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
-import { fill, rowsOf } from './about.mjs';
+import { rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
-import { stayFree } from './free.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
+import { firstAngles, stayFree } from './free.mjs';
 import { handlesOf } from './handles.mjs';
+import { helpRows, listed, listen } from './keys.mjs';
 import { lensOf } from './lens.mjs';
+import { messages } from './messages.mjs';
 import { frameParts, linkOf, liveParts, restore, viewParts } from './link.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawRuler, placeText, rulerOf } from './ruler.mjs';
@@ -17,81 +19,104 @@ const icon = (path) => `<svg viewBox="0 0 18 18" aria-hidden="true"><path d="${p
 const ICONS = {
   perspective: icon('M2 15L6 4h6l4 11Z'), orthographic: icon('M3.5 3.5h11v11h-11Z'), measure: icon('M2.5 12.5l10-10 3 3-10 10ZM6 9l1.5 1.5M9 6l1.5 1.5'),
   picture: icon('M2 6h3l1.5-2h5L13 6h3v9H2ZM9 7.5a2.5 2.5 0 1 0 .01 0'), link: icon('M7.5 10.5l3-3M8 5l2-2a3 3 0 0 1 5 4l-2.5 2M10 13l-2 2a3 3 0 0 1-5-4l2.5-2'),
+  fit: icon('M3 6V3h3M12 3h3v3M15 12v3h-3M6 15H3v-3M6.5 6.5h5v5h-5Z'), reset: icon('M4 3v4h4M4.2 7A5.5 5.5 0 1 1 3.6 10.5'), help: icon('M6.3 6.3a2.8 2.8 0 1 1 3.9 2.5Q9 9.4 9 11M9 13.5v.5'),
   full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
 };
 
 export function where(viewer, scene, live, show) {
   const lens = lensOf(viewer), { app } = viewer, svg = element('svg', { id: 'where', role: 'img' });
   const handles = live && handlesOf(lens, live.cut);
-  document.querySelector('#view .sse-sceneLayer').append(svg, ...(handles ? [handles.svg] : []));
-  const box = document.createElement('div');
+  document.querySelector('#view .sse-viewer').append(svg, ...(handles ? [handles.svg] : []));
+  const values = live?.layers.some(({ nodes }) => nodes), box = document.createElement('nav'), buttons = [];
   box.id = 'tools';
-  const about = Object.assign(document.createElement('section'), { id: 'about', hidden: true, innerHTML: '<dl></dl>' });
+  box.setAttribute('aria-label', 'view');
+  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []);
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
-  document.body.append(box, about, places);
+  document.body.append(box, help.root, about.root, places);
   places.setAttribute('role', 'status');
   let data, world, facts, drawn = '', stamp = 0, told = '';
   const state = {};
 
-  const dataNow = () => app.assets.get(app.root.findByName('gsplat').gsplat.asset)?.resource?.gsplatData ?? data;
+  // what is streamed is not held as a whole: its comments alone
+  const dataNow = () => app.assets.get(app.root.findByName('gsplat').gsplat.asset)?.resource?.gsplatData ?? data ?? { comments: scene.comments ?? [], numSplats: 0 };
   const frame = () => (show ? document.querySelector('#series select').selectedIndex : 0);
   const again = (text = '') => { told = text; stamp++; app.renderNextFrame = true; };
-  const ruler = rulerOf(viewer, lens, () => world, dataNow, live?.look ?? null, again);
+  const ruler = rulerOf(lens, () => world, dataNow, live?.look ?? null, again, (place) => {
+    live?.select(place);
+    site.say('picked', { place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
+  });
   const parts = [...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   function take(now) {  // another frame is another file
     data = now;
     facts = factsOf(now.comments);
-    world = worldOf(facts);
+    world = worldOf(facts, scene.enlarged);
     if (ruler.measuring) ruler.measure(true);
-    sides(world).forEach(([, axis, sign], k) => { views[k].textContent = world.letters[axis][sign < 0 ? 0 : 1]; });
+    sides(world).forEach(([, axis, sign], k) => {
+      const { made, title } = buttons[k];
+      made.textContent = world.letters[axis][sign < 0 ? 0 : 1];
+      made.setAttribute('aria-label', `${made.textContent}: ${title}`);
+    });
     live?.cut.name(world.letters);
-    fill(about.firstChild, rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live }));
+    about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live, converted: scene.converted }));
   }
 
-  const button = (name, title, press) => {
+  const button = (name, title, key, press) => {
     const made = document.createElement('button');
-    Object.assign(made, { className: name, title, innerHTML: ICONS[name] ?? '' });
+    Object.assign(made, { className: name, title: key ? `${title} (${key})` : title, innerHTML: ICONS[name] ?? '' });
     made.setAttribute('aria-label', title);
     made.addEventListener('click', press);
     box.append(made);
+    buttons.push({ title, key, press, made });
     return made;
   };
-  let last = '';
+  const look = (angles) => { fit(angles); again(); };
+  let last = null;
   const view = (k, opposite) => {
-    const [name, axis, sign] = sides(world)[k], other = opposite || last === name;  // once more: from the other side
-    seenFrom(lens, world, axis, other ? -sign : sign);
-    last = other ? '' : name;
-    again();
+    const [, axis, sign] = sides(world)[k], other = opposite ?? last === k;  // once more: from the other side
+    last = other ? null : k;
+    look(seenFrom(lens, world, axis, other ? -sign : sign));
   };
-  const views = [['front', 'y'], ['left', 'x'], ['top', 'z']].map(([name, key], k) => button(name, `from the ${name}; again, or with Shift: from the other side (${key})`, (event) => view(k, event.shiftKey)));
-  const projection = button('perspective', 'orthographic or perspective (o)', () => { lens.flat = !lens.flat; again(); });
-  const measuring = button('measure', 'places and distances: click two points (m)', () => ruler.measure(!ruler.measuring));
-  const picture = async () => save(await pictureOf(viewer, svg), `${scene.frames[frame()].name.replace(/\.(ply|html)$/, '')}.png`);
-  button('picture', 'save the picture as PNG (p)', picture);
-  const copy = async () => {
+  for (const [k, [name, opposite, key]] of [['front', 'back', 'y'], ['left', 'right', 'x'], ['top', 'bottom', 'z']].entries()) {
+    button(name, `view from the ${name}; again or with Shift: from the ${opposite}`, key, (event) => view(k, event.shiftKey || undefined));
+  }
+  button('fit', 'fit into the window', 'f', () => look(lens.pose()));
+  button('reset', 'reset the view', 'r', () => { last = null; look(firstAngles(scene)); });
+  const projection = button('perspective', 'orthographic or perspective', 'o', () => { lens.flat = !lens.flat; again(); });
+  const measuring = button('measure', 'measure a distance: click two points', 'm', () => ruler.measure(!ruler.measuring));
+  measuring.hidden = Boolean(scene.streamed);
+  const picture = async () => save(await pictureOf(viewer, svg), `${scene.frames[frame()].name.replace(/\.(ply|html)$/, '').replace(/[^\w.-]+/g, '-')}.png`);
+  button('picture', 'save the picture as PNG', 'p', picture);
+  button('link', 'link to this view', 'l', async () => {
     const link = linkOf(parts);
-    history.replaceState(null, '', link);
+    try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
     const copied = await navigator.clipboard?.writeText(link).then(() => true, () => false);
-    again(copied ? 'link to this view copied' : 'the address is a link to this view');
+    again(copied ? 'link to this view copied' : 'the address bar now links to this view');
     setTimeout(again, 4000);
-  };
-  button('link', 'link to this view (l)', copy);
-  const whole = document.documentElement;
-  if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
-  const open = button('about', 'what this is (i)', () => { about.hidden = !about.hidden; open.setAttribute('aria-expanded', String(!about.hidden)); });
-
-  const keys = { y: [view, 0], x: [view, 1], z: [view, 2], o: [() => projection.click()], m: [() => measuring.click()], p: [picture], l: [copy], i: [() => open.click()] };
-  window.addEventListener('keydown', (event) => {
-    if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest?.('input, select, textarea, #live')) return;
-    if (event.key === 'Escape') { ruler.measure(false); about.hidden = true; }
-    const [act, k] = keys[event.key.toLowerCase()] ?? [];
-    act?.(k, event.shiftKey);
   });
+  const whole = document.documentElement;
+  if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', '', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
+  for (const kind of ['VR', 'AR']) {
+    const made = button('xr', kind === 'VR' ? 'virtual reality' : 'augmented reality', '', () => viewer.startXR(kind.toLowerCase()).catch(() => {})), offer = () => { made.hidden = !viewer.state[`canStart${kind}`]; };
+    made.textContent = kind;
+    viewer.events.on(`canStart${kind}:changed`, offer);
+    offer();
+  }
+  help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
+  about.of(button('about', 'about this file', 'i', about.toggle));
+  help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed }));
+  lens.canvas.tabIndex = 0;
+  lens.canvas.setAttribute('role', 'application');
+  lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
+  const act = Object.fromEntries(buttons.filter(({ key }) => key).map(({ key, press }) => [key, press]));
+  listen(lens, { ...act, '?': help.toggle }, () => ruler.measure(false), again);
+  const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
+  const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
   addEventListener('hashchange', () => restore(parts).then(again));
 
   function legend(group, wide, high) {
-    const baked = live ? null : facts.legend, place = { right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 };
+    const baked = live ? null : facts.legend, boxes = buttons.map(({ made }) => made.getBoundingClientRect()), low = Math.max(...boxes.map((one) => one.bottom));
+    const place = { right: (low > high - 182 ? Math.min(...boxes.map((one) => one.left || wide)) : wide) - 12, bottom: high - 24 };
     if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
     if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
     const { layer, nodes } = live?.at() ?? {};
@@ -109,7 +134,7 @@ export function where(viewer, scene, live, show) {
     handles?.draw(world);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
-    const lines = ruler.places.map((place, k) => `${k + 1}: ${placeText(place, world)}`);
+    const lines = ruler.places.map((place, k) => `${ruler.measuring ? `${k + 1}: ` : ''}${placeText(place, world)}`);
     if (ruler.places.length > 1) lines.push(`distance ${shown(ruler.distance(), 4)}${world.unit && ` ${world.unit}`}`);
     else if (ruler.measuring && !lines.length) lines.push('click two points');
     if (told) lines.push(told);
@@ -127,7 +152,7 @@ export function where(viewer, scene, live, show) {
     draw();
   });
   take(dataNow());
-  stayFree(lens, scene, draw);
-  Object.assign(state, { lens, ruler, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
+  const fit = stayFree(lens, scene, draw);
+  Object.assign(state, { lens, ruler, site, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
