@@ -200,22 +200,23 @@ def test_no_time_for_steps_is_said(vvgt, volume: Path, tmp_path: Path) -> None:
     assert "skipped: refinement" in found.err
 
 
-@pytest.mark.parametrize("options", [(), ("--light", "headlight"), ("--blocks", "32")])
+@pytest.mark.parametrize("options", [(), ("--light", "headlight")])
 def test_large_clouds_are_refined_by_regions_in_every_format(
     vvgt, volume: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
 ) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.convert.MANY", 5000)
     light = options if "--light" in options else ()
     assert vvgt("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply").code == 0
-    found = vvgt("convert", volume, *FIT[:-1], *STEPS, *options, "-o", tmp_path / "a.ply")
+    found = vvgt("convert", volume, *FIT[:-1], *STEPS, "--blocks", "32", *options, "-o", tmp_path / "a.ply")
     assert found.code == 0, found.err
     assert "region by region" in found.err
-    assert len(read_splats(str(tmp_path / "a.ply"))[0]) == len(read_splats(str(tmp_path / "closed.ply"))[0])
+    made, closed = (read_splats(str(tmp_path / f"{name}.ply"))[0] for name in ("a", "closed"))
+    assert len(made) == pytest.approx(len(closed), rel=0.03)  # those that no viewer draws are left out
     assert read_splats(str(tmp_path / "a.ply"))[1].certificate is not None
     if not light:
         old, new = scores(volume, tmp_path / "closed.ply", tmp_path / "a.ply")
         assert new > old + 1
-        assert vvgt("convert", volume, *FIT, *STEPS, "-o", tmp_path / "a.spz").code == 0
+        assert vvgt("convert", volume, *FIT, *STEPS, "--blocks", "64", "-o", tmp_path / "a.spz").code == 0
     assert not list(tmp_path.glob(".*"))
 
 
@@ -223,10 +224,10 @@ def test_workers_are_as_many_as_threads_memory_and_work_allow(volume: Path, monk
     small = load(SourceRequest(str(volume))).volume
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 5 << 30)
     assert worker_count(BlockOptions(), small, 100_000, 8) == 1
-    assert worker_count(BlockOptions(), small, 2_000_000, 8) == 5
-    assert worker_count(BlockOptions(), small, 2_000_000, 2) == 2
+    assert worker_count(BlockOptions(), small, 4_000_000, 8) == 5
+    assert worker_count(BlockOptions(), small, 4_000_000, 2) == 2
     assert worker_count(BlockOptions(workers=3), small, 100, 1) == 3
-    assert worker_count(BlockOptions(shard=(1, 2)), small, 2_000_000, 8) == 1
+    assert worker_count(BlockOptions(shard=(1, 2)), small, 4_000_000, 8) == 1
     large = replace(small, data=np.broadcast_to(np.uint8(0), (1024, 1024, 1024)))
     assert worker_count(BlockOptions(), large, 100, 4) == 4
 

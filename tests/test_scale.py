@@ -313,8 +313,8 @@ def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_
 
 def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeypatch):
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.field.open import _edge
-    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.open import _measured
+    from vvgt_cli.field.settings import BlockOptions, block_edge
     from vvgt_cli.field.source import SourceRequest
 
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 700 << 20)
@@ -327,9 +327,9 @@ def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeyp
     ):
         with open(tmp_path / name, "wb") as file:
             file.truncate(1024 * 512 * 512 * (4 if "float" in name else 1))  # a hole: nothing of it is read
-        request = SourceRequest(str(tmp_path / name), tf=tf)
+        volume, voxel = _measured(SourceRequest(str(tmp_path / name), tf=tf))
         if fits:
-            assert _edge(request, BlockOptions()) == 128
+            assert block_edge(volume, BlockOptions(), voxel) == 128
         else:
             with pytest.raises(UsageError, match="MiB more"):
-                _edge(request, BlockOptions())
+                block_edge(volume, BlockOptions(), voxel)

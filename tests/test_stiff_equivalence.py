@@ -96,7 +96,11 @@ def assert_alike(one, other, limit):
     ("name", "light"), [*((name, "none") for name in ROWS), *((name, "headlight") for name in LIT)]
 )
 def test_in_blocks_as_in_memory(name, light, live):
-    assert_alike(*(ROWS[name].converted(live, light, blocks) for blocks in (None, BLOCK)), SAME)
+    found = [ROWS[name].converted(live, light, blocks) for blocks in (None, BLOCK)]
+    if live and name == "shell of a thousandth":  # a live file shows no band that is so much narrower than its spreads
+        assert not np.any(found)
+        return
+    assert_alike(*found, SAME)
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -28,7 +28,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
-from vvgt_cli.field.settings import MANY, BlockOptions
+from vvgt_cli.field.settings import MANY
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
@@ -150,15 +150,17 @@ def run_conversion(
     if request.live:
         check_live(request)
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
+    regions = False
     if made is None and start is None and isinstance(field, Blocked) and by_regions(request):
         from vvgt_cli.conversion.shards.run import gaussians_by_regions
 
-        made = gaussians_by_regions(run, request, field)
+        made, regions = gaussians_by_regions(run, request, field), True
     if start is not None:
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None)
     if made is not None:
-        plan.stages, plan.skipped = [stage for stage in plan.stages if stage.scores], []
+        finish = planner.finish(work.limits.time_budget is None) if regions else []
+        plan.stages, plan.skipped = [*finish, *(stage for stage in plan.stages if stage.scores)], []
         plan.gaussians, plan.workload = len(made), replace(plan.workload, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
@@ -167,6 +169,8 @@ def run_conversion(
     kept = work.checkpoint.load(FITTED)
     if made is not None:
         work.gaussians = as_stored(made)
+        improve(work, plan)
+        work.gaussians = as_stored(work.made())
     elif kept:
         work.gaussians = kept[0]
         run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only scoring remains")
@@ -291,11 +295,10 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
     if request.fit.device != "cpu":
         load_ahead()
     options, most = request.blocks or automatic(request.source, run.console), None
-    if by_regions(request):
+    if options is not None and by_regions(request):
         from vvgt_cli.conversion.shards.plan import most_cells
 
-        run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
-        options, most = options or BlockOptions(), most_cells(request.budget())
+        most = most_cells(request.budget())
     if options is None:
         with run.stage("read") as stage:
             source = load(request.source)
@@ -316,7 +319,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
 
 
 def by_regions(request: ConvertRequest) -> bool:
-    """Return whether a request is for so many Gaussians that they are refined region by region."""
+    """Return whether a request in blocks is for so many Gaussians that they are refined region by region."""
     fit = request.fit
     other = fit.init != "vbm" or fit.model or fit.device != "cpu" or request.live or request.checkpoint
     return request.budget() > MANY and fit.steps != 0 and not other

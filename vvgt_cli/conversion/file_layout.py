@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from vvgt_cli.conversion.place import up_axis, with_place
 from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.field.layered import content_of
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.legend import legend_text
@@ -51,8 +52,9 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
 
 def _example(request: ConvertRequest) -> str | None:
     """Return the name of a volume that comes with the program."""
-    volume = request.source.volume
-    return volume.split(":")[1] if isinstance(volume, str) and volume.startswith("example:") else None
+    given = request.source.volume
+    volume = given if isinstance(given, str) else content_of(given).path or ""
+    return volume.split(":")[1] if volume.startswith("example:") else None
 
 
 def _legend(source: Source) -> str | None:

@@ -28,6 +28,7 @@ from vvgt_cli.resources import free_memory
 MOST_STEPS = 400  # where a target or a time limit decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
 ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
+FINISHING = 20  # steps on whole views after those on regions: fewer than need cells by error
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
 WRITE = 0.1  # seconds of writing the file once
 SURE = 0.8  # share of the estimated memory that is certainly needed
@@ -176,6 +177,10 @@ class Planner:
             plan.skipped.append(("back-projection", "gradient descent gains more in the same time"))
         *before, descent = self._descent(steps, small, wanted)
         return [*before, *([BackProjection()] if few else []), *network, descent]
+
+    def finish(self, untimed: bool) -> list[Stage]:
+        """Return the few steps on whole views that follow those on regions; none where time is limited."""
+        return self._descent(FINISHING, self.wide, FINISHING) if untimed else []
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""

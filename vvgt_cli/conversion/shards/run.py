@@ -28,7 +28,7 @@ from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks
 from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.open import FieldNeeds, blocked, store_beside
-from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.settings import MANY, BlockOptions
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import pace
 from vvgt_cli.files import check_disk_space
@@ -107,6 +107,7 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     """
     budget = request.limits.gaussians(request.fit.max_gaussians, degree_of(request, field.source))
     request = replace(request, fit=replace(request.fit, max_gaussians=budget))
+    run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
     make_blocks(run, request, field)
     cut = cut_of(run, field.run_pass.store)
 
