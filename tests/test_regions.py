@@ -238,3 +238,20 @@ def test_results_of_another_number_of_steps_are_not_taken(vvgt, volume: Path, fo
     line = ("convert", volume, *FIT, "--steps", "8", "-o", out / "lod-meta.json", "--overwrite")
     assert vvgt(*line).code == 0
     assert files_in(out) != files_in(folder)
+
+
+def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path: Path) -> None:
+    line = (
+        "convert",
+        volume,
+        "--max-gaussians",
+        "1",
+        *STEPS,
+        "--size",
+        "64",
+        "-q",
+        "-o",
+        tmp_path / "o" / "lod-meta.json",
+    )
+    assert vvgt(*line).code == 0
+    assert json.loads((tmp_path / "o" / "lod-meta.json").read_text())["count"] >= 1

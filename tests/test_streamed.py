@@ -164,10 +164,10 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     [
         (("--init", "wavelet"), "needs moments"),
         (("--frame", "world"), "remove --frame"),
-        (("--live",), "made node by node"),
-        (("--tf", "a.json", "--tf", "b.json"), "made node by node"),
-        (("--dry-run",), "made node by node"),
-        (("--preview", "p.png"), "made node by node"),
+        (("--live",), "cuts of one closed form"),
+        (("--tf", "a.json", "--tf", "b.json"), "cuts of one closed form"),
+        (("--dry-run",), "cuts of one closed form"),
+        (("--preview", "p.png"), "cuts of one closed form"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:

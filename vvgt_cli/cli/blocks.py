@@ -46,7 +46,7 @@ _options = {
     "workers": click.option(
         "--workers", type=click.IntRange(1, 1024), metavar="N",
         help="Number of parallel worker processes, or of SLURM jobs with --scheduler slurm. Default: by processors, "
-        "memory and size.",
+        "memory and size; 1 with --scheduler.",
     ),
     "scheduler": click.option(
         "--scheduler", metavar="local|slurm|ADDRESS",

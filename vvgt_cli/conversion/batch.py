@@ -61,7 +61,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
             *("several --tf", "--model", "--rule", "--max-size", "--live"),
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
-        "levels are made node by node, of one closed form; remove it",
+        "levels are cuts of one closed form, refined on the CPU; remove it",
     ),
     PAGE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",

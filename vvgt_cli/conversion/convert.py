@@ -150,21 +150,23 @@ def run_conversion(
     if request.live:
         check_live(request)
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
-    regions = False
-    if made is None and start is None and isinstance(field, Blocked) and by_regions(request):
-        from vvgt_cli.conversion.shards.run import gaussians_by_regions
-
-        made, regions = gaussians_by_regions(run, request, field), True
+    regions = made is None and start is None and isinstance(field, Blocked) and by_regions(request)
     if start is not None:
         field.views = start.views(field.views)
-    work, planner, plan = _planned(run, request, field, expected=start is None)
-    if made is not None:
+    work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
+    if made is not None or regions:
         finish = planner.finish(work.limits.time_budget is None) if regions else []
         plan.stages, plan.skipped = [*finish, *(stage for stage in plan.stages if stage.scores)], []
-        plan.gaussians, plan.workload = len(made), replace(plan.workload, gaussians=len(made))
-        plan.bytes = file_bytes(len(made), planner.sh_degree)
+        count = plan.gaussians if made is None else len(made)
+        plan.gaussians, plan.workload = count, replace(plan.workload, gaussians=count)
+        plan.bytes = file_bytes(count, planner.sh_degree)
         run.report.plan = plan.record()
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
+    if regions and isinstance(field, Blocked):
+        from vvgt_cli.conversion.shards.run import gaussians_by_regions
+
+        made = gaussians_by_regions(run, request, field)
+        field.views.expect(_pictures(plan, work.fit))
     work.checkpoint = checkpoint_of(request.checkpoint, work.field, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
     if made is not None:

@@ -28,7 +28,7 @@ from vvgt_cli.resources import free_memory
 MOST_STEPS = 400  # where a target or a time limit decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
 ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
-FINISHING = 20  # steps on whole views after those on regions: fewer than need cells by error
+FINISHING = 20  # steps on whole views after those on regions: few enough that cells by error are left out
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
 WRITE = 0.1  # seconds of writing the file once
 SURE = 0.8  # share of the estimated memory that is certainly needed
@@ -180,7 +180,8 @@ class Planner:
 
     def finish(self, untimed: bool) -> list[Stage]:
         """Return the few steps on whole views that follow those on regions; none where time is limited."""
-        return self._descent(FINISHING, self.wide, FINISHING) if untimed else []
+        steps = min(FINISHING, self.fit.steps or FINISHING)
+        return self._descent(steps, self.wide, steps) if untimed else []
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""

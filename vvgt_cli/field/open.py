@@ -36,7 +36,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 3  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 4  # version of the stored blocks: increase it whenever their content changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
@@ -110,8 +110,9 @@ def blocked(
     settings = _settings(request, needs)
     edge = store.kept_edge(settings) if options.size is None else options.size
     volume, voxel = _measured(request)
-    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
-    options = replace(options, workers=worker_count(options, volume, needs.gaussians, threads))
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))  # set by the commands
+    most = threads if isinstance(request.volume, str) else 1  # values in memory would be copied to each worker
+    options = replace(options, workers=worker_count(options, volume, needs.gaussians, most))
     edge = edge or block_edge(volume, options, voxel)
     with _runner(options, threads) as runner:
         run_pass = Pass(runner, store, run.console.bar, options.shard)

@@ -10,7 +10,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import RenderSettings, camera_arrays, tiers
+from vvgt_cli.dvr.render import RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting
 from vvgt_cli.field.reader import Box, Layers, Scalars
 from vvgt_cli.gaussians import Gaussians
@@ -50,7 +50,8 @@ class Part:
         """Render a picture (h, w, 4) of the part, as `render_view` does; the camera is in the part's frame."""
         eye, basis, lens = self._arrays(camera)
         out = np.zeros((camera.height, camera.width, 4), np.float32)
-        for rays in tiers(settings, out, blocks):
+        box = Frame((self._hi - self._lo) / 2 * self._frame.step * self.scale, self._frame.step * self.scale)
+        for rays in tiers(for_thin(settings, box, camera), out, blocks):
             for offsets, mask, known in rays:
                 row, column = np.nonzero(mask)
                 pixels = np.stack([column, row], axis=1)

@@ -37,7 +37,7 @@ def optimize(
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
         free: (K,) bool, those that move, of the method "frame"; None: all.
-        weights: of each training view, (h, w) weights of its pixels in the loss; None: 1.
+        weights: of each training view, (h, w) weights of its pixels in the loss; None: 1. Not on a device.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.

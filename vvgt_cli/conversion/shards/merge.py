@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import IO, TYPE_CHECKING, NamedTuple
@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 SCRATCH = "scores"
 
 
-def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool, refiner: Refiner | None = None) -> None:
+def write_merged(
+    run: Run, store: BlockStore, output: str, overwrite: bool, refiner: Callable[[], Refiner | None] = lambda: None
+) -> None:
     """Cut the pyramid of all blocks for the plan's budget, write the file and fill in the report.
 
     Args:
@@ -50,7 +52,7 @@ def write_merged(run: Run, store: BlockStore, output: str, overwrite: bool, refi
         store: complete blocks.
         output: a `.ply`, the manifest of levels, or a stream.
         overwrite: replace an existing file.
-        refiner: refines the levels; None leaves the closed form.
+        refiner: returns what refines streamed levels, or None for the closed form.
 
     Raises:
         DataError: blocks are missing or damaged, or nothing is visible.
@@ -147,7 +149,7 @@ def _write(cut: Cut, budget: int, sink: IO[bytes], output: str) -> tuple[Made, i
 
     plan, free, threshold = cut.plan, free_memory(), cut.tiled_tree.threshold(budget)
     axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
-    degree = plan.degree if plan.ply.sh_degree is None else plan.ply.sh_degree
+    degree = plan.written_degree
     count = cut.tiled_tree.count(threshold)
     if output != STDOUT:
         check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))

@@ -42,6 +42,7 @@ class RegionDescent:
         boxes: first voxel of each region, and the end of its range.
         closed: kind of the stored closed form.
         kind: kind of the results.
+        measured: whether the errors of the levels are saved, too.
     """
 
     reader: Scalars | Layers
@@ -53,6 +54,7 @@ class RegionDescent:
     boxes: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
     closed: str
     kind: str
+    measured: bool
 
     def __len__(self) -> int:
         """Return the number of regions."""
@@ -74,7 +76,7 @@ class RegionDescent:
             Node(list(made), node.spreads, node.normals)
             for made, node in zip(zip(*levels, strict=True), nodes, strict=True)
         ]
-        errors = errors_of([node.levels for node in found]) if len(levels) > 1 else {}
+        errors = errors_of([node.levels for node in found]) if self.measured else {}
         save(self.store, self.kind, number, found, errors)
 
 
@@ -168,7 +170,7 @@ class Refiner:
         edge = width * grid.tile
         lows = [places[end - 1] * edge for end in ends]
         boxes = tuple((tuple(lo.tolist()), tuple(np.minimum(lo + edge, grid.dims).tolist())) for lo in lows)
-        closed = f"closed-{key}"
+        closed = f"closed-{digest(plan, thresholds, width, least)[:16]}"
         store.prepare(closed)
         if store.missing(closed, range(len(ends))):
             waiting: list[Node] = []
@@ -180,7 +182,7 @@ class Refiner:
                     waiting, done = waiting[size:], done + 1
         task = RegionDescent(
             self.field.reader, grid, store, self.field.light, self.descent, tuple(distances), boxes, closed,
-            f"refined-{key}",
+            f"refined-{key}", least,
         )  # fmt: skip
         with run.stage("refinement") as stage:
             self.field.run_pass(task, "refinement")

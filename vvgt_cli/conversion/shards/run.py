@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of 
 
 
 def writes_streaming(request: ConvertRequest) -> bool:
-    """Return whether the closed form is written batch by batch, without all Gaussians in memory."""
+    """Return whether the output is written batch by batch, without all Gaussians in memory."""
     options = request.blocks
     if is_streamed(request.output):
         if request.fit.init != "vbm" or (options is not None and options.shard):
@@ -91,7 +92,7 @@ def convert_in_batches(request: ConvertRequest, console: Console | None = None) 
         _opened(run, request, options, store) as field,
     ):
         make_blocks(run, request, field)
-        write_merged(run, store, request.output or STDOUT, request.overwrite, refiner_of(run, request, field))
+        write_merged(run, store, request.output or STDOUT, request.overwrite, partial(refiner_of, run, request, field))
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
@@ -135,12 +136,12 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     fit, limits = request.fit, request.limits
     ended = limits.target_psnr is not None or limits.time_budget is not None
     steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
-    degree = degree_of(request, field.source)
-    if limits.time_budget is not None:
+    degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
+    if steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
         steps = min(steps, max(int(left / each), 0))
-        if steps < FEWEST_STEPS:
+        if steps < fewest:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
             return None
     if not steps:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,12 @@ def folder_of(output: str) -> Iterator[None]:
 
 
 def write_streamed(
-    run: Run, store: BlockStore, cut: Cut, output: str, overwrite: bool, refiner: Refiner | None = None
+    run: Run,
+    store: BlockStore,
+    cut: Cut,
+    output: str,
+    overwrite: bool,
+    refiner: Callable[[], Refiner | None] = lambda: None,
 ) -> None:
     """Write the files and, last, the manifest.
 
@@ -71,7 +76,7 @@ def write_streamed(
         cut: pyramid to take the levels from.
         output: path of the manifest.
         overwrite: replace an existing one.
-        refiner: refines the levels, each at the distance at which it is shown; None leaves the closed form.
+        refiner: returns what refines the levels, each at the distance at which it is shown, or None.
 
     Raises:
         UsageError: the frame is not the unit frame.
@@ -87,8 +92,8 @@ def write_streamed(
         stage.note = f"{len(levels)} levels of {len(tiled_tree.tiles)} nodes"
     thresholds = errors.thresholds[np.stack(choices, axis=1)]
     groups = cut.nodes(thresholds)
-    if refiner is not None:
-        refined = refiner(run, cut, thresholds, [NEAREST * 3 ** (level.number - 0.5) for level in levels])
+    if (refine := refiner()) is not None:
+        refined = refine(run, cut, thresholds, [NEAREST * 3 ** (level.number - 0.5) for level in levels])
         key, groups, errors = refined.key, refined.nodes(), refined.errors()
         choices = [np.full(len(tiled_tree.tiles), level.number) for level in levels]
     before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
