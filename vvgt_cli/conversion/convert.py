@@ -156,10 +156,7 @@ def run_conversion(
     work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
     if made is not None or regions:
         finish = planner.finish(work.limits.time_budget is None) if regions else []
-        plan.stages, plan.skipped = [*finish, *(stage for stage in plan.stages if stage.scores)], []
-        count = plan.gaussians if made is None else len(made)
-        plan.gaussians, plan.workload = count, replace(plan.workload, gaussians=count)
-        plan.bytes = file_bytes(count, planner.sh_degree)
+        plan = plan.for_made(plan.gaussians if made is None else len(made), planner.sh_degree, finish)
         run.report.plan = plan.record()
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
     if regions and isinstance(field, Blocked):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from vvgt_cli.conversion.request import FitOptions, Limits, file_bytes
@@ -83,6 +83,13 @@ class Plan:
     def after(self, stage: Stage) -> float:
         """Return the expected seconds after a stage."""
         return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
+
+    def for_made(self, count: int, degree: int, finish: list[Stage]) -> Plan:
+        """Return the plan for ``count`` finished Gaussians with harmonics of ``degree``: few stages, then scores."""
+        return replace(
+            self, gaussians=count, workload=replace(self.workload, gaussians=count), bytes=file_bytes(count, degree),
+            stages=[*finish, *(stage for stage in self.stages if stage.scores)], skipped=[],
+        )  # fmt: skip
 
     def costs(self) -> list[tuple[str, float]]:
         """List (label, seconds) of every stage."""
