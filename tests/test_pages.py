@@ -164,7 +164,10 @@ def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path):
     source = tmp_path / "Mueller_Hans.npy"
     assert vvgt("convert", source, "-o", tmp_path / "a.ply", *HOW).code == 0
     done = vvgt("convert", source, "-o", tmp_path / "a.html", *HOW)
-    assert "a.html holds Gaussians, data values, their histogram, a checksum of the volume; its title is" in done.err
+    assert (
+        "a.html holds Gaussians, data values, their histogram, slices of the volume (14 x 14 x 14 voxels)" in done.err
+    )
+    assert "a checksum of the volume; its title is" in done.err
     assert vvgt("view", source, "-o", tmp_path / "b.html").code == 0
     assert vvgt("convert", tmp_path / "Mueller_*.npy", "-o", tmp_path / "c.html", *HOW).code == 0
     for name in ("a.ply", "a.html", "b.html", "c.html"):

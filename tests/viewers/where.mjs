@@ -1,6 +1,6 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); save SELECTOR FILE (what a click downloads).
 import path from 'node:path';
 import readline from 'node:readline';
@@ -51,6 +51,8 @@ const steps = {
     if (at.length === 1) return job.touch ? page.tap(at[0]) : page.click(at[0]);
     return job.touch ? page.touchscreen.tap(...at) : page.mouse.click(...at);
   },
+  hover: (x, y) => page.mouse.move(x, y),
+  wheel: (by) => page.mouse.wheel(0, by),
   drag: async (x, y, toX, toY) => {
     if (job.touch) {
       const fingers = await context.newCDPSession(page), at = (k) => [{ x: x + (k / 8) * (toX - x), y: y + (k / 8) * (toY - y) }];

@@ -15,6 +15,7 @@ from vvgt_cli.cli.options import (
     light_options,
     overwrite_option,
     placed_read_options,
+    slices_option,
     tfs_options,
     title_option,
 )
@@ -51,6 +52,7 @@ from vvgt_cli.progress import Console
     help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function. By default, a "
     "page (.html) of one volume holds this form as well, for its editor of the function; --no-live omits it.",
 )  # fmt: skip
+@slices_option
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @ply_options
 @placed_read_options
@@ -68,8 +70,8 @@ from vvgt_cli.progress import Console
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool | None, title: str | None,
-    console: Console, blocks: dict[str, Any], **options: Any,
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool | None, slices: bool,
+    title: str | None, console: Console, blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
@@ -111,7 +113,8 @@ def command(
     request = convert_request(volume, **options)
     editor = live is None and is_page(request.output)
     request = replace(
-        request, blocks=block_options_of(blocks), live=bool(live), editor=editor, command=line, title=title
+        request, blocks=block_options_of(blocks), live=bool(live), editor=editor, slices=slices,
+        command=line, title=title,
     )  # fmt: skip
     plan = convert_files(
         request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console

@@ -197,6 +197,11 @@ title_option = click.option(
     help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
 )  # fmt: skip
 
+slices_option = click.option(
+    "--no-slices", "slices", is_flag=True, default=True, flag_value=False,
+    help="Omit the volume's slices from the page (.html) of one volume.",
+)  # fmt: skip
+
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")
 
 

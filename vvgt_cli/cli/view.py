@@ -6,7 +6,14 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options, title_option
+from vvgt_cli.cli.options import (
+    common_options,
+    overwrite_option,
+    placed_read_options,
+    slices_option,
+    tf_options,
+    title_option,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -32,6 +39,7 @@ from vvgt_cli.progress import Console
     "--no-live", "live", is_flag=True, default=True, flag_value=False,
     help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
 )  # fmt: skip
+@slices_option
 @title_option
 @tf_options
 @placed_read_options
@@ -43,6 +51,7 @@ def command(
     port: int | None,
     browser: bool,
     live: bool,
+    slices: bool,
     title: str | None,
     read: dict[str, Any],
     optics: dict[str, Any],
@@ -78,8 +87,8 @@ def command(
 
     if output is not None and (port is not None or not browser):
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
-    if not live and output is None:
-        raise UsageError("--no-live is for a page that is saved; give -o OUT.html, or omit it")
+    if output is None and not (live and slices):
+        raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
     source = source_request(files[0], read, optics)
-    request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, title)
+    request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, slices, title)
     view(request, lambda url: click.echo(url), console)

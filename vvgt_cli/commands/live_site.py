@@ -22,7 +22,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
-from vvgt_cli.gaussians.formats.page_live import live_page_data, parse_light
+from vvgt_cli.gaussians.formats.page_live import Extras, live_page_data, parse_light
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
@@ -74,10 +74,10 @@ class Cloud:
 
     def file(self, suffix: str, live: Cloud | None = None) -> Resource:
         """Return the file to save, in the format of an ending; ``live`` is the form for the editor of a page."""
-        editor = None if live is None or not live.live else (live.gaussians, live.options)
+        extras = Extras(None if live is None or not live.live else (live.gaussians, live.options))
         if (other := format_of(f"x.{suffix}")) is not None:
             name = f"{self.name}.{suffix}"
-            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, editor))
+            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, extras))
         if self.ply is not None:
             return Resource(BYTES, lambda: self.ply or b"")
         stream = io.BytesIO()

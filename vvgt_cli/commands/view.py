@@ -23,8 +23,9 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
+from vvgt_cli.gaussians.formats.choose import NOTHING
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
-from vvgt_cli.gaussians.formats.page_live import LiveForm
+from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, claimed
@@ -50,6 +51,7 @@ class ViewRequest:
         browser: open one, if there is a display.
         overwrite: replace the file if it exists.
         live: let a page of a volume have a function editor.
+        slices: let it have slices.
         title: title of the page; None: the file's own.
     """
 
@@ -60,6 +62,7 @@ class ViewRequest:
     browser: bool = True
     overwrite: bool = False
     live: bool = True
+    slices: bool = True
     title: str | None = None
 
 
@@ -86,8 +89,8 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         return
     file = clouds[0][1]
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
-        gaussians, options, editor = _opened(run, request, file)
-        write_gaussians(run, request.output, gaussians, options, request.overwrite, editor=editor)
+        gaussians, options, extras = _opened(run, request, file)
+        write_gaussians(run, request.output, gaussians, options, request.overwrite, extras=extras)
         run.compile(for_degree(DRAW, gaussians.degree))
         report_agreement(run, request.output, gaussians, options)
 
@@ -157,14 +160,14 @@ def expanded(names: Sequence[str]) -> list[str]:
     return files
 
 
-def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, LiveForm | None]:
-    """Return Gaussians in the unit frame, how to write them, and the live form for a page; a volume is converted."""
+def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, Extras]:
+    """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
     given = request.source
     if name == STDIN or is_splats(name):
         _refuse_reading(given, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
-        return gaussians, replace(options, title=request.title or options.title), None
+        return gaussians, replace(options, title=request.title or options.title), NOTHING
     from vvgt_cli.conversion.convert import convert_in_memory
     from vvgt_cli.conversion.request import ConvertRequest
 
@@ -172,7 +175,8 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
     conversion = convert_in_memory(
         ConvertRequest(replace(given, volume=name), editor=editor, title=request.title), run.console
     )
-    return conversion.gaussians, conversion.ply, conversion.live_form(run) if editor else None
+    extras = conversion.extras(editor, request.slices, run) if is_page(request.output) else NOTHING
+    return conversion.gaussians, conversion.ply, extras
 
 
 def _serve(

@@ -34,6 +34,7 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.formats.choose import NOTHING
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
@@ -364,8 +365,9 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     assert request.output is not None
     if conversion.ply.certificate is not None or not written:
         file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
-        editor = conversion.live_form(run) if request.editor and is_page(request.output) else None
-        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, editor=editor)
+        page = is_page(request.output) and request.ply.comments
+        extras = conversion.extras(request.editor, request.slices, run) if page else NOTHING
+        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, extras=extras)
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

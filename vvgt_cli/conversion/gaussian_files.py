@@ -16,7 +16,8 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
-from vvgt_cli.gaussians.formats.page_live import LiveForm, contents, page_of_several
+from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.page_live import Extras, contents, page_of_several
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
 from vvgt_cli.score.record import Run
@@ -63,7 +64,7 @@ def write_gaussians(
     normals: np.ndarray | None = None,
     stage: str = "write",
     more: str = "",
-    editor: LiveForm | None = None,
+    extras: Extras = NOTHING,
 ) -> None:
     """Write Gaussians in the format of the name, or as a `.ply` to standard output, and record the size.
 
@@ -76,7 +77,7 @@ def write_gaussians(
         normals: (K, 3), for a `.ply`.
         stage: name of the stage.
         more: end of its message.
-        editor: live form of the same volume under the same look, for the function editor of a page.
+        extras: further contents of a page.
     """
     report = run.report
     with run.stage(stage) as record:
@@ -84,11 +85,11 @@ def write_gaussians(
             report.bytes = write_ply(sys.stdout.buffer, gaussians, options, normals)
             sys.stdout.buffer.flush()
         else:
-            report.bytes = _write_file(output, gaussians, options, overwrite, normals, editor)
+            report.bytes = _write_file(output, gaussians, options, overwrite, normals, extras)
         report.gaussians = len(gaussians)
         record.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB{more}"
     if is_page(output) and not more:
-        run.console.message(contents(options if editor is None else editor[1], output))
+        run.console.message(contents(extras.live[1] if extras.live else options, output, slices=extras.slices))
 
 
 def is_page(output: str | None) -> bool:
@@ -133,7 +134,7 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
 
 def _write_file(
     output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None,
-    editor: LiveForm | None,
+    extras: Extras,
 ) -> int:  # fmt: skip
     """Write a file and return its bytes; if that fails, save a `.ply` elsewhere, since the run may have taken hours."""
     if is_stream(output):
@@ -144,7 +145,7 @@ def _write_file(
         with atomic_write(output, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, gaussians, options, normals)
-            return temporary.write_bytes(encoded(known, gaussians, options, output, editor))
+            return temporary.write_bytes(encoded(known, gaussians, options, output, extras))
     except VvgtError as error:
         if known is None and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere

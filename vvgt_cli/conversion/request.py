@@ -112,6 +112,7 @@ class ConvertRequest:
         blocks: how the volume is processed in blocks; None: blocks only where the volume is large.
         live: let the Gaussians carry values, so that they can be shown under any function (docs/live.md).
         editor: a page also holds the live form, so that its function can be changed.
+        slices: a page also holds slices of the volume.
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
@@ -129,6 +130,7 @@ class ConvertRequest:
     checkpoint: str | None = None
     live: bool = False
     editor: bool = False
+    slices: bool = False
     all_views: bool = False
     command: str | None = None
     title: str | None = None

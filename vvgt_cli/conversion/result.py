@@ -17,7 +17,9 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
+from vvgt_cli.gaussians.formats.choose import NOTHING
 from vvgt_cli.gaussians.formats.page_file import iframe
+from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
@@ -29,6 +31,7 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.gaussians.formats.page_live import LiveForm
+    from vvgt_cli.gaussians.formats.page_slices import Slices
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
@@ -74,6 +77,7 @@ class Result:
         sh_degree: int | None = None,
         comments: bool | None = None,
         editor: bool = True,
+        slices: bool = True,
         overwrite: bool = True,
     ) -> int:
         """Write a standard ``.ply``, or another format by the ending of the name, atomically.
@@ -86,6 +90,7 @@ class Result:
             sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
             comments: describe the file in its header.
             editor: a page of a conversion also holds the live form, so that its function can be changed.
+            slices: a page of a conversion also holds slices of its volume.
             overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:
@@ -114,8 +119,8 @@ class Result:
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            live = self.live_form() if known.suffix == ".html" and editor and ply.comments else None
-            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), live))
+            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NOTHING
+            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
 
     def recolor(
         self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
@@ -145,12 +150,15 @@ class Result:
         found = apply_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
-    def live_form(self, run: Run | None = None) -> LiveForm | None:
-        """Return Gaussians that carry values under the same look, with their layout; None without the volume.
+    def extras(self, live: bool, slices: bool, run: Run | None = None) -> Extras:
+        """Return further contents of a page, as far as there is a volume.
 
-        ``run`` times the stages.
+        Args:
+            live: with Gaussians that carry values under the same look.
+            slices: with slices.
+            run: times the stages.
         """
-        return None
+        return NOTHING
 
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
@@ -162,7 +170,7 @@ class Result:
         page = format_of("x.html")
         assert page is not None
         try:
-            return iframe(encoded(page, self.gaussians, self.ply, name), name)
+            return iframe(encoded(page, self.gaussians, self.ply, name, self.extras(False, True)), name)
         except DataError:
             return None
 
@@ -193,17 +201,26 @@ class Conversion(Result):
 
     Attributes:
         field: the volume under its function, labels, layers and light.
-        make_live: makes `live_form`; None if the Gaussians carry values themselves.
+        make_live: makes the live form for a page's editor; None if the Gaussians carry values themselves.
     """
 
     field: Field
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
 
-    def live_form(self, run: Run | None = None) -> LiveForm | None:
-        """Implement `Result.live_form`; None, with a message, if there is no live form."""
-        if self.make_live is None:
-            return None
-        return self.make_live(run or Run(Console(quiet=True), ConversionReport("init")), self.field, self.ply)
+    def extras(self, live: bool, slices: bool, run: Run | None = None) -> Extras:
+        """Implement `Result.extras`, with a message if there is no live form."""
+        run, form = run or Run(Console(quiet=True), ConversionReport("init")), None
+        if live and self.make_live is not None:
+            form = self.make_live(run, self.field, self.ply)
+        if not slices:
+            return Extras(form)
+        with run.stage("slices") as stage:
+            stage.note = str(self._slices or "of colours there are none")
+        return Extras(form, self._slices)
+
+    @cached_property
+    def _slices(self) -> Slices | None:
+        return self.field.source.slices()
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""

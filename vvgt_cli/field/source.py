@@ -22,6 +22,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.scene import PreparedVolume
+    from vvgt_cli.gaussians.formats.page_slices import Slices
 
 OPTICS = 12  # hexadecimal digits of `Source.optics`
 KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
@@ -179,6 +180,17 @@ class Source:
                 f"{self.name}: labels, channels or layers, which have no single value at a point; expected one scalar "
                 "field (try --labels none to read label numbers as values)"
             )
+
+    def slices(self) -> Slices | None:
+        """Return the grids of all layers for a page, read slab by slab; None if all layers have colours."""
+        from vvgt_cli.gaussians.formats.page_slices import slices_of
+
+        return slices_of(
+            [
+                None if layer.colors else (layer.volume, layer.tf if isinstance(layer.tf, LabelTable) else None)
+                for layer in self.layers
+            ]
+        )
 
     def with_function(self, tf: TransferFunction) -> Source:
         """Return the same volume under another function on data values, unlit.

@@ -15,6 +15,7 @@ from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
+from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
@@ -22,6 +23,7 @@ from vvgt_cli.volume.blocks import check_memory
 
 _HEAD = 1024  # bytes that identify a compressed .ply
 _LARGEST = 1 << 32  # bytes of a file that is read whole
+NOTHING = page_live.Extras()
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,9 @@ class Format:
         read: maps bytes and the file's name, for errors, to columns.
         needs: given a name for errors, raises DataError if a library is not installed.
         layout: maps the options for a `.ply` to those for this format.
-        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, and for the
-            form without values to show first, or None; None if the format cannot store values.
+        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, the form
+            without values to show first, or None, and slices of the volume, or None; None if the format cannot store
+            values.
     """
 
     suffix: str
@@ -43,7 +46,7 @@ class Format:
     read: Callable[[bytes, str], Splats]
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
-    live: Callable[[Gaussians, PlyOptions, str, Splats | None], bytes] | None = None
+    live: Callable[[Gaussians, PlyOptions, str, Splats | None, Slices | None], bytes] | None = None
 
 
 FORMATS = (  # the first whose ending fits is taken: a longer ending stands before a shorter one
@@ -80,8 +83,9 @@ def ready(path: str | Path) -> None:
 
 
 def encoded(
-    known: Format, gaussians: Gaussians, options: PlyOptions, name: str, editor: page_live.LiveForm | None = None
-) -> bytes:
+    known: Format, gaussians: Gaussians, options: PlyOptions, name: str,
+    extras: page_live.Extras = NOTHING,
+) -> bytes:  # fmt: skip
     """Encode Gaussians (unit frame) in another format, with the layout of `PlyOptions`.
 
     Args:
@@ -89,7 +93,7 @@ def encoded(
         gaussians: Gaussians, unit frame.
         options: layout.
         name: of the file, for errors and titles.
-        editor: live form of the same volume under the same look, for the function editor of a page.
+        extras: further contents of a page.
 
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
@@ -97,15 +101,17 @@ def encoded(
     if known.suffix == ".html":
         options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
-        return known.live(gaussians, options, name, None)
+        return known.live(gaussians, options, name, None, extras.slices)
     if gaussians.live is not None:
         why = f"{known.suffix} cannot store values for other functions"
         warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     splats = splats_of(gaussians, known.layout(options))
-    if editor is not None and known.live is not None:
-        return known.live(editor[0], replace(editor[1], date=options.date), name, splats)
-    return known.write(splats, name)
+    if known.live is None:
+        return known.write(splats, name)
+    if extras.live is None:
+        return page_file.html(splats, name, extras.slices)
+    return known.live(extras.live[0], replace(extras.live[1], date=options.date), name, splats, extras.slices)
 
 
 def is_splats(path: str | Path) -> bool:

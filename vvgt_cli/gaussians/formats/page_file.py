@@ -28,6 +28,7 @@ from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.certificate import epoch
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_frames import held_frames
+from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.rules import INRIA, RULES
 
@@ -162,9 +163,10 @@ def _digest(content: bytes) -> str:
     return base64.b64encode(hashlib.sha256(content).digest()).decode("ascii")
 
 
-def html(splats: Splats, name: str) -> bytes:
-    """Return the page of one cloud as a single file."""
-    return html_of_several([(title_of(name, splats.comments), splats)], name)
+def html(splats: Splats, name: str, slices: Slices | None = None) -> bytes:
+    """Return the page of one cloud as a single file, with the slices of its volume."""
+    clouds = [(title_of(name, splats.comments), splats)]
+    return html_of_several(clouds, name, slices.held, slices.scene) if slices else html_of_several(clouds, name)
 
 
 def html_of_several(

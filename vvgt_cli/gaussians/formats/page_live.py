@@ -6,7 +6,7 @@ import gzip
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.live import BYTES, ROW, live_bytes, live_json, log_lengths
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
+from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
@@ -35,7 +36,22 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x
 LiveForm = tuple[Gaussians, PlyOptions]  # Gaussians (unit frame) that carry values, and how they are written
 
 
-def live_html(gaussians: Gaussians, options: PlyOptions, name: str, converted: Splats | None = None) -> bytes:
+class Extras(NamedTuple):
+    """Contents of the page of one volume besides its Gaussians.
+
+    Attributes:
+        live: live form under the same look, for the function editor.
+        slices: grids of values and labels.
+    """
+
+    live: LiveForm | None = None
+    slices: Slices | None = None
+
+
+def live_html(
+    gaussians: Gaussians, options: PlyOptions, name: str, converted: Splats | None = None,
+    slices: Slices | None = None,
+) -> bytes:  # fmt: skip
     """Return the page as a single file, for ``gaussians`` in the unit frame.
 
     ``converted`` is a conversion under the same look, shown in their place until the look is changed.
@@ -43,15 +59,16 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str, converted: S
     Raises:
         DataError, UsageError: see `splats_of`; also if a library is not installed.
     """
-    return live_html_of_several([(options.title or title_of(name), gaussians, options)], name, converted)
+    return live_html_of_several([(options.title or title_of(name), gaussians, options)], name, converted, slices)
 
 
 def live_html_of_several(
-    clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str, converted: Splats | None = None
-) -> bytes:
+    clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str, converted: Splats | None = None,
+    slices: Slices | None = None,
+) -> bytes:  # fmt: skip
     """Return the page of several named clouds that are shown under one function, which `shared_facts` must allow.
 
-    ``converted``: see `live_html`.
+    ``converted``, ``slices``: see `live_html`.
 
     Raises:
         DataError, UsageError: see `live_html`.
@@ -60,8 +77,8 @@ def live_html_of_several(
     light = clouds[0][2].light
     if light is not None and light.headlight + len(light.directions) > 1:
         warnings.warn(f"{name}: the page shows one light at a time, and begins with the first", stacklevel=2)
-    held = dict(zip(facts["held"], planes, strict=True))
-    more: dict[str, Any] = {"live": facts}
+    held = dict(zip(facts["held"], planes, strict=True)) | (slices.held if slices else {})
+    more: dict[str, Any] = {"live": facts} | (slices.scene if slices else {})
     if converted is not None:
         held["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
         found = clouds[0][2].certificate
@@ -88,19 +105,22 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
     return html_of_several(baked, name)
 
 
-def contents(options: PlyOptions, name: str, names: Sequence[str] = ()) -> str:
+def contents(options: PlyOptions, name: str, names: Sequence[str] = (), slices: Slices | None = None) -> str:
     """Return one line that says what a page holds, for whoever sends it.
 
     Args:
         options: of the Gaussians that carry values, if there are any.
         name: of the page.
         names: in its list, of several clouds.
+        slices: of its volume.
     """
     layers = () if options.live is None else options.live.layers
     parts = ["Gaussians", *(["data values, their histogram"] if layers else [])]
-    parts += [f"names of {sum(len(layer.labels) for layer in layers)} labels"] if any(x.labels for x in layers) else []
+    labels = sum(len(layer.labels) for layer in layers) or (slices.labels if slices else 0)
+    parts += [f"names of {labels} labels"] if labels else []
     stated = [layer.name for layer in layers if layer.name] if len(layers) > 1 else list(names)
     parts += [f"the names {', '.join(stated[:3])}{', ...' if len(stated) > 3 else ''}"] if stated else []
+    parts += [str(slices)] if slices else []
     parts += ["a checksum of the volume"] if options.certificate else []
     return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"
 

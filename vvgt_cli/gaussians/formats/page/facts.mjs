@@ -58,6 +58,7 @@ export function worldOf(facts, enlarged = 1) {
   const known = anatomical ? 'mm' : (facts['length-unit'] ?? '').replace(/^um$/, 'µm');
   return {
     axes, letters, anatomical, unit: known, length: 1 / unit,
+    at: (p) => [0, 1, 2].map((row) => axes.reduce((sum, axis, k) => sum + axis[row] * (p[k] - centre[k]) * unit, 0)),  // and back
     place: (p) => axes.map((axis, k) => (axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2]) / unit + centre[k]),
   };
 }

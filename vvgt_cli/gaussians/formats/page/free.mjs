@@ -13,9 +13,8 @@ export function firstAngles({ camera: { position, target } }) {
   return { pitch: -Math.asin(y / Math.hypot(x, y, z)) / DEGREES, yaw: Math.atan2(x, z) / DEGREES };
 }
 
-// {target, distance} of a view into a part of some pixels; the viewer's field of view is along the longer side of the window
-export function fitting({ camera: { position, target, fov }, outermost = [] }, { pitch, yaw }, wide = innerWidth, high = innerHeight) {
-  const longer = Math.max(innerWidth, innerHeight, 1);
+// {target, distance} of a view into a part of some pixels; the viewer's field of view is along the longer side of the picture
+export function fitting({ camera: { position, target, fov }, outermost = [] }, { pitch, yaw }, wide, high, longer = Math.max(wide, high, 1)) {
   if (!outermost.length) return { target, distance: (Math.hypot(...plus(position, target, -1)) * longer) / Math.max(Math.min(wide, high), 1) };
   const [p, q] = [pitch * DEGREES, yaw * DEGREES], right = [Math.cos(q), 0, -Math.sin(q)], d = [Math.sin(q) * Math.cos(p), -Math.sin(p), Math.cos(q) * Math.cos(p)];
   const up = [Math.sin(q) * Math.sin(p), Math.cos(p), Math.cos(q) * Math.sin(p)], t = (FITS * Math.tan((fov * DEGREES) / 2)) / longer;
@@ -25,15 +24,15 @@ export function fitting({ camera: { position, target, fov }, outermost = [] }, {
 }
 
 // {x, y: its middle, target, distance} of that part
-function freePart(scene, angles) {
+function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
-    .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, innerWidth), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, innerHeight) }))
+    .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, width), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, height) }))
     .filter(({ left, right, top, bottom }) => left < right && top < bottom);
-  const whole = { x: innerWidth / 2, y: innerHeight / 2, ...fitting(scene, angles) }, found = [];
+  const whole = { x: width / 2, y: height / 2, ...fitting(scene, angles, width, height) }, found = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
-  for (const left of edges('right', 0)) for (const right of edges('left', innerWidth)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', innerHeight)) {
+  for (const left of edges('right', 0)) for (const right of edges('left', width)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', height)) {
     if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, ...fitting(scene, angles, right - left, bottom - top) });
+    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
   }
   const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
   if (!(least < FARTHEST * whole.distance)) return whole;
@@ -47,7 +46,7 @@ export function stayFree(lens, scene, draw) {
   const numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
   const fit = (angles) => {
     draw();
-    const { x, y, ...place } = freePart(scene, angles);
+    const { x, y, ...place } = freePart(lens.canvas, scene, angles);
     lens.set({ ...angles, ...place });
     lens.middle = [x, y];
     fitted = numbers(lens.pose());
@@ -55,7 +54,7 @@ export function stayFree(lens, scene, draw) {
   const place = () => {
     if (numbers(lens.pose()).every((x, k) => Math.abs(x - fitted[k]) < 1e-3)) return fit(lens.pose());
     draw();
-    const { x, y } = freePart(scene, lens.pose());
+    const { x, y } = freePart(lens.canvas, scene, lens.pose());
     lens.middle = [x, y];
   };
   document.querySelector('#live .fold')?.addEventListener('click', place);

@@ -3,16 +3,17 @@ import { fill } from './about.mjs';
 
 const TURN = 5, STEP = 24, NEARER = 1.1;  // degrees, pixels and times of a key
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, .handle`;  // what has keys, or arrows, of its own
+const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .handle`;  // what has keys, or arrows, of its own
 
 // rows of the help: [keys, what]; `buttons` are {title, key}
-export function helpRows(buttons, { live, values, picks }) {
+export function helpRows(buttons, { live, values, picks, sliced }) {
   return [
     ['drag', 'turn'], ['right drag, two fingers', 'move'], ['wheel, pinch', 'nearer, farther'],
     ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['double click', 'turn about that place']] : []),
     ['arrow keys', 'turn; with Shift: move'], ['+ −', 'nearer, farther'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
     ...(live ? [['Ctrl+Z', 'undo']] : []),
+    ...(sliced ? [['in a slice', 'drag for window (across) and level (up), click to move the cross, wheel or arrow keys to step']] : []),
     ...(values ? [['function', 'drag a node or use the arrow keys; double click adds one, Delete removes it']] : []),
     ['Esc', 'close, clear'],
   ];

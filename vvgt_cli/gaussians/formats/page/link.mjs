@@ -1,9 +1,9 @@
-// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
+// A link that restores what is seen: #slices=...&view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
 // which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 
-// the distance is of a square window, as the viewer's field of view is along the longer side
-const shape = () => Math.max(innerWidth, innerHeight, 1) / Math.max(Math.min(innerWidth, innerHeight), 1);
+// the distance is of a square picture, as the viewer's field of view is along the longer side
+const shape = ({ canvas: { clientWidth: w, clientHeight: h } }) => Math.max(w, h, 1) / Math.max(Math.min(w, h), 1);
 
 export function viewParts(lens) {
   return [
@@ -12,11 +12,11 @@ export function viewParts(lens) {
       key: 'view',
       get: () => {
         const { target, pitch, yaw, distance } = lens.pose();
-        return [...target, pitch, yaw, distance / shape()].map((x) => number(x)).join(',');
+        return [...target, pitch, yaw, distance / shape(lens)].map((x) => number(x)).join(',');
       },
       set: (text) => {
         const [x, y, z, pitch, yaw, distance] = text.split(',').map(Number);
-        if ([x, y, z, pitch, yaw, distance].every(Number.isFinite) && distance > 0) lens.set({ target: [x, y, z], pitch, yaw, distance: distance * shape() });
+        if ([x, y, z, pitch, yaw, distance].every(Number.isFinite) && distance > 0) lens.set({ target: [x, y, z], pitch, yaw, distance: distance * shape(lens) });
       },
     },
   ];

@@ -9,7 +9,7 @@ const STREAMS = [['vvgtValues', [0, 1, 2, 9]], ['vvgtGradient', [3, 4, 5, 10]], 
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64), `size` of them
-async function unpacked(id, alone, size) {
+export async function unpacked(id, alone, size) {
   try {
     const element = document.getElementById(id), text = atob(element.textContent);
     const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();

@@ -60,6 +60,13 @@ export function placeText(place, { letters, anatomical, unit }) {
   return `${along.join(', ')}${unit && ` ${unit}`}${text && `: ${text}`}`;
 }
 
+// The lines that cross in the slices, in the picture
+export function drawCross(group, lens, lines) {
+  for (const [a, b] of lines.map((line) => line.map(lens.project))) {
+    if (a && b) group.append(element('line', { x1: a[0], y1: a[1], x2: b[0], y2: b[1], stroke: '#fff', 'stroke-width': 1, 'stroke-opacity': 0.6 }));
+  }
+}
+
 export function drawRuler(group, { lens, world, ruler }) {
   const at = ruler.places.map(({ place }) => lens.project(place)), [a, b] = at, distance = ruler.distance();
   if (a && b) {

@@ -9,9 +9,10 @@ import { lensOf } from './lens.mjs';
 import { messages } from './messages.mjs';
 import { frameParts, linkOf, liveParts, restore, viewParts } from './link.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
-import { drawRuler, placeText, rulerOf } from './ruler.mjs';
+import { drawCross, drawRuler, placeText, rulerOf } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
 import { pictureOf, save } from './shot.mjs';
+import { slicesOf } from './slices.mjs';
 import { element } from './svg.mjs';
 
 const LEFT = 12;  // px
@@ -20,7 +21,7 @@ const ICONS = {
   perspective: icon('M2 15L6 4h6l4 11Z'), orthographic: icon('M3.5 3.5h11v11h-11Z'), measure: icon('M2.5 12.5l10-10 3 3-10 10ZM6 9l1.5 1.5M9 6l1.5 1.5'),
   picture: icon('M2 6h3l1.5-2h5L13 6h3v9H2ZM9 7.5a2.5 2.5 0 1 0 .01 0'), link: icon('M7.5 10.5l3-3M8 5l2-2a3 3 0 0 1 5 4l-2.5 2M10 13l-2 2a3 3 0 0 1-5-4l2.5-2'),
   fit: icon('M3 6V3h3M12 3h3v3M15 12v3h-3M6 15H3v-3M6.5 6.5h5v5h-5Z'), reset: icon('M4 3v4h4M4.2 7A5.5 5.5 0 1 1 3.6 10.5'), help: icon('M6.3 6.3a2.8 2.8 0 1 1 3.9 2.5Q9 9.4 9 11M9 13.5v.5'),
-  full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
+  slices: icon('M2.5 2.5h13v13h-13ZM9 2.5v13M2.5 9h13'), full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
 };
 
 export function where(viewer, scene, live, show) {
@@ -43,9 +44,15 @@ export function where(viewer, scene, live, show) {
   const again = (text = '') => { told = text; stamp++; app.renderNextFrame = true; };
   const ruler = rulerOf(lens, () => world, dataNow, live?.look ?? null, again, (place) => {
     live?.select(place);
+    slices?.to(place.world);
     site.say('picked', { place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
   });
-  const parts = [...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const labelled = (layer) => live && live.look.layers[layer].labels.map((_, k) => live.look.rows[live.look.layers[layer].row + k]);
+  const slices = scene.slices && slicesOf(scene, {
+    world: () => world, rows: labelled, moved: () => again(),
+    picked: (place) => place && site.say('picked', { place: place.world, unit: world.unit, value: place.value ?? place.names[0] ?? null, in: place.in, layer: place.layer }),
+  });
+  const parts = [...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   function take(now) {  // another frame is another file
     data = now;
@@ -85,6 +92,7 @@ export function where(viewer, scene, live, show) {
   const projection = button('perspective', 'orthographic or perspective', 'o', () => { lens.flat = !lens.flat; again(); });
   const measuring = button('measure', 'measure a distance: click two points', 'm', () => ruler.measure(!ruler.measuring));
   measuring.hidden = Boolean(scene.streamed);
+  const slicing = slices && button('slices', 'slices of the volume, beside the picture', 's', () => slices.toggle());
   const picture = async () => save(await pictureOf(viewer, svg), `${scene.frames[frame()].name.replace(/\.(ply|html)$/, '').replace(/[^\w.-]+/g, '-')}.png`);
   button('picture', 'save the picture as PNG', 'p', picture);
   button('link', 'link to this view', 'l', async () => {
@@ -104,7 +112,7 @@ export function where(viewer, scene, live, show) {
   }
   help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
   about.of(button('about', 'about this file', 'i', about.toggle));
-  help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed }));
+  help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed, sliced: slices }));
   lens.canvas.tabIndex = 0;
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
@@ -130,6 +138,7 @@ export function where(viewer, scene, live, show) {
     state.scale = drawScale(rest, { ...all, left: LEFT + 96 });
     state.legend = legend(colors, wide, high);
     drawRuler(rest, all);
+    if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
     handles?.draw(world);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
@@ -141,9 +150,11 @@ export function where(viewer, scene, live, show) {
     [places.hidden, places.textContent] = [!lines.length, lines.join('\n')];
     projection.innerHTML = ICONS[lens.flat ? 'orthographic' : 'perspective'];
     measuring.setAttribute('aria-pressed', String(ruler.measuring));
+    slicing?.setAttribute('aria-expanded', String(slices.open));
   }
 
   app.on('update', () => {
+    if (live) slices?.follow(live.look.rows);
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
     const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.cut.state()]);
@@ -153,6 +164,6 @@ export function where(viewer, scene, live, show) {
   });
   take(dataNow());
   const fit = stayFree(lens, scene, draw);
-  Object.assign(state, { lens, ruler, site, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, ruler, site, slices, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
   return state;
 }

@@ -1,0 +1,208 @@
+"""Slices of the volume on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vvgt_cli.gaussians.formats.page_slices import packed, slices_of, unpacked
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.volume import Volume, averaged
+from vvgt_cli.volume.stats import slabs
+
+HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
+TURNED = (0.8, -0.6, 0.0, -0.6, -0.8, 0.0, 0.0, 0.0, 1.0)  # oblique, and mirrored
+
+
+def held(page: Path) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """Facts and decoded values of each grid that a page holds."""
+    text = page.read_text("utf-8")
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
+    found = []
+    for facts in scene.get("slices", ()):
+        content = re.search(rf'id="{facts["held"]}">([^<]+)</script>', text)[1]
+        found.append((facts, unpacked(base64.b64decode(content), facts)))
+    return found
+
+
+def centres(facts: dict[str, Any]) -> np.ndarray:
+    """World positions (nz, ny, nx, 3) of the middles of a grid's cells."""
+    affine = np.reshape(facts["affine"], (3, 4))
+    index = np.stack(np.meshgrid(*map(np.arange, facts["dims"]), indexing="ij"), -1).transpose(2, 1, 0, 3)
+    return index @ affine[:, :3].T + affine[:, 3]
+
+
+@pytest.mark.parametrize("dims", [(7, 9, 11), (3, 4, 5), (7, 3, 2)])
+def test_cells_have_the_mean_of_their_parts_of_voxels(dims, monkeypatch):
+    """Of a grid that divides the volume unevenly, read a few slices at a time."""
+    data = np.random.default_rng(1).normal(size=(11, 9, 7))
+    monkeypatch.setattr(averaged, "slabs", partial(slabs, max_voxels=2 * 9 * 7))
+    found = averaged.averaged(Volume(data, slope=2.0, intercept=-3.0), dims)
+    fine = data  # each voxel divided into as many parts as there are cells
+    for axis, n in enumerate(dims[::-1]):
+        fine = np.repeat(fine, n, axis)
+    nx, ny, nz = dims
+    wanted = fine.reshape(nz, 11, ny, 9, nx, 7).mean(axis=(1, 3, 5))
+    np.testing.assert_allclose(found, 2 * wanted - 3, rtol=1e-12, atol=1e-12)
+
+
+def test_unknown_voxels_are_left_out_of_means(monkeypatch):
+    monkeypatch.setattr(averaged, "slabs", partial(slabs, max_voxels=16))
+    data = np.full((4, 4, 4), 5.0)
+    data[:2, :2, :2], data[3, 3, 3], data[3, 3, 2] = np.nan, np.inf, 1.0
+    found = averaged.averaged(Volume(data), (2, 2, 2))
+    assert np.isnan(found[0, 0, 0])
+    assert found[1, 1, 1] == pytest.approx((6 * 5 + 1) / 7)
+    assert np.isfinite(found).sum() == 7
+
+
+def test_cells_are_nearly_cubes_and_never_smaller_than_voxels():
+    volume = Volume(np.zeros((10, 200, 200), np.uint8), spacing=(0.5, 0.5, 4.0))
+    dims = averaged.coarser(volume, 20_000)
+    assert np.prod(dims) <= 20_000
+    assert dims[2] == 10  # 4 mm are larger than the cells
+    assert dims[0] == dims[1] > 40
+    assert averaged.coarser(volume, 400_000) == volume.dims
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.uint16, np.float32])
+@pytest.mark.parametrize("missing", [False, True])
+def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monkeypatch):
+    """A field that is linear in the world, so that a cell's mean is its value in the middle."""
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.coarser", lambda volume, most: (11, 5, 18))
+    volume = Volume(np.zeros((18, 20, 22)), (1.0, 1.3, 2.0), (5.0, -7.0, 30.0), TURNED, value_unit="K")
+    index = np.stack(np.meshgrid(*map(np.arange, volume.dims), indexing="ij"), -1).transpose(2, 1, 0, 3)
+    place = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    data = place @ (1.0, 30.0, 2.0)
+    data = (data - data.min()) / np.ptp(data) * (200 if kind is np.uint8 else 30_000)
+    whole = kind is not np.float32
+    slope, intercept = (0.25, -10.0) if whole else (1.0, 0.0)
+    kept = data.astype(np.float32)
+    if missing and not whole:
+        kept[:, :8] = np.nan
+    volume = Volume(
+        np.rint(data).astype(kind) if whole else kept, volume.spacing, volume.origin, TURNED, value_unit="K",
+        slope=slope, intercept=intercept,
+    )  # fmt: skip
+    [facts], [content] = slices_of([(volume, None)])
+    found = unpacked(content, facts)
+    assert facts["bits"] == (8 if kind is np.uint8 else 16)
+    from_world = np.linalg.lstsq(np.c_[place.reshape(-1, 3), np.ones(place.size // 3)], data.ravel())[0]
+    wanted = slope * (centres(facts) @ from_world[:3] + from_world[3]) + intercept
+    known = np.isfinite(found)
+    assert known.all() == (whole or not missing)
+    rounding = 0.5 * slope if whole else 0.0  # of the stored values
+    assert np.abs(found - wanted)[known].max() < 0.5 * facts["step"] + rounding + 1e-6
+    assert facts["unit"] == "K"
+
+
+def test_a_volume_of_few_voxels_is_exact():
+    data = np.random.default_rng(2).integers(-1024, 3000, (5, 6, 7)).astype(np.int16)
+    [facts], [content] = slices_of([(Volume(data, hounsfield=True, space="LPS"), None)])
+    np.testing.assert_array_equal(unpacked(content, facts), data)
+    assert (facts["step"], facts["unit"]) == (1, "HU")
+    flat = slices_of([(Volume(np.full((2, 2, 2), 7, np.int16)), None)])
+    np.testing.assert_array_equal(unpacked(flat.contents[0], flat.facts[0]), 7)
+
+
+def test_huge_ranges_fit_into_16_bits():
+    data = np.random.default_rng(3).normal(size=(20, 20, 20))
+    data[0, 0, 0], data[5, 5, 5] = -1e9, 1e9
+    [facts], [content] = slices_of([(Volume(data), None)])
+    assert np.abs(unpacked(content, facts) - data).max() <= 0.5001 * facts["step"] < 2e4
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_codes_are_packed_without_loss(dtype):
+    codes = np.random.default_rng(4).integers(0, np.iinfo(dtype).max, (3, 4, 5), endpoint=True).astype(dtype)
+    facts = {"bits": 8 * codes.itemsize, "dims": [5, 4, 3], "labels": []}
+    np.testing.assert_array_equal(unpacked(packed(codes), facts), codes.astype(int) - 1)
+
+
+def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MOST", 64)
+    data = np.zeros((8, 8, 8), np.uint16)
+    data[2:4], data[4:6], data[6:] = 7, 300, 9  # 9 is not in the table
+    table = LabelTable("t", (Label(0, "air", (0, 0, 0), 0.0), Label(7, "<b>", (1, 0, 0)), Label(300, "c", (0, 1, 0))))
+    [facts], [content] = slices_of([(Volume(data), table)])
+    assert [one["name"] for one in facts["labels"]] == ["<b>", "c"]
+    assert (facts["dims"], facts["bits"]) == ([4, 4, 4], 8)
+    np.testing.assert_array_equal(unpacked(content, facts)[:, 0, 0], [-1, 0, 1, -1])
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A scan in HU-like values whose outside holds 999, a mask of its inside, and a label map."""
+    nib = pytest.importorskip("nibabel")
+    rng = np.random.default_rng(5)
+    data = np.full((14, 16, 18), 999, np.int16)
+    data[3:11, 3:13, 3:15] = rng.integers(0, 200, (8, 10, 12))
+    inside = (data < 999).astype(np.uint8)
+    labels = np.zeros(data.shape, np.uint8)
+    labels[4:7, 4:9, 4:9] = 1
+    for name, one in (("scan", data), ("mask", inside), ("labels", labels)):
+        nib.save(nib.Nifti1Image(one, np.diag([-1, 1.5, 2, 1])), tmp_path / f"{name}.nii.gz")
+    return tmp_path
+
+
+def test_pages_hold_what_the_conversion_shows_in_memory_and_in_blocks(vvgt, scan):
+    page = scan / "page.html"
+    done = vvgt("convert", scan / "scan.nii.gz", "-o", page, *HOW)
+    assert done.code == 0, done.err
+    assert "slices of the volume (14 x 16 x 18 voxels)" in done.err
+    [(facts, values)] = held(page)
+    assert (values.max(), facts["dims"]) == (999, [14, 16, 18])
+    blocks = vvgt("convert", scan / "scan.nii.gz", "--blocks", "16", "-o", scan / "blocks.html", *HOW)
+    assert blocks.code == 0, blocks.err
+    assert held(scan / "blocks.html")[0][0] == facts
+    np.testing.assert_array_equal(held(scan / "blocks.html")[0][1], values)
+    for how in (("--mask", scan / "mask.nii.gz"), ("--crop", "3:11,3:13,3:15")):
+        for more in ((), ("--blocks", "16")):
+            cut = vvgt("convert", scan / "scan.nii.gz", *how, *more, "-o", page, *HOW)
+            assert cut.code == 0, cut.err
+            [(facts, values)] = held(page)
+            assert np.nanmax(values) < 200  # nothing from outside
+            assert np.isfinite(values).sum() == 8 * 10 * 12
+    assert facts["affine"][3] == -3  # where it was
+    none = vvgt("convert", scan / "scan.nii.gz", "--no-slices", "-o", page, *HOW)
+    assert (none.code, held(page), "slices" in none.err) == (0, [], False)
+
+
+def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan):
+    page, layer = scan / "both.html", ("--layer", f"{scan / 'labels.nii.gz'},labels=auto")
+    done = vvgt("convert", scan / "scan.nii.gz", *layer, "--live", "-o", page, *HOW[:4])
+    assert done.code == 0, done.err
+    (_, values), (facts, rows) = held(page)
+    assert np.isfinite(values).all()
+    assert (rows >= 0).sum() == 3 * 5 * 5
+    assert len(facts["labels"]) == 1
+    alone = vvgt("view", scan / "labels.nii.gz", "--labels", "auto", "-o", page, "--overwrite", "--no-live")
+    assert alone.code == 0, alone.err
+    assert "names of 1 labels" in alone.err
+    assert [set(np.unique(rows)) for _, rows in held(page)] == [{-1, 0}]
+    served = vvgt("view", scan / "scan.nii.gz", "--no-slices")
+    assert (served.code, "--no-slices" in served.error) == (2, True)
+    two = ("--tf", "gray", "--tf", "viridis")
+    assert vvgt("convert", scan / "scan.nii.gz", *two, "-o", page, *HOW).code == 0
+    assert held(page) == []
+
+
+def test_results_have_slices_in_files_and_cells(scan):
+    import vvgt_cli as vvgt
+
+    result = vvgt.convert(str(scan / "scan.nii.gz"), goal={"max_gaussians": 60, "size": 32, "steps": 0})
+    result.save(scan / "result.html", editor=False)
+    [(facts, values)] = held(scan / "result.html")
+    assert values.shape == (18, 16, 14)
+    assert facts["held"] in result._repr_html_()
+    result.save(scan / "result.html", slices=False)
+    assert held(scan / "result.html") == []
+    result.save(scan / "result.html", comments=False)
+    assert held(scan / "result.html") == []

@@ -1,0 +1,52 @@
+// Grids of the volume that a page holds (page_slices.py): decoded, placed in the world, looked up; and how slices of them lie.
+import { unpacked } from './live.mjs';
+
+const BODY = [['axial', 'L', 'A'], ['coronal', 'L', 'S'], ['sagittal', 'P', 'S']], OTHER = [['z', 'x', 'y'], ['y', 'x', 'z'], ['x', 'y', 'z']];  // name, what is to the right, what is up
+const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+
+const through = (m, p) => [0, 1, 2].map((r) => m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
+
+function inverted(m) {
+  const [a, b, c, , d, e, f, , g, h, i] = m, det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g);
+  const rows = [[e * i - f * h, c * h - b * i, b * f - c * e], [f * g - d * i, a * i - c * g, c * d - a * f], [d * h - e * g, b * g - a * h, a * e - b * d]].map((row) => row.map((x) => x / det));
+  return rows.flatMap((row) => [...row, -row.reduce((sum, x, k) => sum + x * m[4 * k + 3], 0)]);
+}
+
+// the matrix of the one after the other
+const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 * r] * n[c] + m[4 * r + 1] * n[4 + c] + m[4 * r + 2] * n[8 + c] + (c === 3 ? m[4 * r + 3] : 0)));
+
+// {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, toWorld, toIndex, from(other): indices of another grid to its own}
+export async function gridOf(facts) {
+  const { dims: [nx, ny, nz], bits, held, affine, lo, step, missing } = facts, n = nx * ny * nz, bytes = await unpacked(held, true, (bits / 8) * n);
+  const codes = bits === 8 ? new Uint8Array(n) : new Uint16Array(n), high = bits === 8 ? null : bytes.subarray(n);
+  for (let i = 0; i < n; i++) {
+    const folded = high ? bytes[i] | (high[i] << 8) : bytes[i];
+    codes[i] = ((folded >>> 1) ^ -(folded & 1)) + (i % nx ? codes[i - 1] : 0);
+  }
+  const inverse = inverted(affine);
+  return {
+    ...facts, codes,
+    value: (code) => (code < missing ? NaN : lo + step * (code - missing)),
+    at(index) {
+      const [x, y, z] = index.map(Math.round);
+      return x < 0 || y < 0 || z < 0 || x >= nx || y >= ny || z >= nz ? -1 : codes[x + nx * (y + ny * z)];
+    },
+    toWorld: (index) => through(affine, index), toIndex: (place) => through(inverse, place),
+    from: (other) => { const m = chained(inverse, other.affine); return (index) => through(m, index); },
+    edges: [0, 1, 2].map((k) => Math.hypot(affine[k], affine[4 + k], affine[8 + k])),
+  };
+}
+
+// The three slices along a grid's own axes, each named after the axis of the world that is nearest: {name, across, along, up: {axis, sign}, letters: of its four sides}
+export function viewsOf({ affine, edges }, { letters, anatomical }) {
+  const share = (k, axis) => Math.abs(affine[4 * k + axis]) / edges[axis], total = (order) => order.reduce((sum, axis, k) => sum + share(k, axis), 0);
+  const order = ORDERS.reduce((best, one) => (total(one) > total(best) + 1e-9 ? one : best));
+  const towards = (letter) => {
+    const k = letters.findIndex((pair) => pair.includes(letter)), axis = order[k], end = letters[k].indexOf(letter);
+    return { axis, sign: (end ? 1 : -1) * (affine[4 * k + axis] < 0 ? -1 : 1), ends: [letters[k][1 - end], letter] };
+  };
+  return (anatomical ? BODY : OTHER).map(([name, right, above]) => {
+    const along = towards(right), up = towards(above);
+    return { name, along, up, across: 3 - along.axis - up.axis, letters: { left: along.ends[0], right: along.ends[1], bottom: up.ends[0], top: up.ends[1] } };
+  });
+}

@@ -1,0 +1,140 @@
+"""Slices of the volume on its page: values and labels on coarser grids, which `page/volume.mjs` decodes.
+
+A grid is packed by gzip: its codes, each minus the one before it along x (modulo 2^bits), as planes of their low and,
+with 16 bits, high bytes. Differences are stored as `(d << 1) ^ (d >> bits - 1)`, so that small ones are small numbers.
+A value is ``lo + step * (code - missing)``, unknown where ``code < missing``; a label is number ``code - 1`` of a list.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.volume.averaged import averaged, coarser, sampled
+from vvgt_cli.volume.types import Volume
+
+MOST = 1 << 22  # cells of all grids of a page
+LEVELS = 4096  # steps of the range of most values
+MOST_OF = (0.1, 99.9)  # percentiles that bound most values
+CODES = 1 << 16
+EXACT = 1e-6  # steps by which rounding may move a mean of equal values
+
+
+class Slices(NamedTuple):
+    """Grids of a page.
+
+    Attributes:
+        facts: of each layer shown.
+        contents: of each, the packed codes.
+    """
+
+    facts: tuple[dict[str, Any], ...]
+    contents: tuple[bytes, ...]
+
+    @property
+    def labels(self) -> int:
+        """Count of labels that are named."""
+        return sum(len(one.get("labels", ())) for one in self.facts)
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """Entry of the page's scene."""
+        return {"slices": self.facts}
+
+    @property
+    def held(self) -> dict[str, bytes]:
+        """Contents by the ids of their elements."""
+        return {one["held"]: content for one, content in zip(self.facts, self.contents, strict=True)}
+
+    def __str__(self) -> str:
+        """Describe the grids for whoever sends the page."""
+        grids = [" x ".join(map(str, one["dims"])) for one in self.facts]
+        return f"slices of the volume ({', '.join(grids)} voxels)"
+
+
+def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None]) -> Slices | None:
+    """Return the grids of layers, read slab by slab.
+
+    Args:
+        layers: of each its volume, and the table of a label map; None for one with colours, which has no grid.
+
+    Returns:
+        None if no layer has a grid.
+    """
+    shown = [(number, *layer) for number, layer in enumerate(layers) if layer is not None]
+    facts, contents = [], []
+    for number, volume, table in shown:
+        dims = coarser(volume, MOST // len(shown))
+        own, codes = _values(volume, dims) if table is None else _labels(table, volume, dims)
+        stretch = np.array(volume.dims) / dims
+        affine = volume.affine[:3] @ np.vstack([np.diag([*stretch, 1.0])[:3], [0, 0, 0, 1.0]])
+        affine[:, 3] += volume.affine[:3, :3] @ ((stretch - 1) / 2)  # the middle of the first cell
+        title = volume.name if len(layers) > 1 else ""
+        facts.append(
+            {
+                "layer": number, "title": title, "dims": list(dims), "bits": 8 * codes.itemsize,
+                "affine": affine.ravel().tolist(), "held": f"slices-{number}",
+            } | own
+        )  # fmt: skip
+        contents.append(packed(codes))
+    return Slices(tuple(facts), tuple(contents)) if facts else None
+
+
+def _values(volume: Volume, dims: tuple[int, int, int]) -> tuple[dict[str, Any], np.ndarray]:
+    """Return facts and codes (nz, ny, nx) of the means of values."""
+    values = averaged(volume, dims)
+    known = values[np.isfinite(values)]
+    lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    a, b = map(float, np.percentile(known, MOST_OF)) if len(known) else (0.0, 0.0)
+    missing = int(len(known) < values.size)
+    step = max(((b - a) or (hi - lo)) / LEVELS, (hi - lo) / (CODES - 3)) or 1.0
+    if volume.data.dtype.kind in "iub":  # whole steps between stored values, so that these are exact
+        one = abs(volume.slope)
+        step = one * max(math.ceil(step / one), 1) if step > one / 2 else one
+        lo = volume.intercept + one * math.floor((lo - volume.intercept) / one + EXACT)
+    codes = np.rint((np.nan_to_num(values, nan=lo - missing * step) - lo) / step) + missing
+    window = [(a + b) / 2, (b - a) or step]
+    facts = {
+        "lo": lo, "step": step, "missing": missing, "unit": volume.values_in, "quantity": volume.quantity,
+        "level": window[0], "window": window[1],
+    }  # fmt: skip
+    return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16)
+
+
+def _labels(
+    table: LabelTable, volume: Volume, dims: tuple[int, int, int]
+) -> tuple[dict[str, Any], np.ndarray]:  # fmt: skip
+    """Return facts and codes (nz, ny, nx) of labels, as many as fit."""
+    labels = [one for one in table.labels if one.number != 0 or one.opacity > 0][: CODES - 1]
+    numbers = np.array([one.number for one in labels], np.float64)
+    codes = np.zeros(dims[::-1], np.uint8 if len(labels) < 256 else np.uint16)
+    for first, found in sampled(volume, dims):
+        row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
+        codes[first : first + len(found)] = np.where(numbers[row] == found, row + 1, 0)
+    return {"labels": [{"name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in labels]}, codes
+
+
+def packed(codes: np.ndarray) -> bytes:
+    """Pack codes (nz, ny, nx) uint8 or uint16."""
+    signed = np.dtype(f"i{codes.itemsize}")
+    steps = np.diff(codes, axis=2, prepend=codes.dtype.type(0)).view(signed)
+    folded = ((steps << 1) ^ (steps >> (8 * codes.itemsize - 1))).astype(signed.newbyteorder("<"))
+    return gzip.compress(folded.view(np.uint8).reshape(-1, codes.itemsize).T.tobytes(), 6, mtime=0)
+
+
+def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
+    """Decode values (nz, ny, nx) float64, NaN where unknown, or numbers in the list of labels, -1 for none."""
+    size = facts["bits"] // 8
+    planes = np.frombuffer(gzip.decompress(content), np.uint8).reshape(size, -1)
+    folded = np.ascontiguousarray(planes.T).view(f"<u{size}").reshape(facts["dims"][::-1])
+    steps = (folded >> 1) ^ (0 - (folded & 1))
+    codes = np.cumsum(steps, axis=2, dtype=folded.dtype).astype(np.int64)
+    if "labels" in facts:
+        return codes - 1
+    codes -= facts["missing"]
+    return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)
