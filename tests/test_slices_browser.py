@@ -118,8 +118,9 @@ def test_a_click_moves_the_cross_in_slices_and_picture(marked: str, person: Pers
     x1, y1, x2, y2 = np.array(person("eval", LINES)).T
     place, _ = found(picture[:, : int(person("eval", "window.vvgt.where.lens.canvas.clientWidth"))], 0)
     far = np.abs((y2 - y1) * place[0] - (x2 - x1) * place[1] + x2 * y1 - y2 * x1) / np.hypot(x2 - x1, y2 - y1)
-    print(f"{person.size}: lines {np.round(far, 1)} px from the mark")
-    assert far.max() < 8  # the red of the mark is in front of its middle
+    far *= person("eval", "window.vvgt.where.lens.perPixel() * window.vvgt.where.world.length")
+    print(f"{person.size}: lines {np.round(far, 1)} mm from the mark")
+    assert far.max() < 4  # the red of the mark, of radius 5, is in front of its middle
     link = person("eval", "window.vvgt.where.link()")
     person("open", link)
     assert np.array(person("eval", CROSS)) == pytest.approx(at, abs=0.1)
@@ -159,7 +160,10 @@ def test_window_and_slice_are_changed_by_drag_wheel_and_keys(marked: str, person
         person("settled")
         assert int(person("eval", f"Number({slider}.value)")) == before + 10
     assert person("eval", "document.activeElement.getAttribute('aria-label')").startswith("axial slice")
-    names = person("eval", f"{CONTROLS}.map((e) => e.getAttribute('aria-label') ?? e.closest('label')?.textContent)")
+    names = person(
+        "eval",
+        f"{CONTROLS}.map((e) => e.getAttribute('aria-label') ?? e.closest('label')?.textContent ?? e.textContent)",
+    )
     assert all(names), names
     assert "coronal slice" in names
     small = person("eval", f"{CONTROLS}.map((e) => e.getBoundingClientRect().height)")
@@ -203,3 +207,32 @@ def test_labels_are_drawn_over_the_values_as_their_list_shows_them(person: Perso
     assert re.search(r": 100, (3|lobe|label 3)$", person("eval", SAID))
     person("eval", f"{look}.set([{{ number: 3, opacity: 0 }}])")
     np.testing.assert_allclose(color(16, 6), np.full(3, np.clip(grey, 0, 1)), atol=0.02)
+
+
+def test_the_face_of_a_cut_shows_the_slice_and_hides_what_is_behind(
+    marked: str, person: Person, tmp_path: Path
+) -> None:  # fmt: skip
+    opened(person, marked)
+    person("press", "y")
+    cut = "window.vvgt.live.cut.change({{ kind: 'plane', normal: window.vvgt.live.cut.axes[1], at: {}, flipped: {} }})"
+    person("eval", cut.format(0.5, "false"))
+    person("eval", "window.vvgt.where.slices.part.set('100,25,30,-20,12,0')")
+    middle = tuple(np.round(person("eval", MIDDLE)).astype(int)[::-1])
+    assert person.picture(tmp_path, "bare.png")[middle] == pytest.approx(np.full(3, 0.6), abs=0.05)
+    person("eval", "document.querySelector('#slices .face').click()")
+    picture = person.picture(tmp_path, "face.png")
+    assert picture[middle] == pytest.approx(np.full(3, 0.65), abs=0.02)  # 40 in the window from -25 to 75
+    row = picture[middle[0], : int(person("eval", "window.vvgt.where.lens.canvas.clientWidth"))].max(axis=-1)
+    beside = np.abs(row - 0.25) < 0.02  # 0 in it: within the box, beside the ball
+    ball = np.abs(row - 0.65) < 0.02
+    print(f"{person.size}: {ball.sum()} px of the ball, {beside.sum()} beside it, {(row < 0.02).sum()} black")
+    assert ball.sum() == pytest.approx(beside.sum() * 33 / (60 - 33), rel=0.3)
+    link = person("eval", "window.vvgt.where.link()")
+    person("press", "Shift+Y")  # from behind it is covered
+    assert person.picture(tmp_path, "behind.png")[middle] == pytest.approx(np.full(3, 0.6), abs=0.05)
+    person("open", link)
+    assert person("eval", "window.vvgt.where.link()") == link
+    middle = tuple(np.round(person("eval", MIDDLE)).astype(int)[::-1])
+    assert person.picture(tmp_path, "linked.png")[middle] == pytest.approx(np.full(3, 0.65), abs=0.02)
+    person("eval", "window.vvgt.live.cut.change({ kind: 'none' })")
+    assert person.picture(tmp_path, "none.png")[middle] == pytest.approx(np.full(3, 0.6), abs=0.05)

@@ -6,8 +6,20 @@ const THIN = 0.02, STEP = 0.01, TURN = 5 * (Math.PI / 180);  // thinnest box; a 
 const STEEP = 0.06;  // squared sine of the angle between a line and the ray below which up and down move along it
 const STEM = 70;  // px that the direction of a plane is at most long
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const WHOLE = [0, 1, 0, 1, 0, 1];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => { const length = Math.hypot(...a) || 1; return a.map((x) => x / length); };
+
+// where a plane meets a parallelepiped of eight corners: the corners of a polygon, and two directions in the plane
+export function sectionOf(ends, { normal, place }) {
+  const found = EDGES.flatMap(([i, j]) => {
+    const [a, b] = [ends[i], ends[j]].map((p) => dot(normal, p) - place);
+    return (a < 0) === (b < 0) ? [] : [plus(ends[i], plus(ends[j], ends[i], -1), a / (a - b))];
+  });
+  const side = unit(cross(normal, Math.abs(normal[0]) < 0.7 ? [1, 0, 0] : [0, 1, 0])), other = cross(normal, side);
+  const centre = found.reduce((sum, p) => plus(sum, p, 1 / found.length), [0, 0, 0]), angle = (p) => Math.atan2(dot(plus(p, centre, -1), other), dot(plus(p, centre, -1), side));
+  return { points: found.sort((p, q) => angle(p) - angle(q)), side, other };
+}
 
 export function handlesOf(lens, cut) {
   const svg = element('svg', { id: 'cut' }), outline = element('path', { fill: 'none', stroke: '#fc3', 'stroke-width': 1, 'stroke-opacity': 0.7 });
@@ -109,18 +121,6 @@ export function handlesOf(lens, cut) {
 
   const path = (points, closed = false) => (points.every(Boolean) && points.length ? `M${points.map((p) => p.map((x) => x.toFixed(1)).join(',')).join('L')}${closed ? 'Z' : ''}` : '');
 
-  // where the plane meets the box
-  function section() {
-    const [{ normal, place }] = cut.planes(), ends = corners([0, 1, 0, 1, 0, 1]);
-    const found = EDGES.flatMap(([i, j]) => {
-      const [a, b] = [ends[i], ends[j]].map((p) => dot(normal, p) - place);
-      return (a < 0) === (b < 0) ? [] : [plus(ends[i], plus(ends[j], ends[i], -1), a / (a - b))];
-    });
-    const side = unit(cross(normal, Math.abs(normal[0]) < 0.7 ? [1, 0, 0] : [0, 1, 0])), other = cross(normal, side);
-    const centre = found.reduce((sum, p) => plus(sum, p, 1 / found.length), [0, 0, 0]), angle = (p) => Math.atan2(dot(plus(p, centre, -1), other), dot(plus(p, centre, -1), side));
-    return found.sort((p, q) => angle(p) - angle(q));
-  }
-
   return {
     svg,
     draw(world) {
@@ -135,7 +135,7 @@ export function handlesOf(lens, cut) {
         group.setAttribute('aria-label', name());
         group.setAttribute('aria-valuenow', value().toFixed(3));
       }
-      outline.setAttribute('d', kind === 'box' ? EDGES.map((edge) => path(edge.map((i) => lens.project(corners(box)[i])))).join('') : kind === 'plane' ? path(section().map(lens.project), true) : '');
+      outline.setAttribute('d', kind === 'box' ? EDGES.map((edge) => path(edge.map((i) => lens.project(corners(box)[i])))).join('') : kind === 'plane' ? path(sectionOf(corners(WHOLE), cut.planes()[0]).points.map(lens.project), true) : '');
       stem.setAttribute('d', kind === 'plane' ? path([foot(), tip()].map(lens.project)) : '');
     },
   };

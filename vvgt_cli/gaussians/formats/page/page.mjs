@@ -139,7 +139,7 @@ function series(viewer, live) {
 async function start() {
   if (!document.createElement('canvas').getContext('webgl2')) throw new Error('WebGL 2 is missing or turned off');
   if (scene.waits) return waiting(said);
-  document.body.className = scene.streamed ? '' : 'begins';  // what is shown before its place is known
+  document.body.classList.toggle('begins', !scene.streamed);  // what is shown before its place is known
   const { file } = scene.frames[0];
   const response = scene.streamed ? null : await content(scene.frames[0]);  // what is streamed the engine fetches itself
   if (response && !response.ok) throw new Error(`${scene.frames[0].name} could not be loaded`);
@@ -163,7 +163,7 @@ async function start() {
   if (live) await served(live, viewer, scene.server, converted && { ...converted, contents: await content(converted) });
   const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
   await here.restored;
-  document.body.className = '';
+  document.body.classList.remove('begins');
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };
   here.site.loaded();

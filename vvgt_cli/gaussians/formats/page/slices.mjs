@@ -6,16 +6,16 @@ const STILL = 6, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];  // px that a click
 const CT = [['soft tissue', 400, 40], ['lung', 1500, -600], ['bone', 1800, 400], ['brain', 80, 40]];
 const OVER = 0.5;  // how much of a label's colour is seen over values
 const HTML = `<header><b>slices</b><select class="grid" aria-label="volume" title="volume"></select><select class="preset" aria-label="window" title="window"></select>
-<label>W <input class="window" type="number" step="any" min="0"></label><label>L <input class="level" type="number" step="any"></label><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
+<label>W <input class="window" type="number" step="any" min="0"></label><label>L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
 const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="0">';
 
-// world(): of where.mjs; rows(layer): colours and opacities of its labels as they are shown, or null; moved(place): of the cross, picked(place): by a click
-export function slicesOf(scene, { world, rows, moved, picked }) {
+// world(): of where.mjs; cuts: the picture has a cut; rows(layer): colours and opacities of its labels as they are shown, or null; moved(place): of the cross, picked(place): by a click
+export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   const root = Object.assign(document.createElement('section'), { id: 'slices', hidden: true, innerHTML: HTML });
   root.setAttribute('aria-label', 'slices');
   document.body.append(root);
   const find = (selector) => root.querySelector(selector), fields = [find('.window'), find('.level')], said = find('output');
-  let grids = null, labels = [], views = [], base = null, at = [0, 0, 0], shades = null, window_ = [1, 0];
+  let grids = null, labels = [], views = [], base = null, at = [0, 0, 0], shades = null, window_ = [1, 0], version = 0;
 
   const presets = () => [...(base.unit === 'HU' ? CT : []), ['all values', base.window, base.level]];
   function shade(window, level) {
@@ -27,7 +27,9 @@ export function slicesOf(scene, { world, rows, moved, picked }) {
     });
     window_.forEach((x, k) => { fields[k].value = Number(x.toPrecision(4)); });
     find('.preset').value = String(presets().findIndex(([, w, l]) => w === window && l === level));
+    version++;
     draw();
+    moved();
   }
 
   function choose(grid) {
@@ -61,27 +63,29 @@ export function slicesOf(scene, { world, rows, moved, picked }) {
     };
   }
 
-  // the picture of a slice: values under colours of labels
-  function painted({ along, up, across }) {
-    const [n, m] = [along, up].map(({ axis }) => base.dims[axis]), picture = new ImageData(n, m), pixels = new Uint32Array(picture.data.buffer), { data } = picture;
-    const strides = [1, base.dims[0], base.dims[0] * base.dims[1]], index = [...at].map(Math.round), first = index[across] * strides[across];
+  // the picture of a parallelogram, n by m pixels: values under colours of labels; from an index, a pixel across and a pixel down
+  function walked(from, across, down, n, m) {
+    const picture = new ImageData(n, m), pixels = new Uint32Array(picture.data.buffer), { data } = picture, share = base.labels ? 1 : OVER;
     const over = labels.map((grid) => ({ grid, own: grid.from(base), colors: rows(grid.layer) ?? grid.labels }));
-    for (let j = 0, p = 0; j < m; j++) {
-      index[up.axis] = up.sign > 0 ? m - 1 - j : j;
-      for (let i = 0; i < n; i++, p++) {
-        index[along.axis] = along.sign > 0 ? i : n - 1 - i;
-        if (shades && !base.labels) pixels[p] = shades[base.codes[first + index[along.axis] * strides[along.axis] + index[up.axis] * strides[up.axis]]];
-        for (const { grid, own, colors } of over) {
-          const seen = colors[grid.at(own(index)) - 1];
-          if (!seen?.opacity) continue;
-          const share = base.labels ? 1 : OVER;
-          for (let c = 0; c < 3; c++) data[4 * p + c] = (1 - share) * data[4 * p + c] + 255 * share * seen.rgb[c];
-          data[4 * p + 3] = 255;
-        }
+    for (let j = 0, p = 0; j < m; j++) for (let i = 0; i < n; i++, p++) {
+      const x = from[0] + i * across[0] + j * down[0], y = from[1] + i * across[1] + j * down[1], z = from[2] + i * across[2] + j * down[2];
+      if (!base.labels) pixels[p] = shades[base.near(x, y, z)] ?? 0;
+      for (const { grid, own, colors } of over) {
+        const seen = colors[grid.at(own([x, y, z])) - 1];
+        if (!seen?.opacity) continue;
+        for (let c = 0; c < 3; c++) data[4 * p + c] = (1 - share) * data[4 * p + c] + 255 * share * seen.rgb[c];
+        data[4 * p + 3] = 255;
       }
     }
-    const made = new OffscreenCanvas(n, m);
-    made.getContext('2d').putImageData(picture, 0, 0);
+    return picture;
+  }
+
+  function painted({ along, up, across }) {
+    const [n, m] = [along, up].map(({ axis }) => base.dims[axis]), from = [0, 0, 0], right = [0, 0, 0], down = [0, 0, 0], made = new OffscreenCanvas(n, m);
+    from[across] = Math.round(at[across]);
+    [from[along.axis], right[along.axis]] = along.sign > 0 ? [0, 1] : [n - 1, -1];
+    [from[up.axis], down[up.axis]] = up.sign > 0 ? [m - 1, -1] : [0, 1];
+    made.getContext('2d').putImageData(walked(from, right, down, n, m), 0, 0);
     return made;
   }
 
@@ -194,12 +198,23 @@ export function slicesOf(scene, { world, rows, moved, picked }) {
   }
   find('.preset').addEventListener('change', ({ target }) => shade(...presets()[Number(target.value)].slice(1)));
   fields.forEach((field) => field.addEventListener('change', () => shade(...fields.map(({ valueAsNumber: x }, k) => (Number.isFinite(x) ? x : window_[k])))));
+  const face = find('.face'), onFace = (now) => { face.setAttribute('aria-pressed', String(now)); moved(); };
+  face.hidden = !cuts;
+  face.addEventListener('click', () => onFace(face.getAttribute('aria-pressed') !== 'true'));
   find('.close').addEventListener('click', () => toggle(false));
 
   let looks = [];
   return {
-    root, toggle, draw, found: (place) => found(base.toIndex(place)),
+    root, toggle, found: (place) => found(base.toIndex(place)),
     get open() { return Boolean(base) && !root.hidden; },
+    // 0: not on the cut; another number: another look
+    get face() { return base && !root.hidden && face.getAttribute('aria-pressed') === 'true' ? version + 1 : 0; },
+    // of places of the world, a pixel across and a pixel down
+    image(from, across, down, n, m) {
+      const [o, a, b] = [from, across, down].map(base.toIndex), minus = (p) => p.map((x, k) => x - o[k]);
+      return walked(o, minus(a), minus(b), n, m);
+    },
+    corners: () => Array.from({ length: 8 }, (_, i) => base.toWorld(base.dims.map((n, k) => ((i >> k) & 1 ? n - 0.5 : -0.5)))),
     get state() { return { window: window_[0], level: window_[1], at: base.toWorld(at), views, frameOf, base }; },
     // the ends of the lines that cross, in the world
     lines: () => [0, 1, 2].map((k) => [-0.5, base.dims[k] - 0.5].map((x) => base.toWorld(at.map((y, j) => (j === k ? x : y))))),
@@ -208,17 +223,20 @@ export function slicesOf(scene, { world, rows, moved, picked }) {
     follow(now) {
       if (now.length === looks.length && now.every((one, k) => one === looks[k])) return;
       looks = [...now];
+      version++;
       draw();
+      moved();
     },
     part: {
       key: 'slices',
-      get: () => (base && !root.hidden ? [...(base.labels ? [0, 0] : window_), ...base.toWorld(at)].map((x) => Number(x.toPrecision(6))).join(',') : ''),
+      get: () => (base && !root.hidden ? [...(base.labels ? [0, 0] : window_), ...base.toWorld(at), face.getAttribute('aria-pressed') === 'true' ? 1 : 0].map((x) => Number(x.toPrecision(6))).join(',') : ''),
       async set(text) {
         const numbers = text.split(',').map(Number);
         await toggle(Boolean(text));
-        if (!text || numbers.length !== 5 || !numbers.every(Number.isFinite)) return;
+        if (!text || numbers.length !== 6 || !numbers.every(Number.isFinite)) return;
         if (!base.labels) shade(numbers[0], numbers[1]);
-        go(base.toIndex(numbers.slice(2)));
+        onFace(numbers[5] === 1);
+        go(base.toIndex(numbers.slice(2, 5)));
       },
     },
   };

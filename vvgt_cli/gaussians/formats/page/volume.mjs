@@ -15,7 +15,7 @@ function inverted(m) {
 // the matrix of the one after the other
 const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 * r] * n[c] + m[4 * r + 1] * n[4 + c] + m[4 * r + 2] * n[8 + c] + (c === 3 ? m[4 * r + 3] : 0)));
 
-// {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, toWorld, toIndex, from(other): indices of another grid to its own}
+// {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, near(x, y, z): that between the eight around it, toWorld, toIndex, from(other): indices of another grid to its own}
 export async function gridOf(facts) {
   const { dims: [nx, ny, nz], bits, held, affine, lo, step, missing } = facts, n = nx * ny * nz, bytes = await unpacked(held, true, (bits / 8) * n);
   const codes = bits === 8 ? new Uint8Array(n) : new Uint16Array(n), high = bits === 8 ? null : bytes.subarray(n);
@@ -30,6 +30,14 @@ export async function gridOf(facts) {
     at(index) {
       const [x, y, z] = index.map(Math.round);
       return x < 0 || y < 0 || z < 0 || x >= nx || y >= ny || z >= nz ? -1 : codes[x + nx * (y + ny * z)];
+    },
+    near(x, y, z) {
+      if (!(x >= -0.5 && y >= -0.5 && z >= -0.5 && x < nx - 0.5 && y < ny - 0.5 && z < nz - 0.5)) return -1;
+      if (missing) return codes[Math.round(x) + nx * (Math.round(y) + ny * Math.round(z))] || -1;
+      const i = Math.max(Math.floor(x), 0), j = Math.max(Math.floor(y), 0), k = Math.max(Math.floor(z), 0), first = i + nx * (j + ny * k);
+      const f = Math.max(x - i, 0), g = Math.max(y - j, 0), h = Math.max(z - k, 0), dx = i + 1 < nx ? 1 : 0, dy = j + 1 < ny ? nx : 0, dz = k + 1 < nz ? nx * ny : 0;
+      const line = (at) => codes[at] + (codes[at + dx] - codes[at]) * f, plane = (at) => { const a = line(at); return g ? a + (line(at + dy) - a) * g : a; }, low = plane(first);
+      return Math.round(h ? low + (plane(first + dz) - low) * h : low);
     },
     toWorld: (index) => through(affine, index), toIndex: (place) => through(inverse, place),
     from: (other) => { const m = chained(inverse, other.affine); return (index) => through(m, index); },

@@ -2,6 +2,7 @@
 import { rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
+import { facesOf } from './face.mjs';
 import { firstAngles, stayFree } from './free.mjs';
 import { handlesOf } from './handles.mjs';
 import { helpRows, listed, listen } from './keys.mjs';
@@ -49,9 +50,11 @@ export function where(viewer, scene, live, show) {
   });
   const labelled = (layer) => live && live.look.layers[layer].labels.map((_, k) => live.look.rows[live.look.layers[layer].row + k]);
   const slices = scene.slices && slicesOf(scene, {
-    world: () => world, rows: labelled, moved: () => again(),
+    world: () => world, cuts: Boolean(live), rows: labelled, moved: () => again(),
     picked: (place) => place && site.say('picked', { place: place.world, unit: world.unit, value: place.value ?? place.names[0] ?? null, in: place.in, layer: place.layer }),
   });
+  const faces = slices && live && facesOf(viewer);
+  let faced = '[[],0]';
   const parts = [...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   function take(now) {  // another frame is another file
@@ -131,6 +134,13 @@ export function where(viewer, scene, live, show) {
     return nodes ? drawLegend(group, { nodes: nodes(), live: layer, ...place }) : null;
   }
 
+  function drawFaces() {
+    const now = slices.face, planes = now ? live.cut.planes() : [], said = JSON.stringify([planes, planes.length && now]);
+    if (said === faced) return;
+    faced = said;
+    faces(planes, planes.length ? slices.corners().map(world.at) : [], (from, across, down, n, m) => slices.image(...[from, across, down].map(world.place), n, m));
+  }
+
   function draw() {
     const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, ruler, left: LEFT };
     const [letters, rest, colors] = ['over', '', 'over'].map((name) => element('g', { class: name }));
@@ -141,6 +151,7 @@ export function where(viewer, scene, live, show) {
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
     handles?.draw(world);
+    if (faces) drawFaces();
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
     const lines = ruler.places.map((place, k) => `${ruler.measuring ? `${k + 1}: ` : ''}${placeText(place, world)}`);
