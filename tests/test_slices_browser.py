@@ -236,3 +236,12 @@ def test_the_face_of_a_cut_shows_the_slice_and_hides_what_is_behind(
     assert person.picture(tmp_path, "linked.png")[middle] == pytest.approx(np.full(3, 0.65), abs=0.02)
     person("eval", "window.vvgt.live.cut.change({ kind: 'none' })")
     assert person.picture(tmp_path, "none.png")[middle] == pytest.approx(np.full(3, 0.6), abs=0.05)
+
+
+def test_damaged_slices_are_said_to_be(marked: str, person: Person, tmp_path: Path) -> None:
+    text = Path(marked.removeprefix("file://")).read_text("utf-8")
+    cut = re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text)
+    (tmp_path / "cut.html").write_text(cut, "utf-8")
+    opened(person, (tmp_path / "cut.html").as_uri())
+    assert person("eval", SAID).startswith("The slices are damaged")
+    assert person("eval", "window.vvgt.where.link()").count("slices=") == 0

@@ -191,7 +191,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   async function toggle(shown = root.hidden) {
     root.hidden = !shown;
     document.body.classList.toggle('sliced', shown);
-    if (shown) await open();
+    if (shown) await open().catch(({ message }) => { said.textContent = `The slices are damaged: ${message}.`; });
     draw();
     moved();
     dispatchEvent(new Event('resize'));
