@@ -155,9 +155,14 @@ def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: 
     assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
-def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("scheduler", [(), ("--scheduler", "local")])
+def test_bytes_depend_on_neither_blocks_nor_workers(
+    vvgt, volume: Path, folder: Path, tmp_path: Path, scheduler: tuple[str, ...]
+) -> None:
+    if scheduler:
+        pytest.importorskip("distributed")
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "32")
-    assert vvgt(*line, "--workers", "2").code == 0
+    assert vvgt(*line, "--workers", "2", *scheduler).code == 0
     assert files_in(tmp_path / "out") == files_in(folder)
 
 

@@ -29,11 +29,12 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks, Pass
 from vvgt_cli.field.cells import CellBlocks
+from vvgt_cli.field.digests import digest
 from vvgt_cli.field.open import FieldNeeds, blocked, runner_of, store_beside, thread_count
 from vvgt_cli.field.settings import MANY, BlockOptions, worker_count
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import pace
-from vvgt_cli.files import check_disk_space
+from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
@@ -128,13 +129,18 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     ended = limits.target_psnr is not None or limits.time_budget is not None
     steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
     degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
-    if steps and limits.time_budget is not None:
+    chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
+    if chosen.is_file():  # by a run with the same budget that was interrupted
+        steps = int(chosen.read_text("ascii"))
+    elif steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
         steps = min(steps, max(int(left / each), 0))
         if steps < fewest:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
             return None
+        with atomic_write(chosen, overwrite=True) as temporary:
+            temporary.write_text(str(steps), "ascii")
     if not steps:
         return None
     run.compile(for_degree(OPTIMIZE, degree))
