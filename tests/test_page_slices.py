@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import pytest
 from vvgt_cli.gaussians.formats.page_slices import packed, slices_of, unpacked
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
-from vvgt_cli.volume.stats import slabs
+from vvgt_cli.volume.stored import Stored
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
 TURNED = (0.8, -0.6, 0.0, -0.6, -0.8, 0.0, 0.0, 0.0, 1.0)  # oblique, and mirrored
@@ -43,7 +42,7 @@ def centres(facts: dict[str, Any]) -> np.ndarray:
 def test_cells_have_the_mean_of_their_parts_of_voxels(dims, monkeypatch):
     """Of a grid that divides the volume unevenly, read a few slices at a time."""
     data = np.random.default_rng(1).normal(size=(11, 9, 7))
-    monkeypatch.setattr(averaged, "slabs", partial(slabs, max_voxels=2 * 9 * 7))
+    monkeypatch.setattr(averaged, "AT_ONCE", 2 * 9 * 7)
     found = averaged.averaged(Volume(data, slope=2.0, intercept=-3.0), dims)
     fine = data  # each voxel divided into as many parts as there are cells
     for axis, n in enumerate(dims[::-1]):
@@ -53,8 +52,28 @@ def test_cells_have_the_mean_of_their_parts_of_voxels(dims, monkeypatch):
     np.testing.assert_allclose(found, 2 * wanted - 3, rtol=1e-12, atol=1e-12)
 
 
+def test_chunks_of_a_file_are_read_once_each(monkeypatch):
+    """Whether parts are smaller or larger than the chunks."""
+    data, asked = np.random.default_rng(6).integers(0, 99, (11, 9, 14)).astype(np.int16), []
+
+    def read(slices):
+        asked.append(tuple((s.start, s.stop) for s in slices))
+        return data[slices]
+
+    lazy = Volume(Stored(read, data.dtype, data.shape, (4, 4, 5), "lazy"))
+    wanted, labels = averaged.averaged(Volume(data), (5, 9, 3)), averaged.sampled(Volume(data), (5, 9, 3))
+    np.testing.assert_array_equal(labels, data[[1, 5, 9]][:, :, [1, 4, 7, 9, 12]])
+    for most, count in ((1, 3 * 3 * 3), (4 * 4 * 15, 3 * 3), (1 << 21, 1)):
+        monkeypatch.setattr(averaged, "AT_ONCE", most)
+        asked.clear()
+        np.testing.assert_allclose(averaged.averaged(lazy, (5, 9, 3)), wanted, rtol=1e-12)
+        assert len(asked) == len(set(asked)) == count
+        assert all(a % edge == 0 for part in asked for (a, _), edge in zip(part, (4, 4, 5), strict=True))
+        np.testing.assert_array_equal(averaged.sampled(lazy, (5, 9, 3)), labels)
+
+
 def test_unknown_voxels_are_left_out_of_means(monkeypatch):
-    monkeypatch.setattr(averaged, "slabs", partial(slabs, max_voxels=16))
+    monkeypatch.setattr(averaged, "AT_ONCE", 16)
     data = np.full((4, 4, 4), 5.0)
     data[:2, :2, :2], data[3, 3, 3], data[3, 3, 2] = np.nan, np.inf, 1.0
     found = averaged.averaged(Volume(data), (2, 2, 2))

@@ -182,7 +182,7 @@ class Source:
             )
 
     def slices(self) -> Slices | None:
-        """Return the grids of all layers for a page, read slab by slab; None if all layers have colours."""
+        """Return the grids of all layers for a page, read part by part; None if all layers have colours."""
         from vvgt_cli.gaussians.formats.page_slices import slices_of
 
         return slices_of(

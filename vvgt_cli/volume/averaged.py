@@ -1,14 +1,17 @@
-"""A volume on a coarser grid of the same box, read slab by slab: means of values, or samples of labels."""
+"""A volume on a coarser grid of the same box, read part by part: means of values, or samples of labels."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vvgt_cli.volume.stats import slabs
+from vvgt_cli.volume.stored import chunks_of, read_block
 from vvgt_cli.volume.types import Volume, triple
+
+AT_ONCE = 1 << 21  # voxels of a part, unless one of the file's chunks has more
 
 
 def coarser(volume: Volume, most: int) -> tuple[int, int, int]:
@@ -34,48 +37,63 @@ def averaged(volume: Volume, dims: tuple[int, int, int]) -> np.ndarray:
         (nz, ny, nx) float64, NaN where a cell has no finite value.
     """
     sums, shares = np.zeros((2, *dims[::-1]))
-    area = volume.dims[0] * volume.dims[1] / (dims[0] * dims[1])
-    for lo, slab in slabs(volume):
-        values = volume.slope * slab.astype(np.float64) + volume.intercept
+    for lo, part in _parts(volume):
+        values = volume.slope * part.astype(np.float64) + volume.intercept
         known = np.isfinite(values)
+        values[~known] = 0
+        spans = [
+            _span(*axis) for axis in zip(volume.dims[::-1], dims[::-1], lo[::-1], part.shape, strict=True)
+        ]  # fmt: skip
+        here = tuple(slice(first, first + len(edges) - 1) for first, edges in spans)
+        edges = [edges for _, edges in spans]
+        sums[here] += _integrated(values, edges)
         if known.all():
-            column = np.full((len(slab), 1, 1), area)
-            of_known = _integrated(column, lo, (1, 1, volume.dims[2]), (1, 1, dims[2]))[1]
+            z, y, x = (np.diff(one) for one in edges)
+            shares[here] += z[:, None, None] * y[:, None] * x
         else:
-            of_known = _integrated(known.astype(np.float64), lo, volume.dims, dims)[1]
-            values[~known] = 0
-        first, of_values = _integrated(values, lo, volume.dims, dims)
-        here = slice(first, first + len(of_values))
-        sums[here] += of_values
-        shares[here] += of_known
+            shares[here] += _integrated(known.astype(np.float64), edges)
     empty = shares < 1e-9
     return np.where(empty, np.nan, sums / np.where(empty, 1.0, shares))
 
 
-def _integrated(
-    slab: np.ndarray, lo: int, whole: tuple[int, ...], dims: tuple[int, ...]
-) -> tuple[int, np.ndarray]:  # fmt: skip
-    """Integrate slices from ``lo`` on over the cells that they overlap; return the first such cell, and the sums."""
-    begin = 0
-    for axis, (n, count) in enumerate(zip(whole[::-1], dims[::-1], strict=True)):
-        edges = np.linspace(0, n, count + 1)
-        if axis == 0:
-            hi = lo + len(slab)
-            begin, end = int(np.searchsorted(edges, lo, "right")) - 1, int(np.searchsorted(edges, hi, "left"))
-            edges = edges[begin : end + 1].clip(lo, hi) - lo
-        before = np.minimum(edges.astype(np.int64), slab.shape[axis] - 1)
-        share = (edges - before).reshape([-1 if k == axis else 1 for k in range(3)])
-        until = np.insert(np.cumsum(slab, axis), 0, 0.0, axis)
+def sampled(volume: Volume, dims: tuple[int, int, int]) -> np.ndarray:
+    """Return the data value (nz, ny, nx) float64 at the middle of each cell, for a label map."""
+    out = np.empty(dims[::-1])
+    middles = [((np.arange(n) + 0.5) * whole / n).astype(np.int64) for n, whole in zip(dims, volume.dims, strict=True)]
+    for lo, part in _parts(volume):
+        cells, voxels = [], []
+        for middle, first, length in zip(middles[::-1], lo[::-1], part.shape, strict=True):
+            cells.append(np.flatnonzero((middle >= first) & (middle < first + length)))
+            voxels.append(middle[cells[-1]] - first)
+        out[np.ix_(*cells)] = part[np.ix_(*voxels)]
+    return volume.slope * out + volume.intercept
+
+
+def _parts(volume: Volume) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the first voxel (x, y, z) and the stored values (z, y, x) of parts of whole chunks of the file."""
+    shape, edge = volume.data.shape, list(chunks_of(volume))
+    for axis in (2, 1, 0):
+        room = max(AT_ONCE // math.prod(edge), 1)
+        edge[axis] = min(edge[axis] * room, shape[axis])
+    for start in itertools.product(*(range(0, n, step) for n, step in zip(shape, edge, strict=True))):
+        lo = np.array(start[::-1])
+        yield lo, read_block(volume, lo, np.minimum(lo + edge[::-1], volume.dims))
+
+
+def _span(whole: int, count: int, lo: int, length: int) -> tuple[int, np.ndarray]:
+    """Return the first of ``count`` cells that voxels from ``lo`` on overlap, and the cells' edges within these."""
+    edges = np.linspace(0, whole, count + 1)
+    first = int(np.searchsorted(edges, lo, "right")) - 1
+    last = int(np.searchsorted(edges, lo + length, "left"))
+    return first, edges[first : last + 1].clip(lo, lo + length) - lo
+
+
+def _integrated(values: np.ndarray, edges: Sequence[np.ndarray]) -> np.ndarray:
+    """Integrate values (z, y, x), constant within voxels, between edges along each axis."""
+    for axis, ends in enumerate(edges):
+        before = np.minimum(ends.astype(np.int64), values.shape[axis] - 1)
+        share = (ends - before).reshape([-1 if k == axis else 1 for k in range(3)])
+        until = np.insert(np.cumsum(values, axis), 0, 0.0, axis)
         below = until.take(before, axis)
-        slab = np.diff(below + share * (until.take(before + 1, axis) - below), axis=axis)
-    return begin, slab
-
-
-def sampled(volume: Volume, dims: tuple[int, int, int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the data value at the middle of each cell, for a label map: (first slice of cells, (k, ny, nx))."""
-    x, y, z = (((np.arange(n) + 0.5) * whole / n).astype(np.int64) for n, whole in zip(dims, volume.dims, strict=True))
-    for lo, slab in slabs(volume):
-        here = np.flatnonzero((z >= lo) & (z < lo + len(slab)))
-        if len(here):
-            found = slab[(z[here] - lo)[:, None, None], y[:, None], x].astype(np.float64)
-            yield int(here[0]), volume.slope * found + volume.intercept
+        values = np.diff(below + share * (until.take(before + 1, axis) - below), axis=axis)
+    return values

@@ -58,7 +58,7 @@ class Slices(NamedTuple):
 
 
 def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None]) -> Slices | None:
-    """Return the grids of layers, read slab by slab.
+    """Return the grids of layers, read part by part.
 
     Args:
         layers: of each its volume, and the table of a label map; None for one with colours, which has no grid.
@@ -112,10 +112,9 @@ def _labels(
     """Return facts and codes (nz, ny, nx) of labels, as many as fit."""
     labels = [one for one in table.labels if one.number != 0 or one.opacity > 0][: CODES - 1]
     numbers = np.array([one.number for one in labels], np.float64)
-    codes = np.zeros(dims[::-1], np.uint8 if len(labels) < 256 else np.uint16)
-    for first, found in sampled(volume, dims):
-        row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
-        codes[first : first + len(found)] = np.where(numbers[row] == found, row + 1, 0)
+    found = sampled(volume, dims)
+    row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
+    codes = np.where(numbers[row] == found, row + 1, 0).astype(np.uint8 if len(labels) < 256 else np.uint16)
     return {"labels": [{"name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in labels]}, codes
 
 
