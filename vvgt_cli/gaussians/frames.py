@@ -135,7 +135,8 @@ def factored(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
+    """Return the rotation matrices (K, 3, 3) float64 of quaternions (K, 4) of any norm > 0, (w, x, y, z)."""
+    quaternions = np.asarray(quaternions, np.float64)
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
