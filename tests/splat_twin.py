@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import NEAR
 from vvgt_cli.gaussians.frames import rotations
-from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
+from vvgt_cli.gaussians.harmonics import basis, directions, term_slopes, view_colors
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat.reference import covariances, drawn_opacity, layers, project, weights
 
 
@@ -120,3 +123,25 @@ def rotation_derivatives(unit: np.ndarray) -> np.ndarray:
         [[-2 * z, -w, x], [w, -2 * z, y], [x, y, o]],
     )
     return 2 * np.moveaxis(np.array(tables), -1, 0)
+
+
+def basis_slopes(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return the derivatives (K, M, 3) of the polynomials of `basis` by the direction (K, 3).
+
+    Only the component perpendicular to the direction is meaningful, as directions have unit length.
+    """
+    d = np.asarray(directions, np.float64)
+    rows = [np.stack(np.broadcast_arrays(*row, d[:, 0])[:3], -1) for row in term_slopes(*d.T)[: HARMONICS[degree]]]
+    return np.stack(rows, axis=1) if rows else np.zeros((len(d), 0, 3))
+
+
+def view_slopes(gaussians: Gaussians, eye: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients with respect to harmonics (K, M, 3) and means (K, 3), given those for `view_colors`, (K, 3)."""
+    if gaussians.harmonics is None:
+        return np.zeros((len(gaussians), 0, 3)), np.zeros((len(gaussians), 3))
+    toward, distance = directions(gaussians.means, eye)
+    by_term = np.einsum("kmc,kc->km", gaussians.harmonics.astype(np.float64), slopes)
+    bent = np.einsum("km,kmi->ki", by_term, basis_slopes(toward, gaussians.degree))
+    across = bent - (bent * toward).sum(axis=1, keepdims=True) * toward
+    means = across / np.where(distance > 0, distance, math.inf)[:, None]
+    return basis(toward, gaussians.degree)[:, :, None] * slopes[:, None, :], means

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
-
-if TYPE_CHECKING:
-    pass
 
 Draw = Callable[[Camera], np.ndarray]
 NO_POINTS = np.zeros((0, 3))
