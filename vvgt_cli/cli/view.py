@@ -6,7 +6,14 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options, title_option
+from vvgt_cli.cli.options import (
+    common_options,
+    light_options,
+    overwrite_option,
+    placed_read_options,
+    tf_options,
+    title_option,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -34,6 +41,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @title_option
 @tf_options
+@light_options
 @placed_read_options
 @overwrite_option
 @common_options
@@ -46,6 +54,7 @@ def command(
     title: str | None,
     read: dict[str, Any],
     optics: dict[str, Any],
+    light: dict[str, Any],
     overwrite: bool,
     console: Console,
 ) -> None:
@@ -80,6 +89,6 @@ def command(
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
     if not live and output is None:
         raise UsageError("--no-live is for a page that is saved; give -o OUT.html, or omit it")
-    source = source_request(files[0], read, optics)
+    source = source_request(files[0], read, optics, light)
     request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, title)
     view(request, lambda url: click.echo(url), console)

@@ -110,10 +110,10 @@ def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
     """Refuse options for volumes with a file of Gaussians."""
-    plain = SourceRequest(given.volume)
-    if replace(given, volume=plain.volume, light=plain.light) != plain:
+    if given != SourceRequest(given.volume):
         raise UsageError(
-            f"{name} holds Gaussians; --tf, --labels, --layer and reading options are for volumes only: omit them"
+            f"{name} holds Gaussians; --tf, --labels, --layer, light and reading options are for volumes only: omit "
+            "them ('vvgt recolor' relights live files)"
         )
 
 
