@@ -155,7 +155,8 @@ class Source:
     @property
     def title(self) -> str:
         """Kind and size of the volume, which identify no file and nobody."""
-        kind = "CT" if self.volume.hounsfield else "label map" if self.labels_alone else "volume"
+        kind = "label map" if self.labels_alone else self.volume.modality
+        kind = kind or ("CT" if self.volume.hounsfield else "volume")
         return f"{kind}, {' x '.join(map(str, self.volume.dims))}"
 
     @property
