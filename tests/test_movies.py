@@ -152,6 +152,9 @@ def test_a_single_picture_and_what_it_is_not_given(ply, tmp_path, vvgt):
     assert vvgt("render", ply[1], "--exr", "-o", tmp_path / "a.png").code == 0
     assert (tmp_path / "a.exr").is_file()
     assert "exists" in vvgt("render", ply[1], "-o", tmp_path / "a.png").error
+    (tmp_path / "a.png").unlink()
+    assert "a.exr exists" in vvgt("render", ply[1], "--exr", "-o", tmp_path / "a.png").error
+    assert not (tmp_path / "a.png").exists()
     for more, said in (
         (("--orbit", 2, "-o", tmp_path / "b.png"), "one picture of 2 views"),
         (("--crop", "1:,:,:", "-o", tmp_path / "b.png"), "holds Gaussians; reading options"),

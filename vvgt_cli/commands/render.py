@@ -126,7 +126,8 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
     if request.movie or request.single:
         inputs = [request.given] if isinstance(request.given, str) else request.given.paths()
-        check_outputs([Output("-o", request.output)], inputs, request.overwrite)
+        floats = [Output("--exr", str(Path(request.output).with_suffix(".exr")))] if request.exr else []
+        check_outputs([Output("-o", request.output), *floats], inputs, request.overwrite)
     else:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
