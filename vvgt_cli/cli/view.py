@@ -65,7 +65,8 @@ def command(
 
     A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
     address is printed; Ctrl-C stops the server. Several files, a glob, or an index written by convert form a series
-    with a slider.
+    with a slider. A series of volumes (a quoted glob, or a file of several time steps) is converted first, refined only
+    with -o.
 
     A folder with a lod-meta.json is streamed: near parts load in fine detail, far ones coarsely. FOLDER#1 is level 1
     alone.
@@ -78,6 +79,7 @@ def command(
       vvgt view example:frog
       vvgt view head.nrrd --tf bone.json
       vvgt view head_index.json
+      vvgt view 'run_*.vti' --tf viridis
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html
     """
