@@ -402,12 +402,14 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     def serve(run, request, clouds, announce) -> None:
         shown.append(([name for name, _ in clouds], [float(read_ply(f)[0].means[:, 0].mean()) for _, f in clouds]))
 
-    monkeypatch.setattr(view, "_serve", serve)
-    (temporary := tmp_path / "t").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     x = np.indices((12, 12, 24))[2]
     for k in range(3):
         np.save(tmp_path / f"run_{k}.npy", np.exp(-((x - 5 - 6 * k) ** 2) / 8).astype(np.float32))
+    loose = vvgt("view", *sorted(tmp_path.glob("run_*.npy")))
+    assert (loose.code, "quote the pattern" in loose.error) == (2, True)
+    monkeypatch.setattr(view, "_serve", serve)
+    (temporary := tmp_path / "t").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     done = vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis")
     assert done.code == 0, done.err
     names, means = shown[0]
@@ -415,8 +417,6 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert means == sorted(means)
     assert means[2] - means[0] > 0.6  # 12 voxels of 24, whose box is 2 wide, in haze
     assert not list(temporary.glob("vvgt-*"))
-    loose = vvgt("view", *sorted(tmp_path.glob("run_*.npy")))
-    assert (loose.code, "quote the pattern" in loose.error) == (2, True)
     assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
     saved: list[ConvertRequest] = []
     monkeypatch.setattr(convert_batch, "convert_files", lambda request, console: saved.append(request))
