@@ -80,6 +80,10 @@ _READ = dict(
         help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",
     ),
     mask=click.option("--mask", metavar="FILE", help="Volume of the same size; voxels where it is 0 are hidden."),
+    keep_largest=click.option(
+        "--keep-largest", type=float, metavar="VALUE",
+        help="Of what lies above VALUE, hide all but the largest connected body: -300 removes the head rest of a CT.",
+    ),
 )  # fmt: skip
 read_options = group("read", **_READ)
 placed_read_options = group(

@@ -178,6 +178,7 @@ class Reading(TypedDict, total=False):
     space: str
     crop: str
     mask: Any
+    keep_largest: float
     affine: Any
     origin: Sequence[float]
 

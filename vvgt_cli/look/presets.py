@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.look.histogram import contours
-from vvgt_cli.look.recognise import AIR, background_bins, foreground, in_hounsfield
+from vvgt_cli.look.recognise import AIR, air_and_tissue, background_bins, foreground, in_hounsfield
 from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.volume.bodies import largest
 from vvgt_cli.volume.stored import planes
@@ -72,7 +72,7 @@ def _may_be_mr_head(volume: Volume, counts: np.ndarray, edges: np.ndarray) -> bo
     if front is counts or last > LOW * counts.size or not HEAD_SHARE[0] <= share <= HEAD_SHARE[1]:
         return False
     shifts = edges[edges < edges[0] + LONG_CT] - sum(AIR) / 2 if edges[-1] - edges[0] > LONG_CT else ()
-    if any(in_hounsfield(counts, edges - shift) for shift in shifts):
+    if any(air_and_tissue(counts, edges - shift) for shift in shifts):
         return False
     high = np.interp(0.99, np.cumsum(front) / front.sum(), edges[1:]) - edges[0]
     width = max(1, round(PEAK_WIDTH * high / (edges[1] - edges[0])))
