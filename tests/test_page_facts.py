@@ -208,8 +208,8 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
         assert vvgt("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name).code == 0
         assert "Doe" not in json.dumps(listed(name))
     plain, live, bare, page = map(listed, ("a.ply", "live.ply", "n.ply", "a.html"))
-    assert {"title", "function", "legend", "command", "checksum", "place", "picture"} <= set(plain)
-    assert "tumour" in plain["legend"]
+    assert {"title", "function", "names", "command", "checksum", "place", "picture"} <= set(plain)
+    assert plain["names"] == ["tumour"]
     assert "values" not in plain
     assert live["names"] == ["tumour"]
     assert {"values", "place"} <= set(live)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,13 @@ def what_leaves(file: str) -> dict[str, Any]:
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
     live = bool(layers) or (page and f'id="{HELD}-0"' in Path(file).read_text("utf-8"))
+    names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
+    legend = json.loads(header.legend or "{}")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
     found = {
-        "title": header.title, "function": header.function, "date": header.date, "legend": header.legend,
+        "title": header.title, "function": header.function, "date": header.date,
         "command": made and made.command, "checksum": made and made.sha256,
-        "names": [one.name for layer in layers for one in (layer, *layer.labels) if one.name],
+        "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
         "place": header.space in ("RAS", "LPS") and header.affine and "position and directions in the scanner",
         "values": live and "data values under each Gaussian, and their histogram",
         "other": [text for text in header.comments if not text.startswith(OURS)],
