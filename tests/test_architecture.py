@@ -19,7 +19,7 @@ ROOMS = (
     *("conversion", "checks", "commands", "library", "cli"),
 )
 HEAVY = {
-    *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO"),
+    *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
     *("scipy", "nibabel", "gsplat", "lpips", "tifffile", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
     *("highdicom", "gsply", "pxr", "eccodes", "PIL", "imageio_ffmpeg", "dask", "distributed"),
 }

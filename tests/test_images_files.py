@@ -4,7 +4,6 @@ import struct
 import zlib
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 
 from vvgt_cli.cameras.sets import default_views
@@ -53,36 +52,19 @@ def test_exr_refuses_a_camera_of_another_size(tmp_path):
 
 
 def test_exr_of_another_program(tmp_path):
+    import OpenEXR
+
     rgb = np.random.default_rng(1).random((5, 6, 3)).astype(np.float32)
-    exr_of(tmp_path / "rgb.exr", rgb, "RGB")
+    OpenEXR.File({}, {"RGB": rgb}).write(str(tmp_path / "rgb.exr"))
     image, _ = read_exr(tmp_path / "rgb.exr")
     np.testing.assert_array_equal(image[..., :3], rgb)
     assert (image[..., 3] == 1).all()
-    exr_of(tmp_path / "more.exr", np.concatenate([rgb, rgb], axis=-1), "ZABCGR")
-    image, _ = read_exr(tmp_path / "more.exr")
-    np.testing.assert_array_equal(image, rgb[..., [2, 1, 2, 1]])
-    exr_of(tmp_path / "z.exr", rgb[..., :1], "Z")
+    OpenEXR.File({}, {"Z": rgb[..., 0].copy()}).write(str(tmp_path / "z.exr"))
     with pytest.raises(DataError, match="channels Z; expected R, G, B, A"):
         read_exr(tmp_path / "z.exr")
-    exr_of(tmp_path / "whole.exr", (rgb * 255).astype(np.uint32), "RGB")
-    with pytest.raises(DataError, match="expected R, G, B, A, floats"):
-        read_exr(tmp_path / "whole.exr")
-    exr_of(tmp_path / "bad.exr", rgb, "RGB", '{"fx": 1}')
+    OpenEXR.File({"vvgt.camera": '{"fx": 1}'}, {"RGB": rgb}).write(str(tmp_path / "bad.exr"))
     with pytest.raises(DataError, match=r"vvgt\.camera; expected a camera"):
         read_exr(tmp_path / "bad.exr")
-
-
-def exr_of(path, pixels, names, camera=None):
-    """Write channels of these names, by OpenImageIO alone."""
-    kind = oiio.UINT32 if pixels.dtype == np.uint32 else oiio.FLOAT
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec.channelnames = tuple(names)
-    if camera is not None:
-        spec.attribute("vvgt.camera", camera)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec)
-    assert output.write_image(np.ascontiguousarray(pixels))
-    output.close()
 
 
 @pytest.mark.parametrize("keep", [0, 3, 40, 200, -20])
@@ -111,7 +93,7 @@ def test_sizes_that_the_file_cannot_hold_are_refused(tmp_path):
         .replace(struct.pack("<4i", 0, 0, 2, 1), struct.pack("<4i", 0, 0, 15999, 15999))
     )
     (tmp_path / "huge.exr").write_bytes(lie)
-    with pytest.raises(DataError, match=r"huge\.exr: (claims 16000 x 16000|not an image)"):
+    with pytest.raises(DataError, match=r"huge\.exr: claims 16000 x 16000"):
         read_exr(tmp_path / "huge.exr")
 
 

@@ -9,7 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.files import read_picture, write_picture
+from vvgt_cli.files import atomic_write
+
+MAX_PIXELS = 2**28  # 16384 x 16384, because a damaged header may claim anything
+MAX_PIXELS_PER_BYTE = 2**14  # more than deflate can reach for one-bit pixels
+
+
+def check_pixels(path: str | PathLike[str], width: int, height: int) -> None:
+    """Raise DataError if an image is too large for its file, or larger than 2^28 pixels."""
+    size = Path(path).stat().st_size
+    if width < 1 or height < 1 or width * height > min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size):
+        raise DataError(f"{path}: claims {width} x {height} pixels in {size} bytes; expected a whole image, up to 2^28")
 
 
 def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = False) -> None:
@@ -25,9 +35,21 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
         DataError: the shape is wrong, or the file cannot be written.
         UsageError: the file exists and ``overwrite`` is not set.
     """
-    # alpha is straight already: the writer must not divide again
-    attributes = {"oiio:UnassociatedAlpha": 1, "oiio:ColorSpace": "sRGB", "png:compressionLevel": 3}
-    write_picture(path, "png", _bytes(image), attributes, overwrite)
+    import OpenImageIO as oiio
+
+    pixels = _bytes(image)
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # alpha is straight already: the writer must not divide again
+    spec.attribute("oiio:ColorSpace", "sRGB")
+    spec.attribute("png:compressionLevel", 3)
+    with atomic_write(path, overwrite) as temporary:
+        output = oiio.ImageOutput.create("png")
+        if output is None or not output.open(str(temporary), spec):
+            raise DataError(f"{path}: cannot be written ({output.geterror() if output else oiio.geterror()})")
+        written = output.write_image(pixels)
+        if not (output.close() and written):
+            raise DataError(f"{path}: cannot be written ({output.geterror()})")
 
 
 def png_bytes(image: np.ndarray) -> bytes:
@@ -46,8 +68,27 @@ def read_png(path: str | PathLike[str]) -> np.ndarray:
     Raises:
         DataError: the file is not a PNG, or larger than 2^28 pixels.
     """
-    pixels, _ = read_picture(path, "png", "a PNG")
-    if pixels.shape[-1] <= 2:
+    import OpenImageIO as oiio
+
+    if not Path(path).is_file():
+        raise DataError(f"{path}: no such file; expected a PNG image")
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise DataError(f"{path}: not an image ({oiio.geterror().splitlines()[0]}); expected a PNG")
+    try:
+        spec, kind = source.spec(), source.format_name()
+        if kind != "png":
+            raise DataError(f"{path}: an image of format {kind}; expected a PNG")
+        check_pixels(path, spec.width, spec.height)
+        pixels = source.read_image(oiio.FLOAT)
+        if pixels is None:
+            raise DataError(f"{path}: damaged PNG ({source.geterror().strip()}); expected a complete one")
+    finally:
+        source.close()
+    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    if spec.nchannels <= 2:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=-1), pixels[..., 1:]], axis=-1)
     if pixels.shape[-1] == 4:
         pixels[..., :3] *= pixels[..., 3:]
