@@ -60,7 +60,7 @@ def drawn(volume: Any, data: Any = None) -> Drawn:
         notes.append("scattering")
     mask, matrix = None, _numbers(volume.GetMatrix(), 4)
     if data.IsA("vtkImageData"):
-        crops = bool(mapper.GetCropping())
+        crops = bool(getattr(mapper, "GetCropping", int)())
         if crops and not data.GetDirectionMatrix().IsIdentity():
             crops = False
             notes.append("cropping regions of an oblique image (VTK places them along its axes)")
