@@ -123,6 +123,7 @@ def test_all_time_steps_are_frames_of_one_page(display: str, tmp_path: Path) -> 
     _, said = paraview(display, index, page, "MaximumGaussians=2000", "Steps=0", "WriteTimeSteps=1", "Light=2")
     text = page.read_text()
     assert len(re.findall('id="splats-[0-9]+"', text)) == 3, said
+    assert re.search('"name": "[^"]*2.5[^"]*"', text)
     assert not list(tmp_path.glob("*.parts"))
 
 

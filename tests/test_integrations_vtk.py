@@ -184,9 +184,12 @@ def test_camera_and_lights():
     camera = renderer.GetActiveCamera()
     camera.SetPosition(1, 2, 3)
     camera.SetFocalPoint(0, 0, 1)
-    camera.SetViewUp(0, -1, 0.2)
+    camera.SetViewUp(-0.1, -1.2, -0.2)  # upright: -y, and a tenth of the line of sight
     camera.SetViewAngle(25)
     assert camera_of(renderer) == ("1.0,2.0,3.0,0.0,0.0,1.0,25.0", "-y", [])
+    camera.Roll(20)
+    assert camera_of(renderer)[2] in (["roll of the camera, 20 degrees"], ["roll of the camera, -20 degrees"])
+    camera.Roll(-20)
     camera.SetParallelProjection(True)
     camera.SetParallelScale(np.tan(np.radians(12.5)) * 6)
     text, _, notes = camera_of(renderer)
