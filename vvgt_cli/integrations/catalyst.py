@@ -3,6 +3,11 @@
 It is given to the simulation as it is, and takes its settings from the environment: VVGT_OUTPUT, a file with a
 placeholder for the step ("dye_{:04d}.ply"), VVGT_TF, a function, VVGT_GAUSSIANS and VVGT_EVERY, the steps between two
 files. The simulation's channel is called "input", or VVGT_CHANNEL.
+
+Tried: ParaView 5.11's Catalyst (Debian)
+Enable:
+    Give the simulation this script, as its own documentation says: {file}
+    export VVGT_OUTPUT='out_{{:04d}}.ply' VVGT_TF=tf.json
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
+    from vvgt_cli.integrations.command import tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
     sys.path.remove(ROOT)
@@ -39,5 +45,5 @@ def catalyst_execute(info: Any) -> None:
         job.save(source.GetOutputDataObject(0), info.time)
         job.convert()
     except RuntimeError as error:  # the simulation goes on
-        print(f"Gaussian splats: {name}: {error}", file=sys.stderr)
+        tell(f"{name}: {error}", failed=True)
     job.end()

@@ -1,4 +1,9 @@
-"""PyVista: the volumes of a plotter as a file of Gaussians, with functions, light and camera (docs/programs.md)."""
+"""PyVista: the volumes of a plotter as a file of Gaussians, with functions, light and camera (docs/programs.md).
+
+Tried: PyVista 0.49
+Enable:
+    vvgt.export_plotter(plotter, "page.html")
+"""
 
 from __future__ import annotations
 
