@@ -54,6 +54,7 @@ class FileFacts:
         certificate: measurements of the conversion; None if the Gaussians were changed since.
         legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
         title: title of pages, which names no file unless it was chosen.
+        camera: where pages open: eye and target, world, and the vertical field of view in degrees.
     """
 
     frame: str = "unit"
@@ -74,6 +75,7 @@ class FileFacts:
     certificate: Certificate | None = None
     legend: str | None = None
     title: str | None = None
+    camera: tuple[float, ...] | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return the facts by name."""
@@ -253,6 +255,8 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         if words[1] != "rule" or len(words) != 3 or not words[0].isdecimal() or not 0 < int(words[0]) <= 2**20:
             raise ValueError(text)
         return {"made_for": int(words[0]), "rule": words[2]}
+    if word == "camera":
+        return {"camera": camera_of(words)}
     if word == "space":
         if text not in ("RAS", "LPS", "none"):
             raise ValueError(text)
@@ -274,6 +278,18 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
     return {"version": word}
 
 
+def camera_of(words: Sequence[str]) -> tuple[float, ...]:
+    """Return the seven numbers of a camera: eye, target, vertical field of view in degrees.
+
+    Raises:
+        ValueError: another count, no numbers, eye and target at one place, or no field of view.
+    """
+    numbers = _finite(list(words))
+    if len(numbers) != 7 or numbers[:3] == numbers[3:6] or not 0 < numbers[6] < 180:
+        raise ValueError(words)
+    return tuple(numbers)
+
+
 def comment_lines(facts: FileFacts) -> list[str]:
     """Return the header lines with the version and the facts; `parse_header` reads them."""
     lines = [f"comment vvgt {VERSION}"]
@@ -293,6 +309,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")
+    if facts.camera is not None:
+        lines.append(f"comment vvgt camera {' '.join(repr(float(v)) for v in facts.camera)}")
     if facts.made_for is not None:
         lines.append(f"comment vvgt size {facts.made_for} rule {facts.rule or 'inria'}")
     if facts.light is not None:
