@@ -146,7 +146,7 @@ np.save(FOLDER / "slicer.npy", pixels)
 facts = {"volumes": volumes.GetNumberOfItems(), "at": at.tolist(), "eye": camera.GetPosition(), "angle": ANGLE}
 facts["affine"] = (np.array(TURN) @ np.array(MATRIX))[:3].ravel().tolist()
 
-convert("volume", volume)
+convert("volume", volume, renderer=renderer)
 
 # a segmentation: two segments, one of them hidden
 segments = added(scene, "vtkMRMLSegmentationNode", "organs")

@@ -103,6 +103,7 @@ def test_a_point_is_where_slicer_has_it_under_a_transform(scene) -> None:
 def test_the_picture_is_slicers_own(scene) -> None:
     folder, facts = scene
     assert facts["volumes"] == 1
+    assert read_ply(folder / "volume.ply")[1].camera == pytest.approx((*facts["eye"], *facts["at"][:3], facts["angle"]))
     gaussians, header = open_gaussians(str(folder / "volume.ply"))
     eye, target = (header.scale * (np.array(facts[key][:3]) - header.centre) for key in ("eye", "at"))
     forward = (target - eye) / np.linalg.norm(target - eye)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import with_place
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate

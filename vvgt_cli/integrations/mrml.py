@@ -10,6 +10,8 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
+import slicer
+
 
 def neighbour(name: str) -> Any:
     """Return a module of this folder, by its path: Slicer's Python need not know the package."""
@@ -76,33 +78,25 @@ def frames(volume: Any, steps: bool) -> list[Any]:
 
 
 def _world(node: Any) -> Any:
-    """Return the matrix of a node's parent transforms, None where it has none."""
-    import vtk
+    """Return the matrix of a node's parent transforms."""
+    from vtk import vtkMatrix4x4
 
-    parent, matrix = node.GetParentTransformNode(), vtk.vtkMatrix4x4()
-    if parent is None:
-        return None
-    if not parent.IsTransformToWorldLinear():
+    matrix, parent = vtkMatrix4x4(), node.GetParentTransformNode()
+    if not slicer.vtkMRMLTransformNode.GetMatrixTransformBetweenNodes(parent, None, matrix):
         name = f"{node.GetName()}: its transform {parent.GetName()}"
         raise RuntimeError(f"{name} is not linear; harden it (Data, right click, Harden transform) or take it away")
-    parent.GetMatrixTransformToWorld(matrix)
     return matrix
 
 
 def _affine(node: Any, placed: Any) -> Any:
     """Return the matrix of volume ``node`` from IJK to RAS, moved by the transforms of ``placed``."""
-    import vtk
-
-    matrix, world = vtk.vtkMatrix4x4(), _world(placed)
+    matrix, world = _world(placed), _world(placed)
     node.GetIJKToRASMatrix(matrix)
-    if world is not None:
-        vtk.vtkMatrix4x4.Multiply4x4(world, matrix, matrix)
+    world.Multiply4x4(world, matrix, matrix)
     return matrix
 
 
 def _written(image: Any, matrix: Any, path: Path) -> str:
-    import slicer
-
     writer = slicer.vtkTeemNRRDWriter()
     writer.SetInputData(image)
     writer.SetIJKToRASMatrix(matrix)
@@ -133,8 +127,6 @@ def _inside(volume: Any, roi: Any) -> Any:
 
 def _segments(node: Any, path: Path) -> tuple[str, list[str]]:
     """Write the visible segments of a segmentation, with names and colours, and note what is not taken."""
-    import slicer
-
     display, world = node.GetDisplayNode(), _world(node)
     copy = slicer.vtkMRMLSegmentationNode()
     copy.GetSegmentation().DeepCopy(node.GetSegmentation())
@@ -144,8 +136,7 @@ def _segments(node: Any, path: Path) -> tuple[str, list[str]]:
         copy.GetSegmentation().RemoveSegment(name)
     if len(hidden) == len(names):
         raise RuntimeError(f"{node.GetName()}: no visible segment; show one, or take no segmentation")
-    if world is not None:
-        copy.ApplyTransformMatrix(world)
+    copy.ApplyTransformMatrix(world)
     copy.GetSegmentation().CollapseBinaryLabelmaps(False)  # a layer where segments do not overlap
     storage = slicer.vtkMRMLSegmentationStorageNode()
     storage.SetCropToMinimumExtent(False)  # else a segment ends at the centres of its own outermost voxels

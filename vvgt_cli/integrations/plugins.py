@@ -9,6 +9,9 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 PLUGINS = {  # file of each, in this folder; its docstring has the lines "Tried:" and "Enable:"
     "slicer": "slicer/GaussianSplats.py",
+    "napari": "napari.py",
+    "jupyter": "jupyter.py",
+    "xarray": "xarray.py",
 }
 
 
