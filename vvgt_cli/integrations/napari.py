@@ -60,7 +60,9 @@ def _values(layer: Any) -> Any:
     values = layer.data[0] if layer.multiscale else layer.data
     if values.ndim not in (3, 4) or getattr(layer, "rgb", False):
         what = "an RGB image" if getattr(layer, "rgb", False) else f"{values.ndim} axes"
-        raise vvgt_cli.UsageError(f"{layer.name}: {what}; expected z, y, x, or time before them (split RGB into channels)")
+        raise vvgt_cli.UsageError(
+            f"{layer.name}: {what}; expected z, y, x, or time before them (split RGB into channels)"
+        )
     return values
 
 
