@@ -13,7 +13,7 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.shards.regions import RegionDescent
+from vvgt_cli.conversion.shards.regions import RegionNodes
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
@@ -155,9 +155,14 @@ def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: 
     assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
-def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("scheduler", [(), ("--scheduler", "local")])
+def test_bytes_depend_on_neither_blocks_nor_workers(
+    vvgt, volume: Path, folder: Path, tmp_path: Path, scheduler: tuple[str, ...]
+) -> None:
+    if scheduler:
+        pytest.importorskip("distributed")
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "32")
-    assert vvgt(*line, "--workers", "2").code == 0
+    assert vvgt(*line, "--workers", "2", *scheduler).code == 0
     assert files_in(tmp_path / "out") == files_in(folder)
 
 
@@ -165,18 +170,18 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(
     vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
-    monkeypatch.setattr("vvgt_cli.conversion.shards.regions.ENOUGH", 1)  # the tiles are regions
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)  # the tiles are regions
     whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
     assert vvgt(*whole).code == 0
-    call, seen = RegionDescent.__call__, list[int]()
+    call, seen = RegionNodes.__call__, list[int]()
 
-    def stopped(task: RegionDescent, number: int) -> None:
+    def stopped(task: RegionNodes, number: int) -> None:
         seen.append(number)
         if len(seen) == 2:
             raise KeyboardInterrupt
         call(task, number)
 
-    monkeypatch.setattr(RegionDescent, "__call__", stopped)
+    monkeypatch.setattr(RegionNodes, "__call__", stopped)
     assert vvgt(*line).code == 130
     assert not (tmp_path / "out" / "lod-meta.json").exists()
     assert vvgt(*line).code == 0
@@ -220,15 +225,14 @@ def test_large_clouds_are_refined_by_regions_in_every_format(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_workers_are_as_many_as_threads_memory_and_work_allow(volume: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = load(SourceRequest(str(volume))).volume
+def test_workers_are_as_many_as_threads_memory_and_work_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+    small, large = 720_000, 1024**3
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 5 << 30)
     assert worker_count(BlockOptions(), small, 100_000, 8) == 1
     assert worker_count(BlockOptions(), small, 4_000_000, 8) == 5
     assert worker_count(BlockOptions(), small, 4_000_000, 2) == 2
     assert worker_count(BlockOptions(workers=3), small, 100, 1) == 3
     assert worker_count(BlockOptions(shard=(1, 2)), small, 4_000_000, 8) == 1
-    large = replace(small, data=np.broadcast_to(np.uint8(0), (1024, 1024, 1024)))
     assert worker_count(BlockOptions(), large, 100, 4) == 4
 
 

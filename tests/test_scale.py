@@ -67,7 +67,8 @@ def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
     assert same_gaussians(one, other)
 
 
-def test_of_several_batches_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path):
+def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     fit = ("--max-gaussians", "100000", "--size", "100", "-q")
     assert vvgt("init", raw, "-o", one, *fit).code == 0
@@ -81,7 +82,7 @@ def test_of_several_batches_all_but_some_colours_are_those_of_memory(vvgt, raw, 
         if name != "colors":
             np.testing.assert_array_equal(values, both[1].arrays()[name])
     apart = np.abs(both[0].colors - both[1].colors).max(axis=1)
-    assert 0 < (apart > 0).mean() < 0.15  # at the borders: neighbours are those of a batch
+    assert 0 < (apart > 0).mean() < 0.3  # at the borders: neighbours are those of a region
     assert np.sqrt((apart**2).mean()) < 0.004
 
 

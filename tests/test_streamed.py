@@ -18,12 +18,16 @@ from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.commands.view import named_files
+from vvgt_cli.conversion.shards.cut import Node
 from vvgt_cli.conversion.shards.level_errors import level_errors
 from vvgt_cli.conversion.shards.level_selection import CutErrors
-from vvgt_cli.conversion.shards.streamed_files import Files, Level
+from vvgt_cli.conversion.shards.regions import Made, save
+from vvgt_cli.conversion.shards.streamed_files import Part, WrittenFiles, divide
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
-from vvgt_cli.gaussians import read_ply
+from vvgt_cli.field.blocked import Pass
+from vvgt_cli.field.runners import InProcess
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
@@ -180,7 +184,7 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
 def test_an_interrupted_run_resumes_with_the_same_bytes(
     vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.BATCH", 3000)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 2500)
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
     whole, out = tmp_path / "whole", tmp_path / "out"
@@ -208,7 +212,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     assert files > 3
     stop = {"level_errors": 0, "images_of": 3}
     assert vvgt(*line, out / "lod-meta.json").code == 130
-    assert calls["level_errors"] < nodes + 20  # those of the batches that were whole are not drawn again
+    assert calls["level_errors"] < nodes + 20  # those of the regions that were whole are not drawn again
     assert not (out / "lod-meta.json").exists()
     calls, stop["images_of"] = {"level_errors": 0, "images_of": 0}, 0
     assert vvgt(*line, out / "lod-meta.json").code == 0
@@ -218,15 +222,28 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     assert not list(tmp_path.glob(".*"))
 
 
+def test_files_hold_neighbouring_nodes_of_one_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 10)
+    parts, places = divide(np.array([[6, 1], [5, 2], [12, 4], [1, 3]]))
+    assert parts == (Part(0, 0, 0, 2), Part(1, 0, 0, 4), Part(0, 1, 2, 3), Part(0, 2, 3, 4))
+    assert [lods[0]["offset"] for lods in places] == [0, 6, 0, 0]
+    assert [lods[0]["file"] for lods in places] == [0, 0, 2, 3]
+    assert [lods[1]["offset"] for lods in places] == [0, 1, 3, 7]
+
+
 def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path) -> None:
     def written(seed: int, name: str) -> bytes:
-        random, level = np.random.default_rng(seed), Level(0)
-        columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 3)]
-        logits, rest = columns[0][:, 0], np.zeros((50, 0, 3), np.float32)
-        files = Files(tmp_path, BlockStore(tmp_path / name), "written")
-        files.add(level, Splats(*columns[:3], logits, columns[3], rest))
-        files.write(level)
-        assert level.bytes == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())
+        random, store = np.random.default_rng(seed), BlockStore(tmp_path / name)
+        columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 1, 3)]
+        gaussians = Gaussians(*columns[:3], columns[3][:, 0], columns[4])
+        store.prepare("closed")
+        save(store, "closed", 0, [Node([gaussians], [np.ones(2)], None)], {})
+        parts, places = divide(np.array([[50]]))
+        assert places == [[{"file": 0, "offset": 0, "count": 50}]]
+        task = WrittenFiles(Made(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
+        task.forget_changed()
+        Pass(InProcess(), store, lambda _: None)(task, "write")
+        assert task.size(0) == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())
         return (tmp_path / "0_0" / "means_l.webp").read_bytes()
 
     first, other = written(1, "a"), written(2, "b")

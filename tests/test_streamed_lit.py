@@ -10,8 +10,7 @@ import pytest
 from tests.test_scale import bodies
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
 from vvgt_cli.closed_form.lit import base_rows
-from vvgt_cli.conversion.shards.merge import pyramid
-from vvgt_cli.conversion.shards.plan import Plan, load_light
+from vvgt_cli.conversion.shards.cut import open_cut
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.formats import read_splats
@@ -73,14 +72,14 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
     assert all(other == one for other in others)
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]
     assert files[0] == files[1]
-    plan = Plan.load(store := BlockStore(tmp_path / "parts"))
-    tiled_tree, _ = pyramid(store, plan, load_light(store, plan))
-    top = tiled_tree.top
+    tiled_tree = open_cut(BlockStore(tmp_path / "parts"), "").tiled_tree
+    top, root = tiled_tree.top, tiled_tree.leaves_over_tiles(np.finfo(float).max)
     assert top is not None
-    (root,) = tiled_tree.leaves(np.finfo(float).max)
+    assert root is not None
     first, last = base_rows(top, np.array([len(top) - 1]))
-    assert (first[0], last[0]) == (0, len(tiled_tree.tiles))
-    tiles = [cuts[0].moments[0] for cuts in tiled_tree.cuts(np.full((len(tiled_tree.tiles), 1), np.finfo(float).max))]
+    count = len(tiled_tree.tiles)
+    assert (first[0], last[0]) == (0, count)
+    tiles = [cuts[0].moments[0] for cuts in tiled_tree.cuts(0, count, np.full((count, 1), np.finfo(float).max))]
     seen = np.array([row[SEEN] for row in tiles])
     np.testing.assert_allclose(root.moments[0, : MASS + 1], np.sum([row[: MASS + 1] for row in tiles], axis=0))
     np.testing.assert_allclose(

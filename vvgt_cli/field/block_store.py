@@ -17,6 +17,7 @@ from vvgt_cli.files import atomic_write
 
 RUN = "run.json"
 COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"
+COARSE, TREES = "coarse", "trees"
 ROW = MOMENTS * 8 + 3  # bytes per cell: moments float64, position in its tile uint8
 
 

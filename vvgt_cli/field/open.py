@@ -36,7 +36,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
-LAYOUT = 4  # version of the stored blocks: increase it whenever their content changes
+LAYOUT = 5  # version of the stored blocks: increase it whenever their content changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
@@ -93,6 +93,11 @@ def store_beside(output: str | None) -> Iterator[BlockStore]:
         raise
 
 
+def thread_count() -> int:
+    """Return the number of threads that the commands set, 1 outside of them."""
+    return int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+
+
 @contextmanager
 def blocked(
     run: Run, request: SourceRequest, options: BlockOptions, store: BlockStore, needs: FieldNeeds
@@ -110,11 +115,11 @@ def blocked(
     settings = _settings(request, needs)
     edge = store.kept_edge(settings) if options.size is None else options.size
     volume, voxel = _measured(request)
-    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))  # set by the commands
+    threads = thread_count()
     most = threads if isinstance(request.volume, str) else 1  # values in memory would be copied to each worker
-    options = replace(options, workers=worker_count(options, volume, needs.gaussians, most))
+    options = replace(options, workers=worker_count(options, volume.data.size, needs.gaussians, most))
     edge = edge or block_edge(volume, options, voxel)
-    with _runner(options, threads) as runner:
+    with runner_of(options, threads) as runner:
         run_pass = Pass(runner, store, run.console.bar, options.shard)
         if store.open({**settings, "blocks": edge}, ours=options.shard is None):
             run.console.message(f"resuming with the blocks in {store.folder}")
@@ -298,7 +303,8 @@ def needs_histogram(request: SourceRequest) -> bool:
     return any(tf is None or tf.of_histogram for tf in functions)
 
 
-def _runner(options: BlockOptions, threads: int) -> Runner:
+def runner_of(options: BlockOptions, threads: int) -> Runner:
+    """Return the runner of the options' workers, which share ``threads``."""
     workers = options.workers or 1
     if options.scheduler is not None:
         from vvgt_cli.field.dask_runner import DaskRunner

@@ -49,20 +49,20 @@ class BlockOptions:
             raise UsageError(f"--blocks {self.size}: expected auto, or a power of two of at least {SMALLEST}")
 
 
-def worker_count(options: BlockOptions, volume: Volume, gaussians: int, threads: int) -> int:
+def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: int) -> int:
     """Return the number of processes: as many as threads where there is much to do and memory for each.
 
     Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md).
 
     Args:
         options: the user's choice.
-        volume: volume to process.
+        voxels: number of voxels to process.
         gaussians: budget of Gaussians.
         threads: threads that the process may use.
     """
     if options.workers is not None or options.scheduler is not None or options.shard is not None:
         return options.workers or 1
-    if volume.data.size < MUCH and gaussians <= MANY:
+    if voxels < MUCH and gaussians <= MANY:
         return 1
     free = free_memory()
     return max(threads if free is None else min(threads, int(free // A_WORKER)), 1)

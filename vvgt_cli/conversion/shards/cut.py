@@ -1,26 +1,33 @@
-"""Cuts of a tiled pyramid by a threshold, as Gaussians in batches."""
+"""Cuts of a tiled pyramid by thresholds, as Gaussians region by region."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import COLUMNS
-from vvgt_cli.conversion.shards.plan import Plan
+from vvgt_cli.conversion.shards.plan import PLAN, Plan, load_light
+from vvgt_cli.errors import NothingVisible
+from vvgt_cli.field.block_store import COARSE, RUN, TREES
+from vvgt_cli.field.digests import digest
 from vvgt_cli.gaussians.ply import as_stored
+from vvgt_cli.jit.ahead import MERGE, SHADE, for_degree
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.closed_form.tree import Leaves
-    from vvgt_cli.dvr.layout import Light
-    from vvgt_cli.field.tiled_tree import TiledTree
+    from vvgt_cli.field.block_store import BlockStore
+    from vvgt_cli.field.blocked import Pass
+    from vvgt_cli.field.tiled_tree import TiledTree, TileTrees
     from vvgt_cli.gaussians import Gaussians
+    from vvgt_cli.score.record import Run
 
-BATCH = 1 << 16  # Gaussians in a batch
+ENOUGH = 1 << 14  # mean Gaussians of a region from which it is not widened
+LARGEST = 1 << 28  # bytes of its voxels while they are read
 
 
 class Node(NamedTuple):
@@ -37,44 +44,98 @@ class Node(NamedTuple):
     normals: np.ndarray | None
 
 
+class Regions(NamedTuple):
+    """A division of the tiles into cubes, each of which is worked on by one worker.
+
+    Attributes:
+        width: edge of a cube in tiles, a power of two, so that the tiles of a cube follow each other in Morton order.
+        ends: end of each cube's range of tiles.
+    """
+
+    width: int
+    ends: tuple[int, ...]
+
+    def rows(self, number: int) -> tuple[int, int]:
+        """Return the range of tiles of region ``number``."""
+        return self.ends[number - 1] if number else 0, self.ends[number]
+
+
 @dataclass(frozen=True)
 class Cut:
-    """A pyramid with opaque regions, light and the plan that it is cut for."""
+    """A pyramid with what Gaussians need of the whole volume. A pickled one is a reference to its folder.
 
-    tiled_tree: TiledTree
+    Attributes:
+        trees: trees of the tiles.
+        opaque: regions where bodies are opaque.
+        plan: plan of the file.
+        key: digest of the plan and of what the blocks depend on.
+    """
+
+    trees: TileTrees
     opaque: Opaque
     plan: Plan
-    light: Light | None = None
+    key: str
 
-    def gaussians(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
-        """Yield batches of a threshold's Gaussians, box frame, and of normals (n, 3), None without a light."""
-        from vvgt_cli.field.tiled_tree import batches
+    @property
+    def store(self) -> BlockStore:
+        """Return the store of the blocks."""
+        return self.trees.store
 
-        for leaves in batches(self.tiled_tree.leaves(threshold), BATCH):
-            yield self.make(leaves), self._normals(leaves)
+    @cached_property
+    def tiled_tree(self) -> TiledTree:
+        """The pyramid over all tiles; their trees must have been saved (`TreeBlocks`)."""
+        from vvgt_cli.field.tiled_tree import TiledTree
 
-    def nodes(self, thresholds: np.ndarray, begin: int = 0, least: bool = True) -> Iterator[list[Node]]:
-        """Yield groups of nodes from ``begin`` on, with a level for each of their ``thresholds`` (tiles, n).
+        return TiledTree(self.trees)
 
-        Tiles are made in groups, since the colours of neighbours depend on each other. So ``begin`` is 0, or where a
-        group of an earlier call ended. With ``least`` a level of a tile has at least the tile's own cell.
+    def __reduce__(self) -> Any:
+        """Return what opens the same cut in another process, once for all tasks there."""
+        return open_cut, (self.store, self.key)
+
+    def regions(self, threshold: float) -> Regions:
+        """Divide the tiles into cubes of enough Gaussians for a threshold, with voxels that fit in memory."""
+        grid, width = self.plan.grid, 1
+        places = np.array([tile.place for tile in self.tiled_tree.tiles])
+        total = int(self.tiled_tree.counts(threshold).sum())
+        while True:
+            numbers = np.unique(places // width, axis=0)
+            wider = float((2 * width * grid.tile).prod()) * self.plan.voxel_bytes
+            if len(numbers) == 1 or total >= ENOUGH * len(numbers) or wider > LARGEST:
+                break
+            width *= 2
+        cubes = places // width
+        first = np.flatnonzero(np.any(cubes[1:] != cubes[:-1], axis=1)) + 1
+        return Regions(width, (*first.tolist(), len(places)))
+
+    def box(self, regions: Regions, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first voxel of a region, and the end of its range, (3,) each."""
+        grid, edge = self.plan.grid, regions.width * self.plan.grid.tile
+        place = self.tiled_tree.tiles[regions.ends[number] - 1].place
+        lo: np.ndarray = np.array(place) // regions.width * edge
+        return lo, np.minimum(lo + edge, grid.dims)
+
+    def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[Node]:
+        """Return the nodes of the tiles from ``begin`` to ``end``, with a level for each of their ``thresholds``.
+
+        Tiles are made together, since the colours of neighbours depend on each other.
+
+        Args:
+            begin: first tile.
+            end: end of the tiles' range.
+            thresholds: (tiles, n) thresholds of all tiles.
+            least: whether a level of a tile has at least the tile's own cell.
         """
         from vvgt_cli.closed_form.tree import spread_of
         from vvgt_cli.field.tiled_tree import joined
 
-        waiting: list[list[Leaves]] = []
-        for row, leaves in enumerate(self.tiled_tree.cuts(thresholds, begin, least), begin):
-            waiting.append(leaves)
-            if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.tiled_tree.tiles):
-                continue
-            sizes = np.array([[len(leaves) for leaves in node] for node in waiting])
-            whole = [self.make(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
-            made = []
-            for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
-                gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
-                made.append(Node(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
-            yield made
-            waiting = []
+        cuts = list(self.tiled_tree.cuts(begin, end, thresholds, least))
+        sizes = np.array([[len(leaves) for leaves in node] for node in cuts])
+        whole = [self.make(joined([node[k] for node in cuts])) for k in range(sizes.shape[1])]
+        made = []
+        for node, size, last in zip(cuts, sizes, np.cumsum(sizes, axis=0), strict=True):
+            gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, last, strict=True)]
+            made.append(Node(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
+        return made
 
     def make(self, leaves: Leaves) -> Gaussians:
         """Make the Gaussians of cells, one each, in their order."""
@@ -83,19 +144,18 @@ class Cut:
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
         from vvgt_cli.closed_form.sharpen import sharpened
 
-        lit = self._lit(leaves)
+        lit, light = self._lit(leaves), self.trees.light
         made = cell_gaussians(leaves, min(self.plan.grid.step), pixel_width(self.plan.size), self.opaque, ROUND)
-        if lit is not None and self.light is not None:
-            made = colored(made, self.light, lit, self.plan.degree)
+        if lit is not None and light is not None:
+            made = colored(made, light, lit, self.plan.degree)
         if not self.plan.labels:
             made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
         return as_stored(made)
 
-    def over_tiles(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
-        """Yield what `gaussians` yields of cells that stand for several tiles each."""
+    def over_tiles(self, threshold: float) -> tuple[Gaussians, np.ndarray | None] | None:
+        """Return the Gaussians, and normals, of cells that stand for several tiles each; None if there are none."""
         leaves = self.tiled_tree.leaves_over_tiles(threshold)
-        if leaves is not None:
-            yield self.make(leaves), self._normals(leaves)
+        return None if leaves is None else (self.make(leaves), self._normals(leaves))
 
     def _normals(self, leaves: Leaves) -> np.ndarray | None:
         """Return the normals (n, 3) of cells; None without a light."""
@@ -106,4 +166,73 @@ class Cut:
 
     def _lit(self, leaves: Leaves) -> np.ndarray | None:
         """Return the columns of light that the pyramid appends to moments; None without a light."""
-        return None if self.light is None else leaves.moments[:, COLUMNS:]
+        return None if self.trees.light is None else leaves.moments[:, COLUMNS:]
+
+
+@dataclass(frozen=True)
+class TreeBlocks:
+    """The task of saving the trees of each block's tiles."""
+
+    cut: Cut
+    kind: str = TREES
+
+    def __len__(self) -> int:
+        """Return the number of blocks."""
+        return len(self.cut.plan.grid.blocks)
+
+    def __call__(self, number: int) -> None:
+        """Save the trees of block ``number``."""
+        self.cut.trees.save(number)
+
+
+@lru_cache(maxsize=1)  # a worker opens it once for all of its tasks
+def open_cut(store: BlockStore, key: str) -> Cut:
+    """Return the cut of blocks whose summaries are gathered.
+
+    Args:
+        store: the blocks.
+        key: see `Cut`.
+
+    Raises:
+        DataError: a file is missing or damaged.
+    """
+    from vvgt_cli.closed_form.surface_offset import SURFACE, nowhere, smoothed
+    from vvgt_cli.field.tiled_tree import Coarse, TileTrees
+
+    plan, coarse = Plan.load(store), Coarse.load(store)
+    grid, half = plan.grid, np.array(plan.grid.half)
+    edge = grid.cell_edge * 2.0**grid.field
+    opaque = nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
+    return Cut(TileTrees(store, grid, coarse, load_light(store, plan)), opaque, plan, key)
+
+
+def cut_of(run: Run, run_pass: Pass) -> Cut:
+    """Return the pyramid of all blocks, ready to be cut.
+
+    Args:
+        run: gets a stage.
+        run_pass: runs passes over the blocks.
+
+    Raises:
+        NothingVisible: nothing is visible from any view.
+        DataError: blocks are missing or damaged.
+    """
+    from vvgt_cli.field.tiled_tree import Coarse
+
+    store = run_pass.store
+    plan = Plan.load(store)
+    lit = SHADE if load_light(store, plan) else ()
+    run.compile(for_degree((*MERGE, *lit), plan.degree))
+    with run.stage("pyramid") as stage:
+        store.prepare(COARSE)
+        if store.missing(COARSE, [0]):
+            Coarse.gathered(store, plan.grid)
+        open_cut.cache_clear()  # an earlier run's
+        cut = open_cut(store, digest(*((store.folder / name).read_text("utf-8") for name in (PLAN, RUN)))[:16])
+        open_cut.cache_clear()  # this process holds the cut itself
+        run_pass(TreeBlocks(cut), "pyramid", sorted({tile.block for tile in cut.trees.coarse.tiles}))
+        tree = cut.tiled_tree
+        stage.note = f"{tree.base} cells in {len(tree.tiles)} tiles"
+    if not tree.tiles:
+        raise NothingVisible(plan.volume["name"], plan.function["name"])
+    return cut

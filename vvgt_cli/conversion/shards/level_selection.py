@@ -12,8 +12,8 @@ import numpy as np
 from vvgt_cli.conversion.shards.level_errors import level_errors
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.cut import Cut
-    from vvgt_cli.field.block_store import BlockStore
+    from vvgt_cli.conversion.shards.cut import Cut, Regions
+    from vvgt_cli.field.blocked import Pass
     from vvgt_cli.gaussians import Gaussians
 
 CUTS = 10
@@ -104,24 +104,48 @@ def errors_of(nodes: Sequence[Sequence[Gaussians]]) -> dict[str, np.ndarray]:
     return dict(zip(FIELDS, map(np.array, (counts, squares, energies, pixels)), strict=True))
 
 
-def measure_cuts(cut: Cut, store: BlockStore, kind: str) -> CutErrors:
-    """Make and draw `CUTS` cuts of every node; results of an interrupted run in ``store`` are reused.
+@dataclass(frozen=True)
+class ErrorRegions:
+    """The task of drawing the cuts of every node of a region.
+
+    Attributes:
+        cut: pyramid to cut.
+        regions: division of its tiles.
+        values: thresholds of the cuts, the finest first.
+    """
+
+    cut: Cut
+    regions: Regions
+    values: np.ndarray
+
+    @property
+    def kind(self) -> str:
+        """Kind of the results."""
+        return f"errors-{self.cut.key}"
+
+    def __len__(self) -> int:
+        """Return the number of regions."""
+        return len(self.regions.ends)
+
+    def __call__(self, number: int) -> None:
+        """Save the errors of the nodes of region ``number``."""
+        thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
+        nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
+        found = errors_of([node.levels for node in nodes])
+        self.cut.store.save(self.kind, number, ".npz", **found)
+
+
+def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
+    """Make and draw `CUTS` cuts of every node; results of an interrupted run are reused.
 
     Raises:
         DataError: a result is damaged.
     """
-    tiled_tree = cut.tiled_tree
-    finest = tiled_tree.threshold(cut.plan.budget)
-    second = max(tiled_tree.threshold(max(tiled_tree.count(finest) // 2, 1)), np.finfo(float).tiny)
+    tree, store = cut.tiled_tree, cut.store
+    finest = tree.threshold(cut.plan.budget)
+    second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
-    values = np.minimum(values, np.finfo(float).max)
-    found: list[dict[str, Any]] = []
-    store.prepare(kind)
-    while not store.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
-        found.append(store.load(kind, done))
-    for nodes in cut.nodes(np.tile(values, (len(tiled_tree.tiles), 1)), done):
-        some: dict[str, Any] = errors_of([node.levels for node in nodes])
-        store.save(kind, done, **some)
-        found.append(some)
-        done += len(nodes)
-    return CutErrors(values, **{name: np.concatenate([some[name] for some in found]) for name in FIELDS})
+    task = ErrorRegions(cut, cut.regions(finest), np.minimum(values, np.finfo(float).max))
+    run_pass(task, "errors")
+    parts = [store.load(task.kind, number) for number in range(len(task))]
+    return CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})

@@ -23,6 +23,7 @@ PLAN, LIGHT = "plan.json", "light.npz"
 A_SCORE, A_RAY = 20, 20  # bytes of the scores of a base cell and its ancestors, and of a ray within a block
 A_NORMAL = 24  # bytes of the normal of a base cell under a light
 A_GAUSSIAN = 8  # base cells per Gaussian, for large budgets
+KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels, in the store and in the output
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Plan:
         rays: name of the file of the rays for scoring.
         labels: whether the volume is a label map alone.
         degree: degree of the harmonics of colours under a light.
+        voxel_bytes: bytes of a voxel while a block is read.
     """
 
     grid: CellGrid
@@ -50,6 +52,7 @@ class Plan:
     rays: str
     labels: bool = False
     degree: int = 0
+    voxel_bytes: int = 1
 
     @property
     def written_degree(self) -> int:
@@ -126,4 +129,4 @@ def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool,
     met = rays * max(grid.blocks.shape) / 2  # blocks along a ray, half of which show something of it
     coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
     row, vertex = ROW + A_SCORE + A_NORMAL * lit, VERTEX_BYTES + HARMONIC_BYTES[degree]
-    return int(cells * row + coarse + met * A_RAY + min(budget, cells) * vertex)
+    return int(cells * row + coarse + met * A_RAY + KEPT * min(budget, cells) * vertex)

@@ -2,37 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.cameras.sets import RADIUS
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.part_descent import PartDescent
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.shards.merge import cut_of, write_merged
+from vvgt_cli.conversion.shards.cut import cut_of
+from vvgt_cli.conversion.shards.merge import closed_form, write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
-from vvgt_cli.conversion.shards.regions import Refiner
+from vvgt_cli.conversion.shards.regions import Refiner, make_regions
 from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.conversion.shards.streamed import folder_of
-from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import CELLS, BlockStore
-from vvgt_cli.field.blocked import Blocked, MissingBlocks
+from vvgt_cli.field.blocked import Blocked, MissingBlocks, Pass
 from vvgt_cli.field.cells import CellBlocks
-from vvgt_cli.field.open import FieldNeeds, blocked, store_beside
-from vvgt_cli.field.settings import MANY, BlockOptions
+from vvgt_cli.field.digests import digest
+from vvgt_cli.field.open import FieldNeeds, blocked, runner_of, store_beside, thread_count
+from vvgt_cli.field.settings import MANY, BlockOptions, worker_count
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import pace
-from vvgt_cli.files import check_disk_space
+from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
@@ -92,7 +94,8 @@ def convert_in_batches(request: ConvertRequest, console: Console | None = None) 
         _opened(run, request, options, store) as field,
     ):
         make_blocks(run, request, field)
-        write_merged(run, store, request.output or STDOUT, request.overwrite, partial(refiner_of, run, request, field))
+        refiner = partial(refiner_of, run, request, field)
+        write_merged(run, field.run_pass, request.output or STDOUT, request.overwrite, refiner)
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
@@ -110,25 +113,14 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     request = replace(request, fit=replace(request.fit, max_gaussians=budget))
     run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
     make_blocks(run, request, field)
-    cut = cut_of(run, field.run_pass.store)
-
-    def closed_form(budget: int) -> tuple[float, int, bool]:
-        threshold = cut.tiled_tree.threshold(budget)
-        logits = np.concatenate([made.opacity_logits for made, _ in cut.gaussians(threshold)])
-        return threshold, len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
-
-    with run.stage("closed form") as stage:
-        threshold, removed = thin(cut.plan.budget, closed_form)
-        stage.note = f"{cut.tiled_tree.count(threshold)} Gaussians"
-    if removed:
-        run.skip(f"{removed} Gaussians", TOO_FAINT)
-    thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
+    cut = cut_of(run, field.run_pass)
+    threshold, made, _ = closed_form(run, field.run_pass, cut)
+    over = cut.over_tiles(threshold)
     refiner = refiner_of(run, request, field)
-    if refiner is None:
-        return concatenate([made for made, _ in cut.gaussians(threshold)])
-    refined = refiner(run, cut, thresholds, [RADIUS], least=False)
-    parts = [node.levels[0] for nodes in refined.nodes() for node in nodes]
-    return concatenate([*parts, *(made for made, _ in cut.over_tiles(threshold))])
+    if refiner is not None:
+        thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
+        made = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
+    return concatenate([gaussians for gaussians, _ in chain(made.regions(), [] if over is None else [over])])
 
 
 def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | None:
@@ -137,17 +129,23 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     ended = limits.target_psnr is not None or limits.time_budget is not None
     steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
     degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
-    if steps and limits.time_budget is not None:
+    chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
+    if chosen.is_file():  # by a run with the same budget that was interrupted
+        steps = int(chosen.read_text("ascii"))
+    elif steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
         steps = min(steps, max(int(left / each), 0))
         if steps < fewest:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
             return None
+        with atomic_write(chosen, overwrite=True) as temporary:
+            temporary.write_text(str(steps), "ascii")
     if not steps:
         return None
     run.compile(for_degree(OPTIMIZE, degree))
-    return Refiner(field, PartDescent(steps, fit.size, rule_of(fit.rule), fit.seed, limits.target_psnr))
+    descent = PartDescent(steps, fit.size, rule_of(fit.rule), fit.seed, limits.target_psnr)
+    return Refiner(field.reader, field.light, descent)
 
 
 def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
@@ -158,10 +156,16 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
         DataError: blocks are missing or damaged.
     """
     run = Run(console or Console(), ConversionReport("merge"))
-    store = BlockStore(Path(folder))
+    store = BlockStore(Path(folder).absolute())
     store.settings()
-    with _written(output) as outputs, claimed(outputs, [], overwrite):
-        write_merged(run, store, output, overwrite)
+    plan, threads = Plan.load(store), thread_count()
+    workers = worker_count(BlockOptions(), math.prod(plan.grid.blocks.dims), plan.budget, threads)
+    with (
+        _written(output) as outputs,
+        claimed(outputs, [], overwrite),
+        runner_of(BlockOptions(workers=workers), threads) as runner,
+    ):
+        write_merged(run, Pass(runner, store, run.console.bar), output, overwrite)
     return run.finish()
 
 
@@ -225,7 +229,7 @@ def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     assert cells.rays is not None
     Plan(
         cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
-        tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree,
+        tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree, field.reader.voxel_bytes,
     ).save(store, cells.light)  # fmt: skip
     _check_disk(run, field, cells, budget, degree)
     with run.stage("integrate") as stage:

@@ -8,8 +8,7 @@ levels by `level_selection`.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,29 +17,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.shards.level_selection import measure_cuts
-from vvgt_cli.conversion.shards.plan import PLAN
-from vvgt_cli.conversion.shards.streamed_files import Files, Level, files_of
+from vvgt_cli.conversion.shards.regions import make_regions
+from vvgt_cli.conversion.shards.streamed_files import WrittenFiles, divide, files_of, remove_others
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.splats import Splats, splats_of
-from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.header import comment_lines
 from vvgt_cli.score.record import Run, plain
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.cut import Cut, Node
+    from vvgt_cli.conversion.shards.cut import Cut
+    from vvgt_cli.conversion.shards.level_selection import CutErrors
     from vvgt_cli.conversion.shards.regions import Refiner
-    from vvgt_cli.field.block_store import BlockStore
+    from vvgt_cli.field.blocked import Pass
 
 # Scale of the unit frame. The engine shows level 0 within 5 (`lodBaseDistance`) and level 1 within 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
 NEAREST = 5 / SCALE  # distance in the unit frame up to which level 0 is shown; each further level three times as far
-REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
 @contextmanager
@@ -60,7 +55,7 @@ def folder_of(output: str) -> Iterator[None]:
 
 def write_streamed(
     run: Run,
-    store: BlockStore,
+    run_pass: Pass,
     cut: Cut,
     output: str,
     overwrite: bool,
@@ -68,11 +63,11 @@ def write_streamed(
 ) -> None:
     """Write the files and, last, the manifest.
 
-    Progress is recorded in ``store``: errors of groups of nodes, refined regions, and complete files.
+    Each pass leaves its results in the store: errors of nodes, their Gaussians, and complete files.
 
     Args:
         run: gets the stages.
-        store: blocks of the cut.
+        run_pass: runs passes over the blocks of the cut.
         cut: pyramid to take the levels from.
         output: path of the manifest.
         overwrite: replace an existing one.
@@ -85,91 +80,78 @@ def write_streamed(
         raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
-        key = digest((store.folder / PLAN).read_text("utf-8"))[:16]
-        errors = measure_cuts(cut, store, f"errors-{key}")
-        choices = errors.levels()
-        levels = [Level(number) for number in range(len(choices))]
-        stage.note = f"{len(levels)} levels of {len(tiled_tree.tiles)} nodes"
-    thresholds = errors.thresholds[np.stack(choices, axis=1)]
-    groups = cut.nodes(thresholds)
+        errors = measure_cuts(run_pass, cut)
+        choices = np.stack(errors.levels(), axis=1)
+        stage.note = f"{choices.shape[1]} levels of {len(tiled_tree.tiles)} nodes"
     if (refine := refiner()) is not None:
-        refined = refine(run, cut, thresholds, [NEAREST * 3 ** (level.number - 0.5) for level in levels])
-        key, groups, errors = refined.key, refined.nodes(), refined.errors()
-        choices = [np.full(len(tiled_tree.tiles), level.number) for level in levels]
-    before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
-    files = Files(folder, store, f"written-{digest(key, str(folder))[:16]}")
-    with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
-        for some in groups:
-            for node in some:
-                own = [choice[len(nodes)] for choice in choices]
-                nodes.append(_node(cut, files, levels, node) | errors.facts(len(nodes), own))
-        for level in levels:
-            files.write(level)
-        facts = [errors.rms(choice) for choice in choices]
-        temporary.write_text(
-            json.dumps(plain(_manifest(cut, levels, files.names, nodes, facts)), separators=(",", ":"))
-        )
-        total = sum(level.bytes for level in levels)
-        stage.note = f"{output}: {len(nodes)} nodes, {len(files.names)} files, {total / 1e6:.1f} MB; Gaussians "
-        stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
-        if levels[0].gaussians < cut.plan.budget // 2:
+        refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
+    made = make_regions(run, run_pass, cut, errors.thresholds[choices], refine)
+    if refine is not None:
+        errors, choices = made.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
+    target, counts = Path(output), made.field("counts")
+    before, folder = files_of(target), target.absolute().parent
+    parts, places = divide(counts)
+    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), comments=False)
+    task = WrittenFiles(made, parts, folder, axes, SCALE, replace(options, sh_degree=cut.plan.degree))
+    with run.stage("write") as stage, atomic_write(target, overwrite) as temporary:
+        task.forget_changed()
+        run_pass(task, "write")
+        spreads = made.field("spreads")
+        levels = _levels(task, counts, spreads, errors, choices)
+        rows = zip(*task.bounds(len(counts)), places, spreads, strict=True)
+        nodes = [_node(*row) | errors.facts(k, choices[k].tolist()) for k, row in enumerate(rows)]
+        temporary.write_text(json.dumps(plain(_manifest(cut, levels, task.names, nodes)), separators=(",", ":")))
+        total = sum(level["bytes"] for level in levels)
+        stage.note = f"{output}: {len(nodes)} nodes, {len(parts)} files, {total / 1e6:.1f} MB; Gaussians "
+        stage.note += ", ".join(f"{level['gaussians']:,}" for level in levels)
+        if levels[0]["gaussians"] < cut.plan.budget // 2:
             stage.note += f", no more: {tiled_tree.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
-    files.remove_others(before)
-    run.report.gaussians, run.report.bytes = levels[0].gaussians, total
+    remove_others(folder, before, task.names)
+    run.report.gaussians, run.report.bytes = levels[0]["gaussians"], total
 
 
-def _node(cut: Cut, files: Files, levels: list[Level], node: Node) -> dict[str, Any]:
-    """Add a node to the files, and return its entry in the manifest."""
-    axes, options = (
-        np.array(cut.plan.axes).reshape(3, 3),
-        replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),
-    )
-    lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
-    for level, gaussians, spread in zip(levels, node.levels, node.spreads, strict=True):
-        splats = _scaled(gaussians, axes, options)
-        reach = REACH * np.exp(splats.log_scales.max(axis=1, keepdims=True))
-        low = np.minimum(low, (splats.means - reach).min(axis=0))
-        high = np.maximum(high, (splats.means + reach).max(axis=0))
-        lods[str(level.number)] = files.add(level, splats)
-        level.spread += spread
+def _node(low: np.ndarray, high: np.ndarray, lods: list[dict[str, int]], spreads: np.ndarray) -> dict[str, Any]:
+    """Return the entry of a node."""
     return {
         "bound": {"min": low.tolist(), "max": high.tolist()},
-        "lods": lods,
-        "spreads": [SCALE * float(np.sqrt(square / weight)) for weight, square in node.spreads],
+        "lods": {str(k): place for k, place in enumerate(lods)},
+        "spreads": [SCALE * float(np.sqrt(square / weight)) for weight, square in spreads],
     }
 
 
-def _scaled(gaussians: Gaussians, axes: np.ndarray, options: PlyOptions) -> Splats:
-    splats = splats_of(transform(gaussians, axes), options)
-    return replace(
-        splats, means=splats.means * np.float32(SCALE), log_scales=splats.log_scales + np.float32(math.log(SCALE))
-    )
+def _levels(
+    task: WrittenFiles, counts: np.ndarray, spreads: np.ndarray, errors: CutErrors, choices: np.ndarray
+) -> list[dict[str, Any]]:
+    """Return what the manifest says of each level."""
+    found = []
+    for k, sums in enumerate(spreads.sum(axis=0)):
+        own = [number for number, part in enumerate(task.parts) if part.level == k]
+        found.append(
+            {
+                "gaussians": int(counts[:, k].sum()),
+                "bytes": sum(task.size(number) for number in own),
+                "files": len(own),
+                "spread": SCALE * float(np.sqrt(sums[1] / sums[0])),
+                "rms": errors.rms(choices[:, k]),
+            }
+        )
+    return found
 
 
 def _manifest(
-    cut: Cut, levels: list[Level], names: list[str], nodes: list[dict[str, Any]], errors: list[float]
+    cut: Cut, levels: list[dict[str, Any]], names: Sequence[str], nodes: list[dict[str, Any]]
 ) -> dict[str, Any]:
     low = np.min([node["bound"]["min"] for node in nodes], axis=0)
     high = np.max([node["bound"]["max"] for node in nodes], axis=0)
     comments = [line.removeprefix("comment ") for line in comment_lines(upright(cut.plan.ply))]
-    facts = [
-        {
-            "gaussians": level.gaussians,
-            "bytes": level.bytes,
-            "files": level.files,
-            "spread": SCALE * float(np.sqrt(level.spread[1] / level.spread[0])),
-            "rms": errors[level.number],
-        }
-        for level in levels
-    ]
     return {
         "version": 1,
         "asset": {"generator": f"vvgt {VERSION}"},
-        "count": sum(level.gaussians for level in levels),
-        "counts": [level.gaussians for level in levels],
+        "count": sum(level["gaussians"] for level in levels),
+        "counts": [level["gaussians"] for level in levels],
         "lodLevels": len(levels),
         "lodErrors": True,
-        "filenames": names,
+        "filenames": list(names),
         "tree": {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": nodes},
-        "vvgt": {"schema": 1, "scale": SCALE, "size": cut.plan.size, "levels": facts, "comments": comments},
+        "vvgt": {"schema": 1, "scale": SCALE, "size": cut.plan.size, "levels": levels, "comments": comments},
     }

@@ -3,101 +3,154 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from vvgt_cli.conversion.shards.regions import Made
 from vvgt_cli.errors import DataError
-from vvgt_cli.field.block_store import BlockStore
+from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
-from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order
+from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order, splats_of
 from vvgt_cli.gaussians.formats.streamed import read_manifest
+from vvgt_cli.gaussians.frames import transform
 
 A_FILE = 1 << 17  # Gaussians in a file, except for those of its last node
+REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
-@dataclass
-class Level:
-    """The state of writing a level.
+class Part(NamedTuple):
+    """The content of a file: a level of the nodes from ``begin`` to ``end``, and the file's number in that level."""
+
+    level: int
+    number: int
+    begin: int
+    end: int
+
+
+def divide(counts: np.ndarray) -> tuple[tuple[Part, ...], list[list[dict[str, int]]]]:
+    """Divide the levels of nodes among files.
+
+    Args:
+        counts: (nodes, levels) numbers of Gaussians.
+
+    Returns:
+        The files, in the order in which their first nodes come; and for each node, by level, its file, offset and
+        count.
+    """
+    parts: list[Part] = []
+    for level in range(counts.shape[1]):
+        begin, rows, number = 0, 0, 0
+        for node, count in enumerate(counts[:, level].tolist(), 1):
+            rows += count
+            if rows >= A_FILE or node == len(counts):
+                parts.append(Part(level, number, begin, node))
+                begin, rows, number = node, 0, number + 1
+    parts.sort(key=lambda part: (part.begin, part.level))
+    places: list[list[dict[str, int]]] = [[{} for _ in range(counts.shape[1])] for _ in range(len(counts))]
+    for file, part in enumerate(parts):
+        offset = 0
+        for node in range(part.begin, part.end):
+            count = int(counts[node, part.level])
+            places[node][part.level] = {"file": file, "offset": offset, "count": count}
+            offset += count
+    return tuple(parts), places
+
+
+@dataclass(frozen=True)
+class WrittenFiles:
+    """The task of writing each file of all levels.
+
+    The store records its bytes and time, by which a later run recognises it, and the bounds of its nodes.
 
     Attributes:
-        number: number of the level, 0 the finest.
-        waiting: Gaussians for the next file.
-        rows: number of waiting Gaussians.
-        files: number of files written.
-        gaussians, bytes: totals so far.
-        spread: sums over Gaussians of opacity x area of their cells, and of that x variance within.
+        made: Gaussians of all nodes, box frame.
+        parts: content of the files.
+        folder: folder of the manifest.
+        axes: (3, 3) turn into the frame of the file.
+        scale: scale from the unit frame.
+        options: layout of the Gaussians.
     """
 
-    number: int
-    waiting: list[Splats] = field(default_factory=list)
-    rows: int = 0
-    files: int = 0
-    gaussians: int = 0
-    bytes: int = 0
-    spread: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    made: Made
+    parts: tuple[Part, ...]
+    folder: Path
+    axes: np.ndarray
+    scale: float
+    options: PlyOptions
+
+    @property
+    def kind(self) -> str:
+        """Kind of the results."""
+        return f"written-{digest(self.made.kind, str(self.folder))[:16]}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the files' `meta.json` in the manifest."""
+        return tuple(f"{part.level}_{part.number}/{META}" for part in self.parts)
+
+    def __len__(self) -> int:
+        """Return the number of files."""
+        return len(self.parts)
+
+    def __call__(self, number: int) -> None:
+        """Write file ``number``."""
+        part, target = self.parts[number], self.folder / self.names[number]
+        lows, highs, waiting = [], [], []
+        for gaussians in self.made.level(part.level, part.begin, part.end):
+            splats = self._splats(gaussians)
+            reach = REACH * np.exp(splats.log_scales.max(axis=1, keepdims=True))
+            lows.append((splats.means - reach).min(axis=0))
+            highs.append((splats.means + reach).max(axis=0))
+            waiting.append(splats.take(morton_order(splats.means)))
+        size = _written(target, joined(waiting))
+        written = np.array([size, target.stat().st_mtime_ns])
+        self.made.store.save(self.kind, number, size=written, lows=np.array(lows), highs=np.array(highs))
+
+    def _splats(self, gaussians: Gaussians) -> Splats:
+        splats = splats_of(transform(gaussians, self.axes), self.options)
+        larger = splats.log_scales + np.float32(math.log(self.scale))
+        return replace(splats, means=splats.means * np.float32(self.scale), log_scales=larger)
+
+    def forget_changed(self) -> None:
+        """Forget files that are missing, or were changed since this run wrote them."""
+        store = self.made.store
+        done = [number for number in range(len(self)) if not store.missing(self.kind, [number])]
+        for number in done:
+            target = self.folder / self.names[number]
+            written = int(store.load(self.kind, number, names=("size",))["size"][1])
+            if not target.is_file() or target.stat().st_mtime_ns != written:
+                store.path(self.kind, number).unlink()
+
+    def size(self, number: int) -> int:
+        """Return the bytes of a written file."""
+        return int(self.made.store.load(self.kind, number, names=("size",))["size"][0])
+
+    def bounds(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and highest corners (nodes, 3) of all nodes, over their levels."""
+        low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+        for number, part in enumerate(self.parts):
+            found, own = self.made.store.load(self.kind, number), slice(part.begin, part.end)
+            low[own] = np.minimum(low[own], found["lows"])
+            high[own] = np.maximum(high[own], found["highs"])
+        return low, high
 
 
-class Files:
-    """The files of all levels; ``names`` are those of their `meta.json` in the manifest.
-
-    ``store`` records, under ``kind``, the bytes and time of each complete file, which is then not written again unless
-    another run has changed it.
-    """
-
-    def __init__(self, folder: Path, store: BlockStore, kind: str) -> None:
-        """Start without files."""
-        self._folder, self._store, self._kind = folder, store, kind
-        store.prepare(kind)
-        self.names: list[str] = []
-        self._begun: dict[int, int] = {}  # number of the name of each level's next file
-
-    def add(self, level: Level, splats: Splats) -> dict[str, int]:
-        """Add the Gaussians of a node to the next file of a level, and return their place."""
-        if level.number not in self._begun:
-            self._begun[level.number] = len(self.names)
-            self.names.append(f"{level.number}_{level.files}/{META}")
-        place = {"file": self._begun[level.number], "offset": level.rows, "count": len(splats)}
-        level.waiting.append(splats.take(morton_order(splats.means)))
-        level.rows += len(splats)
-        level.gaussians += len(splats)
-        if level.rows >= A_FILE:
-            self.write(level)
-        return place
-
-    def write(self, level: Level) -> None:
-        """Write the waiting Gaussians, if any."""
-        if not level.rows:
-            return
-        number = self._begun.pop(level.number)
-        target = self._folder / self.names[number]
-        level.bytes += self._kept(number, target) or self._made(number, target, joined(level.waiting))
-        level.waiting, level.rows, level.files = [], 0, level.files + 1
-
-    def _kept(self, number: int, target: Path) -> int:
-        """Return the bytes of a file that this run wrote before an interruption, else 0."""
-        if not target.is_file() or self._store.missing(self._kind, [number]):
-            return 0
-        size, written = self._store.load(self._kind, number)["size"].tolist()
-        return int(size) if written == target.stat().st_mtime_ns else 0
-
-    def _made(self, number: int, target: Path, splats: Splats) -> int:
-        size = _written(target, splats)
-        self._store.save(self._kind, number, size=np.array([size, target.stat().st_mtime_ns]))
-        return size
-
-    def remove_others(self, before: Sequence[str]) -> None:
-        """Remove the files of an earlier manifest, ``before``, that this one does not name."""
-        for name in set(before) - set(self.names):
-            path = self._folder / name
-            for file in (path, *(path.with_name(f"{image}.webp") for image in IMAGES)):
-                file.unlink(missing_ok=True)
-            with suppress(OSError):  # it holds other files
-                path.parent.rmdir()
+def remove_others(folder: Path, before: Sequence[str], names: Sequence[str]) -> None:
+    """Remove the files of an earlier manifest, ``before``, that this one does not name."""
+    for name in set(before) - set(names):
+        path = folder / name
+        for file in (path, *(path.with_name(f"{image}.webp") for image in IMAGES)):
+            file.unlink(missing_ok=True)
+        with suppress(OSError):  # it holds other files
+            path.parent.rmdir()
 
 
 def files_of(manifest: Path) -> list[str]:
