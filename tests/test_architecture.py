@@ -208,6 +208,7 @@ PROGRAMS = {
     "commands/converter_process.py": {"os._exit"},
     "field/runners.py": {"os._exit", "signal.signal"},
     "integrations/catalyst.py": {"print"},
+    "integrations/paraview_job.py": {"print"},
     "jit/worker.py": {"print", "sys.exit", "os._exit"},
     "progress.py": {"print"},
     "volume/vtk/child.py": {"os._exit"},
