@@ -10,7 +10,6 @@ import pytest
 
 import vvgt_cli
 import vvgt_cli.integrations.xarray
-from vvgt_cli.volume.stored import Stored
 
 xarray = pytest.importorskip("xarray")
 
@@ -35,11 +34,22 @@ def test_it_converts_as_the_library_does() -> None:
     assert array().vvgt.session(time=0).volume.dims == (8, 10, 12)
 
 
-def test_arrays_of_dask_stay_lazy() -> None:
-    pytest.importorskip("dask.array")
-    lazy = array().isel(time=0).chunk({"z": 6, "y": 5, "x": 8})
-    assert isinstance(lazy.vvgt.session().volume.data, Stored)
-    assert len(lazy.vvgt.convert("viridis", GOAL, blocks=16).gaussians) > 50
+def test_arrays_of_dask_are_never_read_as_a_whole() -> None:
+    dask = pytest.importorskip("dask")
+    from dask.core import flatten
+
+    whole = xarray.DataArray(np.indices((40, 40, 40)).sum(axis=0).astype(np.float32), dims=("z", "y", "x"))
+    lazy = whole.chunk({"z": 20, "y": 20, "x": 20})
+    asked = []
+
+    def get(graph, keys, **more):
+        asked.append(len(list(flatten(keys))))
+        return dask.get(graph, keys, **more)
+
+    with dask.config.set(scheduler=get):
+        assert len(lazy.vvgt.convert("viridis", GOAL, blocks=16).gaussians) > 50
+    assert len(asked) > 8
+    assert max(asked) < 8  # chunks at once, of eight
 
 
 def test_the_library_alone_registers_nothing() -> None:
