@@ -23,6 +23,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
+    from vvgt_cli.integrations.command import tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
     sys.path.remove(ROOT)
@@ -44,5 +45,5 @@ def catalyst_execute(info: Any) -> None:
         job.save(source.GetOutputDataObject(0), info.time)
         job.convert()
     except RuntimeError as error:  # the simulation goes on
-        print(f"Gaussian splats: {name}: {error}", file=sys.stderr)
+        tell(f"{name}: {error}", failed=True)
     job.end()

@@ -12,12 +12,21 @@ import os
 import shutil
 from typing import Any
 
-from vvgt_cli.integrations.command import run
+from vvgt_cli.integrations.command import run, tell
 from vvgt_cli.integrations.paraview_view import look
-from vvgt_cli.integrations.vtk_files import index_of, write
+from vvgt_cli.integrations.vtk_files import index_of, series_of, voxels_of, write
 from vvgt_cli.integrations.vtk_scene import placed
 
 BLOCKS = 4  # of the volume for each rank, at least, of at most 256 voxels along an edge
+
+
+def failure(words: list[str]) -> str:
+    """Run the command; return its error, "" where it did what it should."""
+    try:
+        run(words)
+    except RuntimeError as error:
+        return str(error)
+    return ""
 
 
 class Job:
@@ -42,22 +51,29 @@ class Job:
         self.rank = self.ranks.GetLocalProcessId() if self.ranks else 0
         self.name, self.options, self.saved = os.path.abspath(name), options, list[tuple[str, float]]()
         self.folder = self.name + ".parts"
+        error = ""
         if self.rank == 0:
             shutil.rmtree(self.folder, ignore_errors=True)
             os.makedirs(self.folder)
-            found = look(source, options, self._path("function.json"))
-            with open(self._path("look.json"), "w", encoding="utf-8") as file:
-                json.dump(found, file)
-        self.meet()
-        with open(self._path("look.json"), encoding="utf-8") as file:
-            self.words, numbers, notes = json.load(file)
+            try:
+                found = look(source, options, self._path("function.json"))
+                with open(self._path("look.json"), "w", encoding="utf-8") as file:
+                    json.dump(found, file)
+            except Exception as failed:  # the other ranks would wait for ever
+                error = f"the view's look: {failed!r}"
+        self.meet(error)
+        self.words, numbers, notes = self._read("look.json")
         self.matrix = vtkMatrix4x4()
         self.matrix.DeepCopy(numbers or [float(k % 5 == 0) for k in range(16)])
         if self.rank == 0 and notes:
-            print(f"Gaussian splats: not taken: {'; '.join(dict.fromkeys(notes))}")
+            tell(f"not taken: {'; '.join(dict.fromkeys(notes))}")
 
     def _path(self, name: str) -> str:
         return os.path.join(self.folder, name)
+
+    def _read(self, name: str) -> Any:
+        with open(self._path(name), encoding="utf-8") as file:
+            return json.load(file)
 
     def meet(self, error: str = "") -> None:
         """Wait for all ranks.
@@ -88,22 +104,16 @@ class Job:
             with open(self._path(f"{stem}_{self.rank}.json"), "w", encoding="utf-8") as file:
                 json.dump(moved.GetExtent(), file)
         self.meet("" if image else f"a {data.GetClassName()} in {self.count} ranks; expected an image, or one rank")
+        extents = [self._read(f"{stem}_{rank}.json") for rank in range(self.count)]
         if self.rank == 0:
-            extents = []
-            for rank in range(self.count):
-                with open(self._path(f"{stem}_{rank}.json"), encoding="utf-8") as file:
-                    extents.append(json.load(file))
             with open(self._path(f"{stem}.pvti"), "w", encoding="utf-8") as file:
                 file.write(index_of(moved, stem, extents))
         self.meet()
         self.saved.append((self._path(f"{stem}.pvti"), time))
+        self.voxels = voxels_of(extents)
 
     def convert(self) -> None:
-        """Run the command on what was saved.
-
-        Raises:
-            RuntimeError: it failed.
-        """
+        """Run the command on what was saved; raise its error as a RuntimeError."""
         stem, dot, ending = os.path.basename(self.name).partition(".")
         name = os.path.join(os.path.dirname(self.name), stem + "_{:04d}" + dot + ending)
         limits = ["--max-gaussians", str(self.options["Gaussians"]), *self.words]
@@ -111,45 +121,22 @@ class Job:
             for k, (path, _) in enumerate(self.saved):
                 self._shares(path, limits, name.format(k) if len(self.saved) > 1 else self.name)
             return
-        error = ""
-        if self.rank == 0:
-            limits += ["--steps", str(self.options["Steps"]), "--overwrite", *["--live"] * bool(self.options["Live"])]
-            source, target = self.saved[0][0], self.name
-            if len(self.saved) > 1:
-                source, target = self._series(), self.name if ending.endswith("html") else name
-            try:
-                run(["convert", source, "-o", target, *limits])
-            except RuntimeError as failed:
-                error = str(failed)
-        self.meet(error)
-
-    def _series(self) -> str:
-        files = "".join(f'<DataSet timestep="{time!r}" file="{os.path.basename(path)}"/>' for path, time in self.saved)
-        with open(self._path("series.pvd"), "w", encoding="utf-8") as file:
-            file.write(f'<VTKFile type="Collection" version="0.1"><Collection>{files}</Collection></VTKFile>')
-        return self._path("series.pvd")
+        limits += ["--steps", str(self.options["Steps"]), "--overwrite", *["--live"] * bool(self.options["Live"])]
+        source, target = self.saved[0][0], self.name
+        if len(self.saved) > 1 and self.rank == 0:
+            source, target = self._path("series.pvd"), self.name if ending.endswith("html") else name
+            with open(source, "w", encoding="utf-8") as file:
+                file.write(series_of(self.saved))
+        self.meet(failure(["convert", source, "-o", target, *limits]) if self.rank == 0 else "")
 
     def _shares(self, path: str, words: list[str], target: str) -> None:
         """Compute this rank's share of the closed form, in passes that need each other's results; merge them."""
         blocks = path + ".blocks"
-        with open(path, encoding="utf-8") as file:
-            extent = [int(v) for v in file.read().partition('WholeExtent="')[2].partition('"')[0].split()]
-        voxels = math.prod(extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3))
-        edge = 2 ** max(4, min(8, int(math.log2(voxels / (BLOCKS * self.count)) / 3)))
+        edge = 2 ** max(4, min(8, int(math.log2(self.voxels / (BLOCKS * self.count)) / 3)))
         share = ["--shard", f"{self.rank + 1}/{self.count}", "--blocks", str(edge), "--quiet"]
         for _ in range(2 if "--tf" in words else 3):
-            error = ""
-            try:
-                run(["init", path, "-o", blocks, *words, *share])
-            except RuntimeError as failed:
-                error = str(failed)
-            self.meet(error)
-        if self.rank == 0:
-            try:
-                run(["merge", blocks, "-o", target, "--overwrite"])
-            except RuntimeError as failed:
-                error = str(failed)
-        self.meet(error)
+            self.meet(failure(["init", path, "-o", blocks, *words, *share]))
+        self.meet(failure(["merge", blocks, "-o", target, "--overwrite"]) if self.rank == 0 else "")
 
     def end(self) -> None:
         """Remove the folder."""

@@ -16,19 +16,24 @@ from pathlib import Path
 from typing import Any
 
 from paraview.util.vtkAlgorithm import VTKPythonAlgorithmBase, smdomain, smproperty, smproxy
-from vtkmodules.vtkCommonCore import vtkOutputWindow
-from vtkmodules.vtkCommonDataModel import vtkDataObject
-from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline as Pipeline
-from vtkmodules.vtkParallelCore import vtkMultiProcessController
 
 ENDINGS = ["html", "spz", "sog", "ply"]  # of a .ply, ParaView takes surfaces for itself
 ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
+    from vvgt_cli.integrations.command import tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
     sys.path.remove(ROOT)
+
+
+def _pipeline() -> Any:
+    """Return the class that holds the keys of requests."""
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+
+    return vtkStreamingDemandDrivenPipeline
+
 
 DATA = ["vtkImageData", "vtkRectilinearGrid", "vtkStructuredGrid", "vtkUnstructuredGrid", "vtkCompositeDataSet"]
 
@@ -99,36 +104,42 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
 
     def RequestInformation(self, request: Any, inputs: Any, outputs: Any) -> int:
         """Take the input's time steps, if all are asked for."""
-        info = inputs[0].GetInformationObject(0)
-        every = info.Get(Pipeline.TIME_STEPS()) if info.Has(Pipeline.TIME_STEPS()) else ()
+        info, pipeline = inputs[0].GetInformationObject(0), _pipeline()
+        every = info.Get(pipeline.TIME_STEPS()) if info.Has(pipeline.TIME_STEPS()) else ()
         self.times = list(every) if self.options["AllSteps"] and len(every) > 1 else []
         return 1
 
     def RequestUpdateExtent(self, request: Any, inputs: Any, outputs: Any) -> int:
         """Ask for the next time step, and for this rank's piece."""
+        from vtkmodules.vtkParallelCore import vtkMultiProcessController
+
         info, controller = inputs[0].GetInformationObject(0), vtkMultiProcessController.GetGlobalController()
+        pipeline = _pipeline()
         if self.times:
-            info.Set(Pipeline.UPDATE_TIME_STEP(), self.times[self.step])
-        info.Set(Pipeline.UPDATE_NUMBER_OF_PIECES(), controller.GetNumberOfProcesses() if controller else 1)
-        info.Set(Pipeline.UPDATE_PIECE_NUMBER(), controller.GetLocalProcessId() if controller else 0)
+            info.Set(pipeline.UPDATE_TIME_STEP(), self.times[self.step])
+        info.Set(pipeline.UPDATE_NUMBER_OF_PIECES(), controller.GetNumberOfProcesses() if controller else 1)
+        info.Set(pipeline.UPDATE_PIECE_NUMBER(), controller.GetLocalProcessId() if controller else 0)
         return 1
 
     def RequestData(self, request: Any, inputs: Any, outputs: Any) -> int:
         """Save one time step; convert behind the last."""
-        data = vtkDataObject.GetData(inputs[0].GetInformationObject(0))
+        from vtkmodules.vtkCommonDataModel import vtkDataObject
+
+        pipeline = _pipeline()
         try:
             if self.step == 0:
                 self.job = Job(self.name, self.options, self.GetInputAlgorithm(0, 0))
             assert self.job is not None
+            data = vtkDataObject.GetData(inputs[0].GetInformationObject(0))
             self.job.save(data, self.times[self.step] if self.times else 0.0)
             self.step += 1
             if self.step < len(self.times):
-                request.Set(Pipeline.CONTINUE_EXECUTING(), 1)
+                request.Set(pipeline.CONTINUE_EXECUTING(), 1)
                 return 1
             self.job.convert()
         except RuntimeError as error:
-            vtkOutputWindow.GetInstance().DisplayErrorText(f"Gaussian splats: {error}\n")
-        request.Remove(Pipeline.CONTINUE_EXECUTING())
+            tell(str(error), failed=True)
+        request.Remove(pipeline.CONTINUE_EXECUTING())
         self.step = 0
         if self.job is not None:
             self.job.end()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -34,10 +35,14 @@ def write(data: Any, stem: str) -> str:
 
 def index_of(image: Any, stem: str, extents: Sequence[Sequence[int]]) -> str:
     """Return the text of a ``.pvti``: an image like ``image`` in pieces ``stem_N.vti`` of these extents."""
-    whole = [(max if k % 2 else min)(extent[k] for extent in extents) for k in range(6)]
     directions = image.GetDirectionMatrix()
     turns = [directions.GetElement(k // 3, k % 3) for k in range(9)]
-    place = {"WholeExtent": whole, "GhostLevel": [0], "Origin": image.GetOrigin(), "Spacing": image.GetSpacing()}
+    place = {
+        "WholeExtent": _whole(extents),
+        "GhostLevel": [0],
+        "Origin": image.GetOrigin(),
+        "Spacing": image.GetSpacing(),
+    }
     words = " ".join(f'{key}="{_text(values)}"' for key, values in {**place, "Direction": turns}.items())
     lists = "".join(
         f"<P{name}>{''.join(map(_array, _arrays(data)))}</P{name}>"
@@ -47,6 +52,23 @@ def index_of(image: Any, stem: str, extents: Sequence[Sequence[int]]) -> str:
     pieces = "".join(f'<Piece Extent="{_text(extent)}" Source="{name}_{n}.vti"/>' for n, extent in enumerate(extents))
     kind = 'type="PImageData" version="1.0" byte_order="LittleEndian"'
     return f"<VTKFile {kind}><PImageData {words}>{lists}{pieces}</PImageData></VTKFile>"
+
+
+def _whole(extents: Sequence[Sequence[int]]) -> list[int]:
+    """Return the extent that holds those of all pieces."""
+    return [(max if k % 2 else min)(extent[k] for extent in extents) for k in range(6)]
+
+
+def voxels_of(extents: Sequence[Sequence[int]]) -> int:
+    """Return the number of points of an image in pieces."""
+    whole = _whole(extents)
+    return math.prod(whole[2 * k + 1] - whole[2 * k] + 1 for k in range(3))
+
+
+def series_of(files: Sequence[tuple[str, float]]) -> str:
+    """Return the text of a ``.pvd`` of files in its folder, at their times."""
+    sets = "".join(f'<DataSet timestep="{time!r}" file="{os.path.basename(path)}"/>' for path, time in files)
+    return f'<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>'
 
 
 def _text(values: Sequence[float]) -> str:
