@@ -53,7 +53,6 @@ class FileFacts:
         function: name of the transfer function.
         certificate: measurements of the conversion; None if the Gaussians were changed since.
         legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
-        date: date of writing, YYYY-MM-DD, in pages only.
         title: title of pages, which names no file unless it was chosen.
         camera: where pages open: eye and target, world, and the vertical field of view in degrees.
     """
@@ -75,7 +74,6 @@ class FileFacts:
     function: str | None = None
     certificate: Certificate | None = None
     legend: str | None = None
-    date: str | None = None
     title: str | None = None
     camera: tuple[float, ...] | None = None
 
@@ -275,8 +273,8 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         if not axes.any() or np.linalg.det(axes / np.abs(axes).max()) == 0:
             raise ValueError(text)
         return {"affine": tuple(affine)}
-    if word in ("length-unit", "optics", "date"):
-        return {word.replace("-", "_"): text if word == "date" else words[0]}
+    if word in ("length-unit", "optics"):
+        return {word.replace("-", "_"): words[0]}
     return {"version": word}
 
 
@@ -306,9 +304,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
     named = (("title", facts.title), ("function", facts.function))
     lines += [f"comment vvgt {word} {json.dumps(text)}" for word, text in named if text is not None]
-    for word, text in (("legend", None if facts.live else facts.legend), ("date", facts.date)):
-        if text is not None:
-            lines.append(f"comment vvgt {word} {text}")
+    if facts.legend is not None and not facts.live:
+        lines.append(f"comment vvgt legend {facts.legend}")
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")

@@ -13,7 +13,6 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from itertools import product
@@ -25,7 +24,6 @@ import numpy as np
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.certificate import epoch
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_frames import held_frames
 from vvgt_cli.gaussians.formats.splats import Splats
@@ -58,15 +56,6 @@ def upright(options: PlyOptions) -> PlyOptions:
     if not options.comments:
         return options
     return replace(options, frame="unit", up="z" if options.up == "none" else options.up)
-
-
-def dated(options: PlyOptions) -> PlyOptions:
-    """Return options with the current date, or that of `SOURCE_DATE_EPOCH` for reproducible files."""
-    if not options.comments:
-        return options
-    seconds = epoch()
-    when = datetime.now() if seconds is None else datetime.fromtimestamp(seconds, UTC)
-    return replace(options, date=f"{when:%Y-%m-%d}")
 
 
 def camera(splats: Splats) -> dict[str, Any]:
