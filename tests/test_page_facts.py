@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import with_place
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate
-from vvgt_cli.gaussians.formats.page_file import outermost, upright
+from vvgt_cli.gaussians.formats.page_file import camera, html, outermost, upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
 from vvgt_cli.gaussians.legend import checked, legend_text
@@ -98,6 +99,35 @@ def test_the_page_knows_the_place_and_the_letters(up: str, tmp_path: Path) -> No
         np.testing.assert_allclose(sign * axes["xyz".index(up[-1])], [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("frame", ["unit", "world"])
+@pytest.mark.parametrize("up", UP_NAMES)
+def test_a_page_opens_at_the_camera_of_the_file(up: str, frame: str) -> None:
+    there, offset = POINT / SCALE + CENTRE, np.array([1.0, 2.0, -3.0])
+    asked = (*(there + offset), *there, 25.0)
+    options = PlyOptions(scale=SCALE, centre=CENTRE, up=up, frame=frame, camera=asked)
+    stream = io.BytesIO()
+    write_ply(stream, one(), options)
+    stream.seek(0)
+    assert layout_of(read_ply(stream)[1]).camera == pytest.approx(asked)
+    splats = splats_of(one(), options)
+    found = camera(splats)
+    np.testing.assert_allclose(found["target"], splats.means[0] * (-1, -1, 1), rtol=1e-5)
+    away = np.subtract(found["position"], found["target"])
+    assert np.linalg.norm(away) == pytest.approx(np.linalg.norm(offset) * (SCALE if frame == "unit" else 1))
+    if up in ("y", "z"):  # what is up is +y of the viewer
+        assert away[1] * offset["xyz".index(up)] > 0
+    assert found["fov"] == 25
+    scene = json.loads(html(splats, "a").decode().partition('id="scene">')[2].partition("</script>")[0])
+    assert (scene["camera"], scene["outermost"]) == (found, [])
+
+
+@pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1,2,3,1,2,3,40", "1,2,3,4,5,6,180", "1,2,3,4,5,x,40"])
+def test_a_camera_that_is_none_is_refused(vvgt, text: str, tmp_path: Path) -> None:
+    done = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
+    assert done.code == 2
+    assert "expected eye, target" in done.err
+
+
 def test_files_without_an_anatomical_space_use_the_volume_axes(tmp_path: Path) -> None:
     told = PlyOptions(scale=SCALE, centre=CENTRE, space="none", affine=AFFINE, length_unit="um")
     found = world_of(splats_of(one(), upright(told)), tmp_path)
@@ -153,11 +183,10 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU", "density")
     assert text is not None
     stream = io.BytesIO()
-    write_ply(stream, one(), PlyOptions(legend=text, date="2026-11-25"))
+    write_ply(stream, one(), PlyOptions(legend=text))
     stream.seek(0)
     header = read_ply(stream)[1]
-    assert (header.legend, header.date) == (text, "2026-11-25")
-    assert layout_of(header).date is None  # of what is written then
+    assert header.legend == text
     facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
     found = facts["legend"]
     assert (found["values"], found["unit"], found["quantity"]) == ([0, 60], "HU", "density")
@@ -189,3 +218,31 @@ def test_a_legend_of_labels_names_those_that_are_shown() -> None:
     assert found["of"] == 38
     assert found["labels"][:2] == [["part 1", "ff0080"], ["part 3", "ff0080"]]
     assert len(found["labels"]) == 24
+
+
+def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
+    def listed(name: str) -> dict[str, Any]:
+        done = vvgt("info", tmp_path / name, "--sharing", "--json")
+        assert done.code == 0, done.err
+        return json.loads(done.out)
+
+    values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
+    nibabel.save(nibabel.Nifti1Image(values, np.diag([2, 2, 2, 1])), tmp_path / "Doe_John.nii")
+    (tmp_path / "t.json").write_text(json.dumps({"1": {"name": "tumour", "color": [1, 0, 0]}}))
+    given = ("--labels", tmp_path / "t.json", "--max-gaussians", 100, "--size", 40)
+    quick = ("--steps", 0)
+    kinds = {"a.ply": quick, "live.ply": ("--live",), "n.ply": ("--no-comments", *quick), "a.html": ("--live",)}
+    for name, more in kinds.items():
+        assert vvgt("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name).code == 0
+        assert "Doe" not in json.dumps(listed(name))
+    plain, live, bare, page = map(listed, ("a.ply", "live.ply", "n.ply", "a.html"))
+    assert {"title", "function", "names", "command", "checksum", "place", "picture"} <= set(plain)
+    assert plain["names"] == ["tumour"]
+    assert "values" not in plain
+    assert live["names"] == ["tumour"]
+    assert {"values", "place"} <= set(live)
+    assert "other functions" in live["picture"]
+    assert {"values", "date"} <= set(page)
+    assert set(bare) == {"kind", "name", "picture", "remove"}
+    assert "not Gaussians" in vvgt("info", tmp_path / "Doe_John.nii", "--sharing").error
+    assert vvgt("info", "--machine", "--sharing").code == 2

@@ -98,8 +98,6 @@ def encoded(
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
     """
-    if known.suffix == ".html":
-        options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name, None, extras.slices)
     if gaussians.live is not None:
@@ -111,7 +109,7 @@ def encoded(
         return known.write(splats, name)
     if extras.live is None:
         return page_file.html(splats, name, extras.slices)
-    return known.live(extras.live[0], replace(extras.live[1], date=options.date), name, splats, extras.slices)
+    return known.live(*extras.live, name, splats, extras.slices)
 
 
 def is_splats(path: str | Path) -> bool:
