@@ -13,8 +13,6 @@ from tests.spared import MARCH, spare
 from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
-os.environ["SOURCE_DATE_EPOCH"] = "0"  # no seconds in files: what is made twice is compared byte by byte
-
 SLOWEST = (
     *("matrix", "docs_run", "stiff", "benchmarks", "jit", "fuzz", "stiff_equivalence", "volume_vtk_family", "report"),
     *("scale_workers", "slurm", "cli_streams", "previous_frame", "closed_form", "certificate", "cli_convert"),

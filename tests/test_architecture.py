@@ -16,7 +16,7 @@ PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "synth", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
-    *("conversion", "checks", "commands", "library", "cli"),
+    *("conversion", "checks", "commands", "library", "integrations", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),

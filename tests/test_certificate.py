@@ -18,9 +18,8 @@ from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.certificate import Certificate, epoch
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats import SUFFIXES, read_splats
-from vvgt_cli.gaussians.formats.page_file import dated
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
@@ -29,7 +28,7 @@ DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
     volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
     conditions=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5,
-    seconds=12.5, command="vvgt convert head.nrrd --tf 'a b.json'",
+    command="vvgt convert head.nrrd --tf 'a b.json'",
 )  # fmt: skip
 SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
 RAW = ("--dims", *map(str, DIMS), "--dtype", "uint8")
@@ -73,7 +72,7 @@ def test_a_line_gives_the_certificate_back() -> None:
     assert FULL.line().startswith("vvgt certificate {")
     assert "\n" not in FULL.line()
     assert Certificate.of(FULL.line().split(None, 2)[2]) == FULL
-    least = replace(FULL, sha256=None, conditions=(), texture=None, seconds=None, command=None)
+    least = replace(FULL, sha256=None, conditions=(), texture=None, command=None)
     assert Certificate.of(least.line().split(None, 2)[2]) == least
 
 
@@ -116,7 +115,6 @@ def test_a_conversion_certifies_its_file(made) -> None:
     for words in ("--tf tf.json", "--size 64", "--max-gaussians 300", "--steps 8", "--dims 20 18 22"):
         assert words in found.command
     assert "out.ply" not in found.command
-    assert found.seconds is None  # SOURCE_DATE_EPOCH is set
 
 
 def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
@@ -129,32 +127,6 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME ")
     assert "--shard 2/2" in found.command
-
-
-def test_seconds_are_written_unless_files_are_to_be_reproducible(vvgt, folder, tmp_path, monkeypatch) -> None:
-    monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
-    assert vvgt("convert", *args, "-o", tmp_path / "timed.ply").code == 0
-    found = read_ply(tmp_path / "timed.ply")[1].certificate
-    assert found is not None
-    assert found.seconds is not None
-    assert 0 < found.seconds < 1000
-
-
-def test_an_epoch_is_a_second_that_there_is(monkeypatch) -> None:
-    for text, seconds in (
-        ("0", 0),
-        ("1700000000", 1_700_000_000),
-        ("", None),
-        ("-1", None),
-        ("9" * 30, None),
-        ("x", None),
-    ):
-        monkeypatch.setenv("SOURCE_DATE_EPOCH", text)
-        assert epoch() == seconds
-        assert dated(PlyOptions()).date is not None
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    assert dated(PlyOptions()).date == "2023-11-14"
 
 
 def test_no_folder_is_named_whatever_its_name(vvgt, folder, tmp_path) -> None:

@@ -17,7 +17,7 @@ from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import with_place
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate
-from vvgt_cli.gaussians.formats.page_file import outermost, upright
+from vvgt_cli.gaussians.formats.page_file import camera, html, outermost, upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
 from vvgt_cli.gaussians.legend import checked, legend_text
@@ -98,6 +98,35 @@ def test_the_page_knows_the_place_and_the_letters(up: str, tmp_path: Path) -> No
         np.testing.assert_allclose(sign * axes["xyz".index(up[-1])], [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("frame", ["unit", "world"])
+@pytest.mark.parametrize("up", UP_NAMES)
+def test_a_page_opens_at_the_camera_of_the_file(up: str, frame: str) -> None:
+    there, offset = POINT / SCALE + CENTRE, np.array([1.0, 2.0, -3.0])
+    asked = (*(there + offset), *there, 25.0)
+    options = PlyOptions(scale=SCALE, centre=CENTRE, up=up, frame=frame, camera=asked)
+    stream = io.BytesIO()
+    write_ply(stream, one(), options)
+    stream.seek(0)
+    assert layout_of(read_ply(stream)[1]).camera == pytest.approx(asked)
+    splats = splats_of(one(), options)
+    found = camera(splats)
+    np.testing.assert_allclose(found["target"], splats.means[0] * (-1, -1, 1), rtol=1e-5)
+    away = np.subtract(found["position"], found["target"])
+    assert np.linalg.norm(away) == pytest.approx(np.linalg.norm(offset) * (SCALE if frame == "unit" else 1))
+    if up in ("y", "z"):  # what is up is +y of the viewer
+        assert away[1] * offset["xyz".index(up)] > 0
+    assert found["fov"] == 25
+    scene = json.loads(html(splats, "a").decode().partition('id="scene">')[2].partition("</script>")[0])
+    assert (scene["camera"], scene["outermost"]) == (found, [])
+
+
+@pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1,2,3,1,2,3,40", "1,2,3,4,5,6,180", "1,2,3,4,5,x,40"])
+def test_a_camera_that_is_none_is_refused(vvgt, text: str, tmp_path: Path) -> None:
+    done = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
+    assert done.code == 2
+    assert "expected eye, target" in done.err
+
+
 def test_files_without_an_anatomical_space_use_the_volume_axes(tmp_path: Path) -> None:
     told = PlyOptions(scale=SCALE, centre=CENTRE, space="none", affine=AFFINE, length_unit="um")
     found = world_of(splats_of(one(), upright(told)), tmp_path)
@@ -153,11 +182,10 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU", "density")
     assert text is not None
     stream = io.BytesIO()
-    write_ply(stream, one(), PlyOptions(legend=text, date="2026-11-25"))
+    write_ply(stream, one(), PlyOptions(legend=text))
     stream.seek(0)
     header = read_ply(stream)[1]
-    assert (header.legend, header.date) == (text, "2026-11-25")
-    assert layout_of(header).date is None  # of what is written then
+    assert header.legend == text
     facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
     found = facts["legend"]
     assert (found["values"], found["unit"], found["quantity"]) == ([0, 60], "HU", "density")

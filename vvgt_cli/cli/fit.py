@@ -60,6 +60,19 @@ limit_options = group(
     ),
 )  # fmt: skip
 
+
+def _camera(context: click.Context, option: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    from vvgt_cli.gaussians.header import camera_of
+
+    try:
+        return None if text is None else camera_of(text.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r}; expected eye, target (another place) and field of view (above 0, below 180 degrees), "
+            "seven numbers separated by commas"
+        ) from None
+
+
 ply_options = group(
     "ply",
     frame=click.option(
@@ -74,6 +87,11 @@ ply_options = group(
         ]),
         help="Direction that viewers show upwards: anatomical, or a world axis. 'none' keeps the axes; 'auto' is "
         "superior for anatomical volumes in the unit frame, else none.",
+    ),
+    camera=click.option(
+        "--camera", metavar="EX,EY,EZ,TX,TY,TZ,FOV", callback=_camera,
+        help="Where pages open: eye and target in the volume's physical space, and the vertical field of view in "
+        "degrees. Recorded in the file. Default: all of it in view.",
     ),
     sh_degree=click.option(
         "--sh-degree", type=click.IntRange(0, 3), metavar="N",

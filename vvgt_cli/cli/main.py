@@ -18,6 +18,7 @@ import click
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
+from vvgt_cli.progress import Console
 from vvgt_cli.version import VERSION
 
 COMMANDS = {
@@ -38,6 +39,7 @@ COMMANDS = {
     "export": "vvgt_cli.cli.export",
     "train": "vvgt_cli.cli.train",
     "synth": "vvgt_cli.cli.synth",
+    "plugin": "vvgt_cli.cli.plugin",
     "warmup": "vvgt_cli.cli.warmup",
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -73,8 +75,20 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
 
+def _describe(context: click.Context, parameter: click.Parameter, given: bool) -> None:
+    if given:
+        from vvgt_cli.cli.slicer import description
+
+        click.echo(description())
+        context.exit()
+
+
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(VERSION, "-V", "--version", prog_name="vvgt", message="%(prog)s %(version)s")
+@click.option(
+    "--xml", is_flag=True, is_eager=True, expose_value=False, callback=_describe,
+    help="Describe convert as a command-line module of 3D Slicer (docs/programs.md) and exit.",
+)  # fmt: skip
 def cli() -> None:
     """Convert scientific volumes to 3D Gaussian splats.
 
@@ -132,8 +146,13 @@ def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
     received.clear()
     try:
+        words, console = list(sys.argv[1:] if args is None else args), Console
+        if words[:1] == ["--slicer"]:
+            from vvgt_cli.cli.slicer import SlicerConsole, arguments
+
+            words, console = arguments(words[1:]), SlicerConsole
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
-        with cli.make_context("vvgt", expand(sys.argv[1:] if args is None else args)) as context:
+        with cli.make_context("vvgt", expand(words), obj=console) as context:
             cli.invoke(context)
         sys.stdout.flush()
         return 0

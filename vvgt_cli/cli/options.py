@@ -268,7 +268,10 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")  # they are notes on standard error
-            return function(*args, console=Console(quiet, interruption=interruption), **kwargs)
+            console = (
+                click.get_current_context().find_object(type) or Console
+            )  # that of 3D Slicer (`vvgt_cli.cli.slicer`)
+            return function(*args, console=console(quiet, interruption=interruption), **kwargs)
 
     # click wraps a paragraph's lines unless it begins with \b
     wrapper.__doc__ = re.sub(r"\n( *)(Examples?:\n)", "\n\\1\b\n\\1\\2", function.__doc__ or "")

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.certificate import Certificate, epoch
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views
@@ -49,7 +49,6 @@ def with_certificate(
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
         texture=_rounded_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
-        seconds=round(run.elapsed(), 1) if epoch() is None else None,
         command=command,
     )
     return replace(ply, certificate=found)

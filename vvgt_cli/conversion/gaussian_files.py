@@ -50,8 +50,7 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 def layout_of(header: PlyHeader) -> PlyOptions:
     """Return the layout, place and comments of a file that was read, for writing another."""
-    facts = header.facts() | {"date": None}  # the other file has its own date
-    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **facts)
+    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **header.facts())
 
 
 def write_gaussians(

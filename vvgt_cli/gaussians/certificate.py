@@ -1,22 +1,13 @@
-"""A file's record of its own error: the source volume, how closely it was matched, and how long that took."""
+"""A file's record of its own error: the source volume and how closely it was matched."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import dataclass
 from typing import Any
 
 WORD = "certificate"  # keyword of the comment
-REPRODUCIBLE = "SOURCE_DATE_EPOCH"  # if set, files are reproducible byte by byte (reproducible-builds.org)
-_LAST = 253_402_300_799  # second of the year 9999
-
-
-def epoch() -> int | None:
-    """Return the time stamp for files, seconds since 1970, from `SOURCE_DATE_EPOCH`; None if unset or invalid."""
-    text = os.environ.get(REPRODUCIBLE, "")
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 16 and int(text) <= _LAST else None
 
 
 @dataclass(frozen=True)
@@ -36,7 +27,6 @@ class Certificate:
         texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
             nothing is opaque and smooth.
         position_error: largest distance of a stored centre from the computed one, in world units.
-        seconds: wall time up to the scores; None if `SOURCE_DATE_EPOCH` requests reproducible files.
         command: the command line without folders, outputs, names of volumes and options that do not affect the
             result; None from Python.
     """
@@ -52,7 +42,6 @@ class Certificate:
     conditions: tuple[tuple[str, float], ...] = ()
     texture: tuple[float, float] | None = None
     position_error: float = 0.0
-    seconds: float | None = None
     command: str | None = None
 
     def facts(self) -> dict[str, Any]:
@@ -81,7 +70,7 @@ class Certificate:
         texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
         kinds = {
             "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
-            "live_psnr": float, "position_error": float, "seconds": float, "command": str,
+            "live_psnr": float, "position_error": float, "command": str,
         }  # fmt: skip
         if not {"volume", "look", "size", "rule", "psnr", "views"} <= set(found) <= set(kinds):
             raise ValueError(text)

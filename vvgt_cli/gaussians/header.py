@@ -53,8 +53,8 @@ class FileFacts:
         function: name of the transfer function.
         certificate: measurements of the conversion; None if the Gaussians were changed since.
         legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
-        date: date of writing, YYYY-MM-DD, in pages only.
         title: title of pages, which names no file unless it was chosen.
+        camera: where pages open: eye and target, world, and the vertical field of view in degrees.
     """
 
     frame: str = "unit"
@@ -74,8 +74,8 @@ class FileFacts:
     function: str | None = None
     certificate: Certificate | None = None
     legend: str | None = None
-    date: str | None = None
     title: str | None = None
+    camera: tuple[float, ...] | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return the facts by name."""
@@ -255,6 +255,8 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         if words[1] != "rule" or len(words) != 3 or not words[0].isdecimal() or not 0 < int(words[0]) <= 2**20:
             raise ValueError(text)
         return {"made_for": int(words[0]), "rule": words[2]}
+    if word == "camera":
+        return {"camera": camera_of(words)}
     if word == "space":
         if text not in ("RAS", "LPS", "none"):
             raise ValueError(text)
@@ -271,9 +273,21 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         if not axes.any() or np.linalg.det(axes / np.abs(axes).max()) == 0:
             raise ValueError(text)
         return {"affine": tuple(affine)}
-    if word in ("length-unit", "optics", "date"):
-        return {word.replace("-", "_"): text if word == "date" else words[0]}
+    if word in ("length-unit", "optics"):
+        return {word.replace("-", "_"): words[0]}
     return {"version": word}
+
+
+def camera_of(words: Sequence[str]) -> tuple[float, ...]:
+    """Return the seven numbers of a camera: eye, target, vertical field of view in degrees.
+
+    Raises:
+        ValueError: another count, no numbers, eye and target at one place, or no field of view.
+    """
+    numbers = _finite(list(words))
+    if len(numbers) != 7 or numbers[:3] == numbers[3:6] or not 0 < numbers[6] < 180:
+        raise ValueError(words)
+    return tuple(numbers)
 
 
 def comment_lines(facts: FileFacts) -> list[str]:
@@ -290,12 +304,13 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
     named = (("title", facts.title), ("function", facts.function))
     lines += [f"comment vvgt {word} {json.dumps(text)}" for word, text in named if text is not None]
-    for word, text in (("legend", None if facts.live else facts.legend), ("date", facts.date)):
-        if text is not None:
-            lines.append(f"comment vvgt {word} {text}")
+    if facts.legend is not None and not facts.live:
+        lines.append(f"comment vvgt legend {facts.legend}")
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")
+    if facts.camera is not None:
+        lines.append(f"comment vvgt camera {' '.join(repr(float(v)) for v in facts.camera)}")
     if facts.made_for is not None:
         lines.append(f"comment vvgt size {facts.made_for} rule {facts.rule or 'inria'}")
     if facts.light is not None:

@@ -94,8 +94,6 @@ def encoded(
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
     """
-    if known.suffix == ".html":
-        options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name, None)
     if gaussians.live is not None:
@@ -104,7 +102,7 @@ def encoded(
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     splats = splats_of(gaussians, known.layout(options))
     if editor is not None and known.live is not None:
-        return known.live(editor[0], replace(editor[1], date=options.date), name, splats)
+        return known.live(*editor, name, splats)
     return known.write(splats, name)
 
 

@@ -13,7 +13,6 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from itertools import product
@@ -25,15 +24,17 @@ import numpy as np
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.certificate import epoch
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_frames import held_frames
 from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.gaussians.header import facts_in
 from vvgt_cli.gaussians.rules import INRIA, RULES
 
 PROGRAM = "viewer.js.gz"
 _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
+_PLACED = re.compile(r"vvgt (frame|up|camera) ")
 _TITLE = re.compile(r"vvgt title (\".*\")$")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
@@ -57,21 +58,15 @@ def upright(options: PlyOptions) -> PlyOptions:
     return replace(options, frame="unit", up="z" if options.up == "none" else options.up)
 
 
-def dated(options: PlyOptions) -> PlyOptions:
-    """Return options with the current date, or that of `SOURCE_DATE_EPOCH` for reproducible files."""
-    if not options.comments:
-        return options
-    seconds = epoch()
-    when = datetime.now() if seconds is None else datetime.fromtimestamp(seconds, UTC)
-    return replace(options, date=f"{when:%Y-%m-%d}")
-
-
 def camera(splats: Splats) -> dict[str, Any]:
-    """Return the initial camera of the page: that of `vvgt render --orbit`, or a similar one for other frames.
+    """Return the initial camera of the page: the file's, else that of `vvgt render --orbit` or a similar one.
 
     Returns:
-        position and target in the viewer's axes, where PLY (x, y, z) is (-x, -y, z); the field of view in degrees.
+        position and target in the viewer's axes, where PLY (x, y, z) is (-x, -y, z); the field of view in degrees, of
+        the shorter side of the window.
     """
+    if asked := _asked(splats):
+        return asked
     middle, half = np.zeros(3), 1.0
     if not any(_UNIT.match(line) for line in splats.comments):
         middle = np.median(splats.means, axis=0).astype(np.float64)
@@ -81,11 +76,29 @@ def camera(splats: Splats) -> dict[str, Any]:
     return {"position": (target + np.array([-x, z, y])).tolist(), "target": target.tolist(), "fov": _FIELD}
 
 
+def _asked(splats: Splats) -> dict[str, Any] | None:
+    """Return the camera that the file states, as `camera` does."""
+    if not any(line.startswith("vvgt camera ") for line in splats.comments):
+        return None
+    facts = facts_in([line for line in splats.comments if _PLACED.match(line)], "page")
+    if "scale" not in facts:
+        return None
+    *places, field = facts["camera"]
+    points = np.reshape(places, (2, 3))
+    if facts["frame"] == "unit":
+        points = (points - facts["centre"]) * facts["scale"]
+    eye, target = points @ up_matrix(facts.get("up", "none")).T * (-1, -1, 1)
+    return {"position": eye.tolist(), "target": target.tolist(), "fov": field}
+
+
 def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     """Return points in the viewer's axes that must be in view for everything visible of ``clouds`` to fit.
 
-    These are the farthest Gaussians in 26 directions; the list is empty if nothing is visible.
+    These are the farthest Gaussians in 26 directions; the list is empty if nothing is visible, and if the first cloud
+    states a camera, which stays where it is.
     """
+    if clouds and _asked(clouds[0]):
+        return []
     places = np.concatenate([splats.means[splats.logits > _SEEN] for splats in clouds]) * (-1.0, -1.0, 1.0)
     towards = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)]).T
     if not len(places):

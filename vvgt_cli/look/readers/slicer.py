@@ -2,9 +2,10 @@
 
 ``.vp`` has nine lines: interpolation, shading, diffuse, ambient, specular, specular power, then scalar opacity,
 gradient opacity and colours, each a count of numbers and the numbers, (x, opacity) or (x, r, g, b). ``.vp.json`` names
-the same, with midpoints and sharpness, once a component; the first component is read. Opacity is per
-``scalarOpacityUnitDistance`` in millimetres; the other forms have none and VTK's default of 1 is taken. MRML
-(``presets.xml``, scenes) has a ``VolumeProperty`` element a preset, with the lines of ``.vp`` as attributes
+the same, with midpoints and sharpness, once a component; the first component is read. Ours
+(`vvgt_cli.integrations.vtk_property`) has more of VTK's function in it: ``colorSpace``, ``hsvWrap``, ``useLogScale``,
+``nanColor``. Opacity is per ``scalarOpacityUnitDistance``; the other forms have none and VTK's default of 1 is taken.
+MRML (``presets.xml``, scenes) has a ``VolumeProperty`` element a preset, with the lines of ``.vp`` as attributes
 (``scalarOpacity``, ``gradientOpacity``, ``colorTransfer``, ``shade``, ``ambient``, ...); viewers on vtk.js keep the
 same as JSON. Where shading is on, the function has the head-light of VTK's viewers with the file's coefficients
 (`vvgt_cli.look.lighting`). Gradient opacity is not used, which a warning says where a file asks for it.
@@ -127,7 +128,8 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
         colors = [rgb(f"{key} color", p.get("color")) for p in points]
     else:
         colors = [(grey, grey, grey) for grey in (number(f"{key} y", p.get("y")) for p in points)]
-    bends = np.array([_bend(p) for p in points])
+    bends, more = np.array([_bend(p) for p in points]), component[key]
+    space = str(more.get("colorSpace", "RGB"))
     gradient = component.get("gradientOpacity") and not component.get("disableGradientOpacity")
     slopes = [p.get("y") for p in _points(component, "gradientOpacity")] if gradient else []
     lighting = component.get("lighting")
@@ -137,7 +139,16 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
     return TransferFunction(
         "volume property",
         PiecewiseOpacity(*np.array(opacity).T),
-        ColorMap(np.array([_x(p) for p in points]), np.array(colors), bends[:, 0], bends[:, 1]),
+        ColorMap(
+            np.array([_x(p) for p in points]),
+            np.array(colors),
+            bends[:, 0],
+            bends[:, 1],
+            space=space,
+            hsv_wrap=bool(more.get("hsvWrap", True)),
+            log_scale=bool(more.get("useLogScale", False)),
+            nan_color=rgb("nanColor", more.get("nanColor", [0.5, 0.0, 0.0])),
+        ),
         distance,
         opacity_unit_label="file" if "scalarOpacityUnitDistance" in component else DEFAULT,
         lighting=_lighting(what, light),

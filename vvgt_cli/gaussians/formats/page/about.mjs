@@ -16,7 +16,7 @@ export function rowsOf(name, { facts, world, count, live, converted }) {
     ['made for', facts.size && `screens of ${facts.size} px; drawing rule: ${facts.rule}`],
     ['axes', world.anatomical ? `${facts.space}, in mm` : `the file's own${world.unit && `, in ${world.unit}`}`],
     ['drawn with', 'SuperSplat viewer and PlayCanvas engine (MIT)'],
-    ['written', facts.version && `${facts.date ? `${facts.date}, ` : ''}by vvgt ${facts.version}`],
+    ['written', facts.version && `by vvgt ${facts.version}`],
   ].filter(([, value]) => value);
 }
 

@@ -24,7 +24,7 @@ function qualityOf(text) {
   } catch { return null; }
 }
 
-// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, quality, date}: text and numbers
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, quality}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {

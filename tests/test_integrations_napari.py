@@ -1,0 +1,126 @@
+"""napari: layers saved through its own File > Save, by the manifest of the package."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli
+from tests.test_integrations_slicer import heaviest
+from vvgt_cli.gaussians import read_ply
+
+ROOT = Path(__file__).parents[1]
+MANIFEST = ROOT / "vvgt_cli" / "integrations" / "napari.yaml"
+POINT = (9, 7, 5)  # index z, y, x
+PLACE = {"scale": (2, 1, 0.5), "rotate": (10, 20, 30), "translate": (100, -20, 7), "units": ("um", "um", "um")}
+
+
+def test_the_package_names_the_manifest() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    package, _, file = project["entry-points"]["napari.manifest"]["vvgt"].partition(":")
+    assert ROOT.joinpath(*package.split("."), file) == MANIFEST
+
+
+@pytest.fixture(scope="module")
+def viewer():
+    os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+    pytest.importorskip("napari", reason="no napari: pip install napari PySide6 beside vvgt")
+    from napari.components import ViewerModel  # all of the viewer but its window, which needs OpenGL
+
+    npe2 = pytest.importorskip("npe2")
+    npe2.PluginManager.instance().register(npe2.PluginManifest.from_file(MANIFEST))
+    return ViewerModel()
+
+
+def point(*shift: int) -> np.ndarray:
+    values = np.zeros((20, 18, 16), np.float32)
+    values[tuple(np.add(POINT, shift or 0))] = 90
+    return values
+
+
+def saved(viewer, path: Path) -> Path:
+    viewer.layers.selection.clear()
+    try:
+        assert viewer.layers.save(str(path), plugin="vvgt")
+    finally:
+        viewer.layers.clear()
+    return path
+
+
+def at(layer, *shift: int) -> np.ndarray:
+    """Where napari has the point, in the order x, y, z."""
+    return np.array(layer.data_to_world(np.add(POINT, shift or 0)))[::-1]
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore:Non-orthogonal slicing")
+def test_an_image_keeps_its_place_unit_and_colours(viewer, tmp_path) -> None:
+    layer = viewer.add_image(point(), name="GFP", contrast_limits=(10, 90), gamma=0.7, colormap="magma", **PLACE)
+    world, middle = at(layer), layer.colormap.map(np.array([0.5**0.7]))[0]
+    header = read_ply(saved(viewer, tmp_path / "a.splats.ply"))[1]
+    assert heaviest(tmp_path / "a.splats.ply") == pytest.approx(world, abs=0.01)
+    assert header.length_unit == "um"
+    assert header.function == "GFP"
+    nodes = json.loads(header.legend)["nodes"]
+    x, opacity, colour = min(nodes, key=lambda node: abs(node[0] - 50))
+    assert x == pytest.approx(50, abs=2.6)
+    assert opacity == pytest.approx(((x - 10) / 80) ** 0.7, abs=0.02)
+    assert [int(colour[k : k + 2], 16) for k in (0, 2, 4)] == pytest.approx(255 * middle[:3], abs=16)
+
+
+@pytest.mark.long
+def test_axes_of_different_units_are_one(viewer, tmp_path) -> None:
+    viewer.add_image(point(), contrast_limits=(0, 90), scale=(2, 1, 500), units=("um", "um", "nm"))
+    header = read_ply(saved(viewer, tmp_path / "a.splats.ply"))[1]
+    assert header.length_unit == "nm"
+    assert np.reshape(header.affine, (3, 4))[:, :3] == pytest.approx(np.diag([500, 1000, 2000]))
+
+
+@pytest.mark.long
+def test_channels_and_labels_are_drawn_together(viewer, tmp_path) -> None:
+    labels = np.zeros((20, 18, 16), np.uint8)
+    labels[2:5, 3:8, 4:9], labels[12:15, 3:8, 4:9] = 1, 2
+    names = {"index": [0, 1, 2], "name": ["background", "nucleus, upper", "vacuole"]}
+    only = viewer.add_labels(labels, features=names, opacity=1)
+    colors = [only.get_color(k)[:3] for k in (1, 2)]
+    legend = json.loads(read_ply(saved(viewer, tmp_path / "l.splats.ply"))[1].legend)
+    assert [name for name, _ in legend["labels"]] == ["nucleus, upper", "vacuole"]
+    found = [[int(text[k : k + 2], 16) / 255 for k in (0, 2, 4)] for _, text in legend["labels"]]
+    assert np.array(found) == pytest.approx(np.array(colors), abs=0.01)
+    viewer.add_image(point(), name="red", contrast_limits=(0, 90), colormap="red")
+    viewer.add_image(point(0, 8, 0), name="green", contrast_limits=(0, 90), colormap="green")
+    viewer.add_image(np.full((20, 18, 16), 90.0), name="hidden", visible=False)
+    viewer.add_labels(labels, features=names)
+    header = read_ply(saved(viewer, tmp_path / "c.splats.ply"))[1]
+    assert [word in header.function for word in ("red", "green", "labels", "hidden")] == [True, True, True, False]
+
+
+@pytest.mark.long
+def test_a_first_axis_is_time(viewer, tmp_path) -> None:
+    pytest.importorskip("dask.array")
+    import dask.array
+
+    steps = dask.array.from_array(np.stack([point(), point(3, 0, 2)]), chunks=(1, 20, 18, 16))
+    layer = viewer.add_image(steps, contrast_limits=(0, 90), scale=(1, 2, 1, 0.5), translate=(0, 5, 6, 7))
+    places = [np.array(layer.data_to_world((k, *np.add(POINT, shift))))[:0:-1] for k, shift in ((0, 0), (1, (3, 0, 2)))]
+    saved(viewer, tmp_path / "t.splats.ply")
+    for k, place in enumerate(places):
+        assert heaviest(tmp_path / f"t.splats_{k:04d}.ply") == pytest.approx(place, abs=0.01)
+    viewer.add_image(steps, contrast_limits=(0, 90))
+    page = saved(viewer, tmp_path / "t.html").read_text("utf-8")
+    assert page.count('id="live-') + page.count('id="splats-') >= 2
+
+
+@pytest.mark.long
+def test_what_cannot_be_saved_says_why(viewer, tmp_path) -> None:
+    viewer.add_image(np.zeros((8, 8, 3), np.uint8), rgb=True, name="photo")
+    with pytest.raises(vvgt_cli.UsageError, match="photo: an RGB image; expected z, y, x"):
+        saved(viewer, tmp_path / "a.html")
+    viewer.add_image(point(), visible=False)
+    with pytest.raises(vvgt_cli.UsageError, match="no visible layer"):
+        saved(viewer, tmp_path / "a.html")

@@ -1,0 +1,47 @@
+"""The adapters for other programs: what each does and how it is enabled, as its own file says."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+PLUGINS = {  # file of each, in this folder; its docstring has the lines "Tried:" and "Enable:"
+    "slicer": "slicer/GaussianSplats.py",
+    "napari": "napari.py",
+    "jupyter": "jupyter.py",
+    "xarray": "xarray.py",
+}
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An adapter.
+
+    Attributes:
+        name: for `vvgt plugin NAME`.
+        path: its file.
+        does: what it does, in a line.
+        tried: the program's version that it was tried with.
+        enable: lines that enable it there.
+    """
+
+    name: str
+    path: Path
+    does: str
+    tried: str
+    enable: tuple[str, ...]
+
+
+def plugin(name: str) -> Plugin:
+    """Return an adapter of `PLUGINS`, by its docstring: the file itself is not imported, as its program may be missing.
+
+    Raises:
+        KeyError: none of this name.
+    """
+    path = FOLDER / PLUGINS[name]
+    lines = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()
+    tried = next(line.removeprefix("Tried:").strip() for line in lines if line.startswith("Tried:"))
+    enable = [line.strip().format(file=path, folder=path.parent) for line in lines[lines.index("Enable:") + 1 :]]
+    return Plugin(name, path, lines[0], tried, tuple(filter(None, enable)))
