@@ -18,6 +18,7 @@ import click
 import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
+from tests.live_stream import from_bytes
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.convert import fit_gaussians
 from vvgt_cli.conversion.file_layout import degree_of
@@ -31,7 +32,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.layered import Content
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.live import apply_look, baked
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction

@@ -109,7 +109,7 @@ def test_a_room_imports_only_from_rooms_before_it(path):
             assert ROOMS.index(room(module)) <= ROOMS.index(own), f"line {node.lineno}: {own} imports {module}"
 
 
-@of_every_file(FILES)
+@of_every_file([path for path in FILES if path.name != "paraview_plugin.py"])  # which only ParaView imports
 def test_heavy_imports_sit_where_they_are_used(path):
     tree = tree_of(path)
     top = {id(node) for node in module_level(tree)}
@@ -207,6 +207,8 @@ def test_every_module_says_what_it_is(path):
 PROGRAMS = {
     "commands/converter_process.py": {"os._exit"},
     "field/runners.py": {"os._exit", "signal.signal"},
+    "integrations/catalyst.py": {"print"},
+    "integrations/paraview_job.py": {"print"},
     "jit/worker.py": {"print", "sys.exit", "os._exit"},
     "progress.py": {"print"},
     "volume/vtk/child.py": {"os._exit"},

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vvgt_cli.cameras import default_views, look_at
-from vvgt_cli.cameras.colmap import colmap_model, quaternion
-from vvgt_cli.splat.reference import rotations
+from vvgt_cli.cameras.colmap import colmap_model
+from vvgt_cli.cameras.quaternions import quaternion
+from vvgt_cli.gaussians.frames import rotations
 
 unit = st.floats(-1, 1)
 

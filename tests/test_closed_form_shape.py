@@ -20,9 +20,9 @@ from vvgt_cli.closed_form.wavelet import box_surrogate
 from vvgt_cli.dvr import render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.constants import MAX_ALPHA, MIN_ALPHA
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.splat import render
-from vvgt_cli.splat.reference import rotations
 from vvgt_cli.synth import analytic
 from vvgt_cli.volume import Volume
 

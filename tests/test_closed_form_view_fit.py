@@ -82,7 +82,7 @@ def test_known_harmonics_come_back_and_degree_0_is_far_behind(degree):
     start, views = replace(truth, colors=np.full((60, 3), 0.5), harmonics=None), pictures(truth)
     plain = solve_colors(start, CAMERAS, views, rounds=20)
     assert plain.harmonics is None
-    solved = solve_colors(start, CAMERAS, views, rounds=20, degree=degree)
+    solved = solve_colors(start.of_degree(degree), CAMERAS, views, rounds=20)
     assert solved.degree == degree
     assert mean_psnr(solved, truth) > mean_psnr(plain, truth) + 8
     for field in ("means", "log_scales", "quaternions", "opacity_logits"):
@@ -105,7 +105,7 @@ def test_one_view_says_little_of_the_others():
     """Harmonics from a single view stay small: the colour takes what it can."""
     truth = shiny(30, 3)
     start = replace(truth, colors=np.full((30, 3), 0.5), harmonics=None)
-    solved = solve_colors(start, CAMERAS[:1], pictures(truth, CAMERAS[:1]), degree=3)
+    solved = solve_colors(start.of_degree(3), CAMERAS[:1], pictures(truth, CAMERAS[:1]))
     assert np.abs(solved.harmonics).max() < 0.5
     assert mean_psnr(solved, truth) > mean_psnr(start, truth) - 1
 
@@ -122,6 +122,6 @@ def test_colours_and_harmonics_stay_in_range():
 def test_repeats_to_the_byte_and_of_none_makes_none():
     truth = shiny()
     start, views = replace(truth, harmonics=None), pictures(truth)
-    first, second = (solve_colors(start, CAMERAS, views, degree=2) for _ in range(2))
+    first, second = (solve_colors(start.of_degree(2), CAMERAS, views) for _ in range(2))
     assert first.harmonics.tobytes() == second.harmonics.tobytes()
-    assert len(solve_colors(start.take(np.zeros(0, int)), CAMERAS, views, degree=1)) == 0
+    assert len(solve_colors(start.take(np.zeros(0, int)).of_degree(1), CAMERAS, views)) == 0

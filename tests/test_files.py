@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write, check_disk_space, claim, discard_leftovers, temporary_folder
+from vvgt_cli.files import atomic_write, check_disk_space, claim
 from vvgt_cli.gaussians import read_ply
 
 ROOT = Path(__file__).parent.parent
@@ -142,19 +142,3 @@ def test_a_full_disk_while_writing_is_in_the_systems_words(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_temporary_folder_lies_beside_its_target_and_goes_without_unwinding_too(tmp_path):
-    with temporary_folder(tmp_path / "out.html") as folder:
-        (folder / "part.ply").write_bytes(b"part")
-        assert folder.parent == tmp_path
-        assert folder.name.startswith(".out.html.")
-    assert not list(tmp_path.iterdir())
-    with pytest.raises(ZeroDivisionError), temporary_folder(tmp_path / "out.html") as folder:
-        (folder / "part.ply").write_bytes(bytes([1 // 0]))
-    assert not list(tmp_path.iterdir())
-    held = temporary_folder(tmp_path / "out.html")
-    (held.__enter__() / "part.ply").write_bytes(b"part")
-    discard_leftovers()  # as a process does that a signal ends within a kernel
-    assert not list(tmp_path.iterdir())
-    held.__exit__(None, None, None)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.splat_twin import basis_slopes, view_slopes
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.conversion.resume import Checkpoint
@@ -18,12 +19,10 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, describe, in_un
 from vvgt_cli.gaussians.frames import UP_NAMES, rescale, transform, turn, up_matrix
 from vvgt_cli.gaussians.harmonics import (
     basis,
-    basis_slopes,
     directions,
     mixing,
     turned,
     view_colors,
-    view_slopes,
 )
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.network.damp import interpolate

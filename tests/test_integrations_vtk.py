@@ -150,10 +150,12 @@ def test_an_uneven_scale_is_named():
 
 
 def test_hidden_voxels_are_those_that_planes_cut_off():
-    _, volume = shown(image())
+    data = image()
+    data.SetDirectionMatrix(1, 0, 0, 0, 1, 0, 0, 0, 1)
+    _, volume = shown(data)
     volume.SetPosition(5, 0, 0)
     mapper = volume.GetMapper()
-    centre = np.array(image().GetPoint(100))
+    centre = np.array(data.GetPoint(100))
     plane = vtkPlane()
     plane.SetOrigin(*(centre + np.array([5, 0, 0])))
     plane.SetNormal(1, 2, -1)
@@ -165,10 +167,16 @@ def test_hidden_voxels_are_those_that_planes_cut_off():
     assert mask is not None
     assert 0 < mask.sum() < mask.size
     for k, kept in enumerate(mask.ravel()):
-        place = np.array(image().GetPoint(k))
+        place = np.array(data.GetPoint(k))
         amid = np.abs(place - centre) <= 1
         fence = 1 << int(((place >= centre - 1).astype(int) + (place > centre + 1)) @ (1, 3, 9))
         assert kept == (bool(fence & mapper.GetCroppingRegionFlags()) and (place - centre) @ (1, 2, -1) >= 0), amid
+    data.SetDirectionMatrix(0, -1, 0, 1, 0, 0, 0, 0, 1)
+    found = drawn(volume)
+    assert found.notes == ["cropping regions of an oblique image (VTK places them along its axes)"]
+    assert found.mask is not None  # the clipping plane's
+    for k, kept in enumerate(found.mask.ravel()):
+        assert kept == ((np.array(data.GetPoint(k)) - centre) @ (1, 2, -1) >= 0)
 
 
 def test_camera_and_lights():
@@ -176,9 +184,12 @@ def test_camera_and_lights():
     camera = renderer.GetActiveCamera()
     camera.SetPosition(1, 2, 3)
     camera.SetFocalPoint(0, 0, 1)
-    camera.SetViewUp(0, -1, 0.2)
+    camera.SetViewUp(-0.1, -1.2, -0.2)  # upright: -y, and a tenth of the line of sight
     camera.SetViewAngle(25)
     assert camera_of(renderer) == ("1.0,2.0,3.0,0.0,0.0,1.0,25.0", "-y", [])
+    camera.Roll(20)
+    assert camera_of(renderer)[2] in (["roll of the camera, 20 degrees"], ["roll of the camera, -20 degrees"])
+    camera.Roll(-20)
     camera.SetParallelProjection(True)
     camera.SetParallelScale(np.tan(np.radians(12.5)) * 6)
     text, _, notes = camera_of(renderer)

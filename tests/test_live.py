@@ -12,6 +12,7 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
+from tests.live_stream import from_bytes
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.gaussian_samples import (
@@ -26,7 +27,7 @@ from vvgt_cli.closed_form.gaussian_samples import (
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats.live import BYTES, from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.formats.live import BYTES, live_bytes, live_json
 from vvgt_cli.gaussians.frames import rotations, transform, turn
 from vvgt_cli.gaussians.live import (
     AMOUNT,

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
+from tests.live_stream import from_bytes
 from tests.test_live import SMALL, cloud
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import assign_labels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.live import SHARP, Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LiveFacts

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
+from tests.live_stream import from_bytes
 from tests.test_live_labels import LABELS
 from tests.test_live_layers import TF, layered, several
 from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.formats.live import BYTES, ROW, from_bytes
+from vvgt_cli.gaussians.formats.live import BYTES, ROW
 from vvgt_cli.gaussians.formats.page_live import shared_facts, with_shared_labels
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID
 

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from network_models import scene
 
+from tests.splat_twin import render_backward_reference
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.prepare import pack, unpack
 from vvgt_cli.network.slopes import STEP, own_axes_gradients, slope_rows
-from vvgt_cli.splat import render, render_backward_reference, render_reference
+from vvgt_cli.splat import render, render_reference
 from vvgt_cli.splat.half import halved
-from vvgt_cli.splat.reference import rotations
 
 
 def stepped(g, step):

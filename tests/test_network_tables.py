@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from tests.random_clouds import extreme_cloud, random_cloud
 from vvgt_cli.cameras import default_views, farthest_cameras
+from vvgt_cli.cameras.quaternions import quaternion
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import NAMED, GeometryConfig, ImageConfig, NetworkConfig
 from vvgt_cli.network import tables as tb
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
-from vvgt_cli.network.prepare import filter_matrix, pack, prepare, quaternion, resize, unpack, view_arrays
+from vvgt_cli.network.prepare import filter_matrix, pack, prepare, resize, unpack, view_arrays
 
 SMALL = NAMED["small"]
 

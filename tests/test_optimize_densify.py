@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.splat_twin import image_gradients
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
@@ -13,7 +14,6 @@ from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.refine.densify import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
 from vvgt_cli.refine.loop import step
 from vvgt_cli.splat import project, render
-from vvgt_cli.splat.reference import image_gradients
 from vvgt_cli.splat.render import moments, screen_slopes
 
 EXTENT = 3.3

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.live_stream import from_bytes
 from tests.test_live import COLORS, GRAIN, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
-from vvgt_cli.gaussians.formats.live import BYTES, ROW, from_bytes
+from vvgt_cli.gaussians.formats.live import BYTES, ROW
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_live import nodes_of, planes_of
 from vvgt_cli.gaussians.formats.splats import morton_order

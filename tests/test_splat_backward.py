@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from tests.random_clouds import extreme_cloud, random_cloud
+from tests.splat_twin import image_gradients, render_backward_reference, space_gradients
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MAX_ALPHA
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.rules import INRIA, RULES
-from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
-from vvgt_cli.splat.reference import covariances, image_gradients, layers, rotations, space_gradients
+from vvgt_cli.splat import project, render, render_backward, render_reference
+from vvgt_cli.splat.reference import covariances, layers
 from vvgt_cli.splat.render import moments, own_axes_backward, project_factors
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from tests.random_clouds import random_cloud
+from tests.splat_twin import render_backward_reference, view_slopes
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
+from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.harmonics import view_colors
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
-from vvgt_cli.splat.reference import layers, rotations
+from vvgt_cli.splat import project, render, render_backward, render_reference
+from vvgt_cli.splat.reference import layers
 from vvgt_cli.splat.render import moments, own_axes_backward, project_factors, seen_colors, seen_slopes
 
 EYE = (2.0, -1.7, 1.1)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from tests.random_clouds import extreme_cloud, random_cloud
+from tests.splat_twin import gather_reference
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.rules import INRIA, RULES
-from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
+from vvgt_cli.splat import blend, gather, project, render, render_reference
 from vvgt_cli.splat.render import depth_order
 
 EYE = (2.0, -1.7, 1.1)

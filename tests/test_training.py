@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from network_models import TINY, as_rows, scene
 
+from tests.splat_twin import render_backward_reference
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError, UsageError
@@ -27,7 +28,7 @@ from vvgt_cli.network.training import LossConfig, SceneConfig, TrainConfig
 from vvgt_cli.network.training import scenes as training_scenes
 from vvgt_cli.network.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.progress import Console
-from vvgt_cli.splat import project, render, render_backward_reference, render_reference
+from vvgt_cli.splat import project, render, render_reference
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
+    from vvgt_cli.integrations.pyvista import export_plotter
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, recolor, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
@@ -36,6 +37,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
+    "integrations.pyvista": ("export_plotter",),
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "recolor", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
@@ -68,6 +70,7 @@ __all__ = [
     "convert",
     "default_views",
     "evaluate",
+    "export_plotter",
     "optimize",
     "orbit_views",
     "read_ply",

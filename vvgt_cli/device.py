@@ -13,7 +13,6 @@ from vvgt_cli.errors import DataError, UsageError
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-DEVICES = ("cpu", "cuda", "auto")
 PACKAGES = {"numba_cuda": "numba-cuda", "torch": "torch", "gsplat": "gsplat"}  # modules, and what installs them
 FREE = 0.5  # of a GPU's memory, below which "auto" leaves it to others
 
@@ -50,7 +49,7 @@ def first_gpu() -> Gpu | None:
 
 
 def chosen(device: str) -> str:
-    """Return "cpu" or "cuda" for one of `DEVICES`; "auto" is a GPU that is there and has at least half its memory free.
+    """Return "cpu" or "cuda": "auto" is a GPU that is there and has at least half its memory free, else the CPU.
 
     Raises:
         UsageError: "cuda" without the packages that it needs.

@@ -220,28 +220,8 @@ def _lock(lock: Path, target: Path) -> IO[bytes] | None:
         held.close()  # the run that held it has ended and removed the file
 
 
-@contextmanager
-def temporary_folder(target: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a hidden folder beside ``target`` for its pieces, and remove it after the block.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-    place = Path(target)
-    folder = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
-    _leftovers.add(folder)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        _leftovers.discard(folder)
-
-
 def discard_leftovers() -> None:
-    """Remove temporary files, folders and locks of this process, for exits that do not unwind the stack."""
+    """Remove temporary files and locks of this process, for exits that do not unwind the stack."""
     for path in list(_leftovers):
         with suppress(OSError):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)

@@ -6,12 +6,12 @@ COLMAP has the same conventions as vvgt: world-to-camera poses, OpenCV axes, the
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Sequence
 
 import numpy as np
 
+from vvgt_cli.cameras.quaternions import quaternion
 from vvgt_cli.cameras.types import Camera
 
 PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy
@@ -62,25 +62,6 @@ def point_cloud_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
     properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
     return "\n".join(header).encode() + table.tobytes()
-
-
-def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
-
-    It is the eigenvector of a symmetric matrix, well conditioned for every angle (Bar-Itzhack 2000).
-    """
-    r = np.asarray(rotation, dtype=np.float64)
-    k = np.array(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0, r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2]],
-            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2]],
-            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
-        ]
-    )
-    w, x, y, z = np.linalg.eigh(k, UPLO="U")[1][:, -1]
-    sign = math.copysign(1.0, w)
-    return float(sign * w), float(sign * x), float(sign * y), float(sign * z)
 
 
 def _bytes(colors: np.ndarray) -> np.ndarray:

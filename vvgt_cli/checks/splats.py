@@ -62,7 +62,11 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
         size: pixels of the screen.
     """
     sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
-    length, alpha, largest = edge or _extent(gaussians, sigma), opacity(gaussians), sigma.max(axis=1)
+    length = edge or 0.0
+    if not edge:
+        low, high = np.percentile(gaussians.means.astype(np.float64), (1, 99), axis=0)
+        length = float((high - low).max() + 6 * np.median(sigma))
+    alpha, largest = opacity(gaussians), sigma.max(axis=1)
 
     def share(of: np.ndarray) -> float:
         return float(np.average(of, weights=np.maximum(alpha, 1e-12)))
@@ -81,11 +85,6 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
     yield Case("values", f"sigma below a quarter of a pixel at {size} px", tiny)
     yield Case("values", "too faint for viewers to draw", faint)
     yield Case("values", "colours outside -0.5 to 1.5", gaudy)
-
-
-def _extent(gaussians: Gaussians, sigma: np.ndarray) -> float:
-    low, high = np.percentile(gaussians.means.astype(np.float64), (1, 99), axis=0)
-    return float((high - low).max() + 6 * np.median(sigma))
 
 
 def place_cases(

@@ -69,11 +69,6 @@ block_options = group("blocks", **_options)
 shared_block_options = group("blocks", **_options, **_shard_option)
 
 
-def any_given(blocks: dict[str, Any]) -> bool:
-    """Return whether any of the options is given."""
-    return any(value is not None for value in blocks.values())
-
-
 def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
     """Return the options of blocks, None to let the program choose.
 
@@ -82,7 +77,7 @@ def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
     """
     from vvgt_cli.field.settings import BlockOptions
 
-    if not any_given(blocks):
+    if all(value is None for value in blocks.values()):
         return None
     size = blocks.pop("block_size")
     return BlockOptions(**{**blocks, "size": None if size == "auto" else size})

@@ -56,7 +56,6 @@ def solve_colors(
     progress: Progress | None = None,
     twice_every: int = 0,
     rule: Rule = INRIA,
-    degree: int | None = None,
 ) -> Gaussians:
     """Solve for least-squares colours by preconditioned conjugate gradients: images are linear in them.
 
@@ -64,9 +63,8 @@ def solve_colors(
     premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
     back-projection of the residual. Rounds end early where one lowers the squared error by less than `ENOUGH`. Every
     ``twice_every``-th view (0: none) counts as seen at twice its size; ``rule`` is that of the views. Colours and
-    harmonics of ``degree`` (None: the Gaussians' own) are solved together: see `vvgt_cli.closed_form.view_fit`.
+    harmonics are solved together: see `vvgt_cli.closed_form.view_fit`.
     """
-    gaussians = gaussians if degree is None else gaussians.of_degree(degree)
     projections = [
         project(gaussians, camera, rule.at(0.5) if twice_every and i % twice_every == twice_every - 1 else rule)
         for i, camera in enumerate(cameras)

@@ -232,7 +232,7 @@ def base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
     """Colour Gaussians by the means ``out`` (K, 16 + lights) of `Shading.sums`."""
     colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
-    normals = symmetric(out[:, NORMALS])
+    normals = out[:, NORMALS][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)  # of xx, xy, xz, yy, yz, zz
     white = np.ones((1, 3))
     if light.head:
         for tint, factor, power in ((out[:, TINT], light.diffuse, 1.0), (white, light.specular, light.power)):
@@ -245,11 +245,6 @@ def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) ->
         colors += light.specular * mean[:, None]
         terms += light.specular * all_terms[:, :, None]
     return replace(gaussians, colors=np.clip(colors, 0, BRIGHTEST), harmonics=terms if degree else None)
-
-
-def symmetric(columns: np.ndarray) -> np.ndarray:
-    """Return symmetric matrices (n, 3, 3) of xx, xy, xz, yy, yz, zz (n, 6)."""
-    return columns[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:

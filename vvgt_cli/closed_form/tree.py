@@ -289,7 +289,9 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
         through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
         keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
-        rows = with_visible(moments[keep], through[keep, 0])
+        own, mean = moments[keep], through[keep, 0, None]
+        square = (own[:, COLOR] ** 2).sum(axis=1, keepdims=True) / np.maximum(own[:, [MASS]], np.finfo(np.float64).tiny)
+        rows = np.concatenate([own, own[:, [MASS, RED, GREEN, BLUE]] * mean, square * mean], axis=1)
         parents.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
@@ -299,11 +301,3 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
     together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
     order = np.argsort(parent, kind="stable")
     return parent[order], together.take(order)
-
-
-def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Return (n, 18): moments (n, 13) by mean transmittance (n,), with the seen mass, colour and its square."""
-    square = (moments[:, COLOR] ** 2).sum(axis=1) / np.maximum(moments[:, MASS], np.finfo(np.float64).tiny)
-    return np.concatenate(
-        [moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None], (square * mean)[:, None]], axis=1
-    )

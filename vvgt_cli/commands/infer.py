@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from vvgt_cli.cameras import Camera
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians, write_gaussians
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.outputs import Output, claimed, write_text
 from vvgt_cli.jit.ahead import INFER
 from vvgt_cli.progress import Console
+from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import ConversionReport, Run
 
 SHIPPED = "vvgt-small"  # the model that comes with the program
@@ -89,7 +87,7 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
         better = model.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
         stage.note = f"reads {len(read)} views"
     with run.stage("judge") as stage:
-        before, after = (_psnr(g, cameras, images, judges) for g in (gaussians, better))
+        before, after = map(Views(cameras, images).take(judges).psnr, (gaussians, better))
         stage.psnr, stage.kept = after, after > before
         own = "" if set(judges) - set(read) else ", all read by the network"
         stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
@@ -107,10 +105,3 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
     if request.report:
         write_text(request.report, report.to_json(), request.overwrite)
     return report
-
-
-def _psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, judges: Sequence[int]) -> float:
-    from vvgt_cli.images.metrics import score_views
-    from vvgt_cli.splat import render
-
-    return score_views(images[list(judges)], [render(gaussians, cameras[i]) for i in judges], perceptual=False).psnr

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
-
-if TYPE_CHECKING:
-    pass
 
 Draw = Callable[[Camera], np.ndarray]
 NO_POINTS = np.zeros((0, 3))
@@ -315,7 +312,9 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
 
 
 def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
-    _remove_leftovers(job, request.layout)
+    for path in (job.folder / name for view in job.pending for name in request.layout.files(view)):
+        for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):  # by a killed run
+            left.unlink(missing_ok=True)
     with run.stage("views") as stage:
         bar = run.console.bar("views")
         with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
@@ -338,13 +337,6 @@ def _keep(job: _Job, layout: Layout, view: View, image: np.ndarray) -> list[str]
     if layout.exact:
         job.small[view.stem] = thumbnail(image, view.camera)
     return layout.write(job.folder, view, image)
-
-
-def _remove_leftovers(job: _Job, layout: Layout) -> None:
-    """Remove temporary files of this shard's views that a killed run left."""
-    for path in (job.folder / name for view in job.pending for name in layout.files(view)):
-        for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):
-            left.unlink(missing_ok=True)
 
 
 def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:

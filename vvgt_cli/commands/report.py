@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.peers import Peer
@@ -21,6 +18,7 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.images import png_bytes
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
@@ -82,14 +80,14 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     total = len(plan_runs(request.options))
     for run, images in do_runs(request.source, request.options, reference, console):
         runs.append(run)
-        ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
+        ours.append(list(map(png_bytes, pictures(images, PICTURED, request.picture_size))))
         score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
     found: dict[str, Any] = json.loads(text)
     series = [Series(source.volume.name, runs, found)]
-    shown = _pngs(pictures(reference.shown, PICTURED, request.picture_size))
+    shown = list(map(png_bytes, pictures(reference.shown, PICTURED, request.picture_size)))
     folder.mkdir(exist_ok=True)
     write_text(str(folder / DATA), text, request.overwrite)
     title = f"Error against run time: {source.volume.name}"
@@ -177,19 +175,6 @@ def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence
     if folder.is_dir():
         check_outputs([Output("-o", str(folder / name)) for name in names], list(inputs), overwrite)
     return folder
-
-
-def _pngs(images: Sequence[np.ndarray]) -> list[bytes]:
-    """Return RGB images as 8-bit PNG files, bytes each."""
-    from vvgt_cli.images import write_png
-
-    found = []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "view.png"
-        for image in images:
-            write_png(path, image, overwrite=True)
-            found.append(path.read_bytes())
-    return found
 
 
 def _write(folder: Path, series: list[Series], title: str, shown: Pictures | None, overwrite: bool) -> None:

@@ -225,7 +225,10 @@ def do_runs(
     from vvgt_cli.splat import render
 
     with tempfile.TemporaryDirectory() as folder:
-        views = peer_views(source, options, Path(folder)) if options.peers else None
+        views = None
+        if options.peers:  # as many as our longest run has, at the screen's size
+            count = view_count(max(options.steps, default=0), small=False)
+            views = PeerViews.render(source, Path(folder) / "views", count, options.size, options.blocks)
         for planned in plan_runs(options):
             report, gaussians = _run(source, planned, reference.axes, options.blocks, views)
             if report.refinement and report.refinement["reason"] == "interrupted":
@@ -237,12 +240,6 @@ def do_runs(
             run = {"name": planned.name, "label": planned.label, "kind": planned.kind, "views": count}
             run |= asdict(report)
             yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
-
-
-def peer_views(source: SourceRequest, options: RunOptions, folder: Path) -> PeerViews:
-    """Render the views for other trainers: as many as our longest run has, at the screen's size."""
-    count = view_count(max(options.steps, default=0), small=False)
-    return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
 def warm_up(source: SourceRequest, options: RunOptions) -> None:

@@ -30,14 +30,12 @@ def streamed_resources(file: str) -> dict[str, Resource]:
             path = (folder / name).with_name(f"{image}.webp")
             resources[f"{name.removesuffix(META)}{path.name}"] = Resource("image/webp", partial(path.read_bytes))
     splats, scale = placed(manifest)
+    view = camera(splats)
+    view |= {key: [scale * x for x in view[key]] for key in ("position", "target")}
     more: dict[str, Any] = {
-        "streamed": True, "camera": _larger(camera(splats), scale), "outermost": [], "comments": splats.comments,
+        "streamed": True, "camera": view, "outermost": [], "comments": splats.comments,
         "enlarged": scale,
     }  # fmt: skip
     name = Path(file).absolute().parent.name
     text = page(name, splats, [{"name": name, "file": MANIFEST}], SCRIPT, more)
     return resources | {"": Resource(HTML, lambda: text.encode("utf-8"))}
-
-
-def _larger(view: dict[str, Any], scale: float) -> dict[str, Any]:
-    return {**view, **{key: [scale * x for x in view[key]] for key in ("position", "target")}}

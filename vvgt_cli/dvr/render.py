@@ -99,13 +99,6 @@ def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.nd
     return eye, basis, lens
 
 
-def tile_order(height: int, width: int, blocks: Blocks | None = None) -> np.ndarray:
-    """Return the numbers of a picture's tiles, or of its ``blocks``, in the order in which they are begun."""
-    from vvgt_cli.dvr.kernel import TILE
-
-    return np.arange(-(-height // TILE) * -(-width // TILE)) if blocks is None else blocks.numbers
-
-
 class Rays(NamedTuple):
     """Rays to cast: at ``offsets`` (m, 2) of every pixel in ``mask`` (h, w), averaged with ``known`` ones before."""
 
@@ -174,13 +167,16 @@ def render_view(
     scene: Scene | Viewed, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
 ) -> np.ndarray:
     """Render one view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
+    from vvgt_cli.dvr.kernel import TILE
+
     settings = settings or RenderSettings()
     if not isinstance(scene, Scene):
         return scene.view(camera, settings, blocks)
     draw = scene.rays or host_rays(scene)
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
-    order = tile_order(camera.height, camera.width, blocks)
+    tiles = math.prod(-(-edge // TILE) for edge in out.shape[:2])
+    order = np.arange(tiles) if blocks is None else blocks.numbers
     for rays in tiers(for_thin(settings, scene, camera), out, blocks):
         for offsets, mask, known in rays:
             draw(eye, basis, lens, float(settings.step), order, offsets, mask, known, out)

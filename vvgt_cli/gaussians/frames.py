@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vvgt_cli.cameras.quaternions import quaternions as quaternions_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.harmonics import turned
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT
@@ -98,7 +99,7 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
     quaternions = gaussians.quaternions.astype(np.float64)
     log_scales = gaussians.log_scales.astype(np.float64)
     if np.abs(matrix.T @ matrix - _IDENTITY).max() <= _RIGID:
-        turn_by = _quaternions(matrix[None] * np.sign(np.linalg.det(matrix)))[0]
+        turn_by = quaternions_of(matrix[None] * np.sign(np.linalg.det(matrix)))[0]
         quaternions = _quaternion_product(tuple(turn_by.tolist()), quaternions)
     else:
         largest = log_scales.max(axis=1, keepdims=True)
@@ -130,12 +131,13 @@ def _normals_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | No
 def factored(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions (K, 4) and log scales (K, 3) of covariances ``M M^T``, M (K, 3, 3)."""
     axes, sigma, _ = np.linalg.svd(factors)
-    quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
+    quaternions = quaternions_of(axes * np.sign(np.linalg.det(axes))[:, None, None])
     return quaternions, np.log(np.maximum(sigma, np.finfo(np.float64).tiny))
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
+    """Return the rotation matrices (K, 3, 3) float64 of quaternions (K, 4) of any norm > 0, (w, x, y, z)."""
+    quaternions = np.asarray(quaternions, np.float64)
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -143,15 +145,3 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (K, 4), (w, x, y, z), of matrices (K, 3, 3), by eigenvectors (Bar-Itzhack 2000)."""
-    r = np.moveaxis(rotations, 0, -1)
-    table = np.zeros((4, 4, len(rotations)))
-    table[0, 0] = r[0, 0] + r[1, 1] + r[2, 2]
-    for a, (b, c) in enumerate(((1, 2), (2, 0), (0, 1))):
-        table[a + 1, a + 1] = r[a, a] - r[b, b] - r[c, c]
-        table[0, a + 1] = table[a + 1, 0] = r[c, b] - r[b, c]
-        table[b + 1, c + 1] = table[c + 1, b + 1] = r[b, c] + r[c, b]
-    return np.linalg.eigh(np.moveaxis(table, -1, 0))[1][:, :, -1]

@@ -82,16 +82,6 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     return found
 
 
-def basis_slopes(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Return the derivatives (K, M, 3) of the polynomials of `basis` by the direction (K, 3).
-
-    Only the component perpendicular to the direction is meaningful, as directions have unit length.
-    """
-    d = np.asarray(directions, np.float64)
-    rows = [np.stack(np.broadcast_arrays(*row, d[:, 0])[:3], -1) for row in term_slopes(*d.T)[: HARMONICS[degree]]]
-    return np.stack(rows, axis=1) if rows else np.zeros((len(d), 0, 3))
-
-
 def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
     """Return the colours (K, 3) float64 as seen from ``eye`` (3,), before negative values are clamped to 0."""
     colors: np.ndarray = gaussians.colors.astype(np.float64)
@@ -99,18 +89,6 @@ def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
         toward, _ = directions(gaussians.means, eye)
         colors += np.einsum("km,kmc->kc", basis(toward, gaussians.degree), gaussians.harmonics.astype(np.float64))
     return colors
-
-
-def view_slopes(gaussians: Gaussians, eye: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients with respect to harmonics (K, M, 3) and means (K, 3), given those for `view_colors`, (K, 3)."""
-    if gaussians.harmonics is None:
-        return np.zeros((len(gaussians), 0, 3)), np.zeros((len(gaussians), 3))
-    toward, distance = directions(gaussians.means, eye)
-    by_term = np.einsum("kmc,kc->km", gaussians.harmonics.astype(np.float64), slopes)
-    bent = np.einsum("km,kmi->ki", by_term, basis_slopes(toward, gaussians.degree))
-    across = bent - (bent * toward).sum(axis=1, keepdims=True) * toward
-    means = across / np.where(distance > 0, distance, math.inf)[:, None]
-    return basis(toward, gaussians.degree)[:, :, None] * slopes[:, None, :], means
 
 
 def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""The ``vvgt`` command, for programs whose Python cannot import it; imports the standard library alone."""
+"""The ``vvgt`` command, for programs whose Python cannot import it; needs no package, but VTK for messages."""
 
 from __future__ import annotations
 
@@ -48,3 +48,11 @@ def run(arguments: Sequence[str], say: Callable[[str], object] = print) -> None:
                 say(last)
     if process.returncode:
         raise RuntimeError(last.removeprefix(ERROR) or f"vvgt ended with status {process.returncode}")
+
+
+def tell(text: str, failed: bool = False) -> None:
+    """Show a line among the messages of a program on VTK."""
+    from vtkmodules.vtkCommonCore import vtkOutputWindow
+
+    window = vtkOutputWindow.GetInstance()
+    (window.DisplayErrorText if failed else window.DisplayWarningText)(f"Gaussian splats: {text}\n")

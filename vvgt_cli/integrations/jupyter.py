@@ -68,13 +68,13 @@ class SplatWidget(anywidget.AnyWidget):
 
     _esm = SCRIPT
     page = traitlets.Unicode().tag(sync=True)
-    camera = traitlets.Any(None, allow_none=True).tag(sync=True)
-    cut = traitlets.Dict(None, allow_none=True).tag(sync=True)
-    light = traitlets.Dict(None, allow_none=True).tag(sync=True)
-    function = traitlets.Dict(None, allow_none=True).tag(sync=True)
-    labels: Any = traitlets.List(None, allow_none=True).tag(sync=True)
+    camera = traitlets.Any(None).tag(sync=True)
+    cut = traitlets.Any(None).tag(sync=True)
+    light = traitlets.Any(None).tag(sync=True)
+    function = traitlets.Any(None).tag(sync=True)
+    labels = traitlets.Any(None).tag(sync=True)
     layer = traitlets.Int(0).tag(sync=True)
-    picked = traitlets.Dict(None, allow_none=True).tag(sync=True)
+    picked = traitlets.Any(None).tag(sync=True)
     error = traitlets.Unicode("").tag(sync=True)
     loaded = traitlets.Bool(False).tag(sync=True)
 

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from napari.layers import Layer
 
-import vvgt_cli
 from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.library.inputs import source_of
+from vvgt_cli.errors import UsageError
+from vvgt_cli.library.functions import convert, read_volume
+from vvgt_cli.library.inputs import Look, source_of
 
 NODES = 33  # of a colour map, which napari interpolates between 256 colours
 
@@ -34,7 +35,7 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     """
     shown = [layer for layer in (Layer.create(*one) for one in layers) if layer.visible]
     if not shown:
-        raise vvgt_cli.UsageError("no visible layer; show one of those that are saved")
+        raise UsageError("no visible layer; show one of those that are saved")
     steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
     found = [_converted(shown, step) for step in range(steps)]
     if steps == 1:
@@ -53,14 +54,14 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
 def _converted(layers: Sequence[Any], step: int) -> Any:
     """Convert a time step: the first layer with the others laid over it."""
     first, *others = [(_volume(layer, step), _look(layer)) for layer in layers]
-    return vvgt_cli.convert(first[0], replace(first[1], layers=[source_of(*other, {}) for other in others]))
+    return convert(first[0], replace(first[1], layers=[source_of(*other, {}) for other in others]))
 
 
 def _values(layer: Any) -> Any:
     values = layer.data[0] if layer.multiscale else layer.data
     if values.ndim not in (3, 4) or getattr(layer, "rgb", False):
         what = "an RGB image" if getattr(layer, "rgb", False) else f"{values.ndim} axes"
-        raise vvgt_cli.UsageError(f"{layer.name}: {what}; expected z, y, x, or time before them (split RGB into channels)")
+        raise UsageError(f"{layer.name}: {what}; expected z, y, x, or time before them (split RGB into channels)")
     return values
 
 
@@ -76,10 +77,10 @@ def _volume(layer: Any, step: int) -> Any:
     affine[:3, :3] = (np.array([(p - place[0])[lead:] * lengths for p in place[1:]])[::-1, ::-1]).T
     unit = f"{units[-1]:~}".replace("µ", "u").replace("px", "").replace("pixel", "")
     data = values[min(step, len(values) - 1)] if lead else values
-    return replace(vvgt_cli.read_volume(data, affine=affine), unit=unit, name=layer.name)
+    return replace(read_volume(data, affine=affine), unit=unit, name=layer.name)
 
 
-def _look(layer: Any) -> vvgt_cli.Look:
+def _look(layer: Any) -> Look:
     """Return the colours and opacity of a layer."""
     if type(layer).__name__ == "Labels":
         names = (
@@ -94,7 +95,7 @@ def _look(layer: Any) -> vvgt_cli.Look:
                     "color": color[:3].tolist(),
                     "opacity": float(color[3] * layer.opacity),
                 }
-        return vvgt_cli.Look(labels=table)
+        return Look(labels=table)
     low, high = layer.contrast_limits
     share = np.linspace(0, 1, NODES)
     level = share**layer.gamma
@@ -103,4 +104,4 @@ def _look(layer: Any) -> vvgt_cli.Look:
         {"x": low + t * (high - low), "rgb": color[:3].tolist(), "opacity": float(s * color[3] * layer.opacity)}
         for t, s, color in zip(share, level, colors, strict=True)
     ]
-    return vvgt_cli.Look({"name": layer.name, "points": points})
+    return Look({"name": layer.name, "points": points})

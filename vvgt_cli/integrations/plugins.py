@@ -8,6 +8,9 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 PLUGINS = {  # file of each, in this folder; its docstring has the lines "Tried:" and "Enable:"
+    "pyvista": "pyvista.py",
+    "paraview": "paraview_plugin.py",
+    "catalyst": "catalyst.py",
     "slicer": "slicer/GaussianSplats.py",
     "napari": "napari.py",
     "jupyter": "jupyter.py",

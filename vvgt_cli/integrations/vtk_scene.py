@@ -60,7 +60,11 @@ def drawn(volume: Any, data: Any = None) -> Drawn:
         notes.append("scattering")
     mask, matrix = None, _numbers(volume.GetMatrix(), 4)
     if data.IsA("vtkImageData"):
-        mask = _mask(mapper, data, array, matrix)
+        crops = bool(getattr(mapper, "GetCropping", int)())
+        if crops and not data.GetDirectionMatrix().IsIdentity():
+            crops = False
+            notes.append("cropping regions of an oblique image (VTK places them along its axes)")
+        mask = _mask(mapper, crops, data, array, matrix)
     elif getattr(mapper, "GetCropping", bool)() or mapper.GetClippingPlanes() is not None:
         notes.append("cropping of a mesh")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
@@ -105,11 +109,11 @@ def placed(data: Any, matrix: Any) -> Any:
     return moved
 
 
-def _mask(mapper: Any, image: Any, array: str, matrix: np.ndarray) -> np.ndarray | None:
+def _mask(mapper: Any, crops: bool, image: Any, array: str, matrix: np.ndarray) -> np.ndarray | None:
     """Return which voxels cropping and clipping planes leave, None where there are none."""
     planes = mapper.GetClippingPlanes()
     count = planes.GetNumberOfItems() if planes is not None else 0
-    if not (count or mapper.GetCropping()):
+    if not (count or crops):
         return None
     points = image.GetPointData()
     inside = (points.GetArray(array) if array else points.GetScalars()) is None  # data of cells
@@ -124,7 +128,7 @@ def _mask(mapper: Any, image: Any, array: str, matrix: np.ndarray) -> np.ndarray
 
     affine = _affine(image)
     keep = np.ones(dims[::-1], bool)
-    if mapper.GetCropping():
+    if crops:
         bounds, flags, region = mapper.GetCroppingRegionPlanes(), mapper.GetCroppingRegionFlags(), 0
         for axis in range(3):
             at = height(affine, np.eye(3)[axis])

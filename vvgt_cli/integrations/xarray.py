@@ -11,7 +11,8 @@ from typing import Any
 
 import xarray
 
-import vvgt_cli
+from vvgt_cli.library.functions import convert, render_views
+from vvgt_cli.library.session import Session
 
 
 @xarray.register_dataarray_accessor("vvgt")  # type: ignore[no-untyped-call]
@@ -24,12 +25,12 @@ class Accessor:
 
     def convert(self, look: Any = None, goal: Any = None, **options: Any) -> Any:
         """Convert the array; see `vvgt_cli.convert`. A ``time`` axis needs ``time=N``."""
-        return vvgt_cli.convert(self._array, look, goal, **options)
+        return convert(self._array, look, goal, **options)
 
     def render_views(self, output: Any, **options: Any) -> Any:
         """Render calibrated views of the array; see `vvgt_cli.render_views`."""
-        return vvgt_cli.render_views(self._array, output, **options)
+        return render_views(self._array, output, **options)
 
-    def session(self, **reading: Any) -> vvgt_cli.Session:
+    def session(self, **reading: Any) -> Session:
         """Return a session, which reads the array once for several looks; see `vvgt_cli.Session`."""
-        return vvgt_cli.Session(self._array, **reading)
+        return Session(self._array, **reading)

@@ -107,11 +107,6 @@ def turned_by(quaternion: Tensor, vector: Tensor) -> Tensor:
     )
 
 
-def gaussian_head(config: GeometryConfig) -> GaussianHead | StepHead:
-    """Return the head that a configuration names."""
-    return StepHead(config) if config.head == "step" else GaussianHead(config)
-
-
 class PixelHead(nn.Module):
     """Gaussians per pixel of the finest map (the ablation "w/o 3DT", after AnySplat): one on each pixel's ray.
 

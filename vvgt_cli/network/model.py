@@ -11,7 +11,7 @@ from vvgt_cli.network.appearance import AppearanceTransformer, MultiScaleMaps
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.epipolar import EpipolarCrossAttention
 from vvgt_cli.network.geometry import GeometryTransformer, Tables
-from vvgt_cli.network.head import PixelHead, describe, gaussian_head
+from vvgt_cli.network.head import GaussianHead, PixelHead, StepHead, describe
 
 
 class ImageSide(nn.Module):
@@ -41,7 +41,7 @@ class GeometrySide(nn.Module):
             width = geometry.widths[geometry.epipolar_stage]
             vgf = EpipolarCrossAttention(width, image.map_width, len(image.taps), geometry.epipolar_width)
         self.transformer = GeometryTransformer(geometry, vgf)
-        self.head = gaussian_head(geometry)
+        self.head = StepHead(geometry) if geometry.head == "step" else GaussianHead(geometry)
 
     def forward(
         self,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.quaternions import quaternion
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
@@ -140,19 +141,6 @@ def view_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
         name: np.array(values, np.float32)
         for name, values in {"poses": poses, "matrices": matrices, "eyes": eyes}.items()
     }
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return (w, x, y, z), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack (2000), stable at any angle."""
-    m = rotation
-    k = np.array([
-        [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-        [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-        [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], 0],
-        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
-    ])  # fmt: skip
-    x, y, z, w = np.linalg.eigh(k)[1][:, -1]  # eigh reads the lower triangle
-    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
 
 
 def image_arrays(

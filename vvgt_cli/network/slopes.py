@@ -51,8 +51,8 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
     - log of the blending weight per view (pixels), log of the error below it, over that of the scene;
     - log of the scene's RMS error; log of a pixel's width at the origin, less that of a standard deviation.
     """
+    from vvgt_cli.gaussians.frames import rotations
     from vvgt_cli.splat import gather, project, render, render_backward
-    from vvgt_cli.splat.reference import rotations
 
     g, count = gaussians, len(gaussians)
     axes, scales = rotations(g.quaternions).astype(np.float32), np.exp(g.log_scales)

@@ -42,11 +42,6 @@ def block_curves(config: GeometryConfig) -> list[list[str]]:
     return curves
 
 
-def stages_of_blocks() -> list[int]:
-    """Return the stage of each of the nine groups of blocks."""
-    return [*range(STAGES), *reversed(range(STAGES - 1))]
-
-
 def quantise(means: np.ndarray) -> np.ndarray:
     """Return cells (n, 3) int64 of the finest grid: 2^16 per axis over the cube around the unit frame and all means."""
     bound = max(1.0, float(np.abs(means).max(initial=0)))
@@ -150,7 +145,8 @@ def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
     """
     stage = StagePoints(quantise(means), BITS, means, np.ones(len(means), np.int64))
     wanted: list[list[str]] = [[] for _ in range(STAGES)]
-    for number, curves in zip(stages_of_blocks(), block_curves(config), strict=True):
+    stages = [*range(STAGES), *reversed(range(STAGES - 1))]  # of the nine groups of blocks
+    for number, curves in zip(stages, block_curves(config), strict=True):
         wanted[number] += [curve for curve in curves if curve not in wanted[number]]
     tables: dict[str, np.ndarray] = {}
     for i in range(STAGES):

@@ -17,10 +17,10 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.refine.options import OptimizeOptions
 from vvgt_cli.refine.states import Fields
 from vvgt_cli.splat import Projection
-from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import moments, screen_slopes
 
 FIRST, LAST, EVERY, RESET = 500 / 30_000, 0.5, 100 / 30_000, 3_000 / 30_000  # shares of the run

@@ -62,7 +62,10 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
     factors *= np.where(pull < 0, np.float32(-1), np.float32(1))[:, None, :]
     far = np.minimum(np.abs(pull), FARTHEST).astype(np.float32)  # in lengths of the axis: flat ones have no bound
     known = np.concatenate([values[:, :7], beside[:, :7], far], axis=1)
-    return _standard(known)
+    spread = known.std(axis=0, dtype=np.float64)
+    found = (known - known.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
+    standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
+    return standard
 
 
 def sample_of(count: int) -> tuple[int, int]:
@@ -82,14 +85,6 @@ def sampled(numbers: np.ndarray) -> np.ndarray:
     runs = numbers[: len(numbers) - len(numbers) % RUN].reshape(-1, RUN, numbers.shape[1])
     some: np.ndarray = runs[::every].reshape(count, -1)
     return some
-
-
-def _standard(numbers: np.ndarray) -> np.ndarray:
-    """Scale to mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
-    spread = numbers.std(axis=0, dtype=np.float64)
-    found = (numbers - numbers.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
-    standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
-    return standard
 
 
 class SharedSteps:

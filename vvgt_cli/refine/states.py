@@ -9,12 +9,12 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import SH_C0, Gaussians
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
 from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, project
-from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
 MEMORY = 0.9  # share of the running error that a step keeps

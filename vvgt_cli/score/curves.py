@@ -168,7 +168,9 @@ def read_series(path: str) -> Series:
         if kind not in FORMATS:
             raise DataError(f"{path}: a {kind} document; expected one that 'vvgt report' or 'convert --report' wrote")
         runs = document["runs"] if kind == "vvgt-report" else [_named(document)]
-        series = Series(_title(path, document), runs, document)
+        own = Path(path)
+        title = own.resolve().parent.name if own.name == "report.json" else own.stem
+        series = Series(title, runs, document)
         for run in runs:
             _check(run)
         count = len(series.scored())
@@ -194,12 +196,6 @@ def _named(document: dict[str, Any]) -> Run:
     budget = options.get("max_gaussians") or document["gaussians"]
     name = f"{document['command']}, K {short(budget)}" + (f", {steps} steps" if steps else "")
     return document | {"name": name, "kind": "steps" if steps else "closed form"}
-
-
-def _title(path: str, document: dict[str, Any]) -> str:
-    """Return the name of a file, or of the folder of a report.json."""
-    own = Path(path)
-    return own.resolve().parent.name if own.name == "report.json" else own.stem
 
 
 def short(number: float) -> str:

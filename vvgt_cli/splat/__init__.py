@@ -1,6 +1,6 @@
 """EWA splatting, with gradients."""
 
-from vvgt_cli.splat.reference import gather_reference, render_backward_reference, render_reference
+from vvgt_cli.splat.reference import render_reference
 from vvgt_cli.splat.render import Gradients, Projection, blend, gather, project, render, render_backward
 
 __all__ = [
@@ -8,10 +8,8 @@ __all__ = [
     "Projection",
     "blend",
     "gather",
-    "gather_reference",
     "project",
     "render",
     "render_backward",
-    "render_backward_reference",
     "render_reference",
 ]

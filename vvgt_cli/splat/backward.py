@@ -2,7 +2,7 @@
 
 The first half works as `tiles` does, front to back and with the same early end: what lies behind a splat is the whole
 pixel less what has been blended, so nothing but the picture is kept from the forward pass. Equations: docs/optimize.md.
-Twin: `reference.render_backward_reference`.
+Twin: ``tests/splat_twin.py``.
 
 Arguments are those of `splat.kernel` and `splat.tiles`; ``pairs`` (pairs, 9) float32 holds `SUMS` of each (tile,
 Gaussian) pair, Gaussian by Gaussian; ``total`` is a Gaussian's sum of them, 9 float64.

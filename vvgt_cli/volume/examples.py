@@ -22,11 +22,6 @@ def register_example(name: str, make: Maker) -> None:
     _EXAMPLES[name] = make
 
 
-def example_names() -> list[str]:
-    """List the names of all examples."""
-    return sorted(_EXAMPLES)
-
-
 def open_example(text: str, options: ReadOptions) -> Volume:
     """Open ``NAME`` or ``NAME:rest``.
 
@@ -35,7 +30,7 @@ def open_example(text: str, options: ReadOptions) -> Volume:
     """
     name, _, rest = text.partition(":")
     if name not in _EXAMPLES:
-        raise UsageError(f"example:{name}: no such example; expected one of {', '.join(example_names())}")
+        raise UsageError(f"example:{name}: no such example; expected one of {', '.join(sorted(_EXAMPLES))}")
     if options.raw_flags:
         raise UsageError(f"example:{name}: an example has its own layout; leave out {' '.join(options.raw_flags)}")
     return _EXAMPLES[name](rest, options)

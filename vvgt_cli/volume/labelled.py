@@ -331,7 +331,8 @@ def _placed(
         for a, flip in zip(axes, flips, strict=True)
     ]
     try:
-        centres, unit = _one_unit(axes, source), _length(axes)
+        last = next((_unit(a) for a in reversed(axes) if a.size > 1), "")
+        centres, unit = _one_unit(axes, source), unit_name(metres(last))
     except UsageError:
         if options.spacing is None:
             raise
@@ -439,11 +440,6 @@ def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
         return [None if a.centres is None else a.centres * ((metres(_unit(a)) or base) / base) for a in axes]
     stated = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
     raise UsageError(f"{source}: axes {stated}; expected one unit of length: try --spacing X Y Z")
-
-
-def _length(axes: Sequence[Axis]) -> str:
-    """Return the name of the unit that `_one_unit` leads to, "" where it is not a length."""
-    return unit_name(metres(next((_unit(a) for a in reversed(axes) if a.size > 1), "")))
 
 
 def _unit(a: Axis) -> str:

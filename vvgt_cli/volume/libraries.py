@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
 
@@ -32,3 +35,11 @@ def library_errors(source: str, what: str) -> Iterator[None]:
     except Exception as error:  # libraries raise what they like on damaged files
         text = " ".join(str(error).split())[:300] or type(error).__name__
         raise DataError(f"{source}: cannot be read as {what} ({text}); check that it is whole") from error
+
+
+def read_part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
+    """Read a part of a dataset of HDF5 from a file that is open no longer than that."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][index])

@@ -32,11 +32,6 @@ class Statistics:
     histogram: np.ndarray
     edges: np.ndarray
 
-    @property
-    def finite_count(self) -> int:
-        """Voxels with a finite value."""
-        return int(self.histogram.sum())
-
 
 def slabs(volume: Volume, max_voxels: int = SLAB_VOXELS) -> Iterator[tuple[int, np.ndarray]]:
     """Walk a volume in z-slabs of at most ``max_voxels`` voxels (at least one slice).

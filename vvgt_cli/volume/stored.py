@@ -98,17 +98,17 @@ class Stored:
 
 def stored_or_held(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
-    stored: bool, instead: str = IN_BLOCKS,
+    stored: bool,
 ) -> Any:  # fmt: skip
     """Return a `Stored`, or its values in memory where ``stored`` is False; other arguments as `Stored`.
 
     Raises:
-        DataError: the values do not fit in memory; ``instead`` is what else may be done.
+        DataError: the values do not fit in memory.
     """
     found = Stored(read, dtype, tuple(shape), chunks, source)
     if stored:
         return found
-    check_memory(found.nbytes, source, instead)
+    check_memory(found.nbytes, source, IN_BLOCKS)
     return found[:]
 
 

@@ -46,7 +46,8 @@ def glb(splats: Splats, name: str) -> bytes:
     start = 0
     for array in arrays:
         views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _ARRAY})
-        accessors.append(_accessor(len(accessors), array))
+        view, kind = len(accessors), _TYPES[array.shape[1]]
+        accessors.append({"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": kind})
         start += array.nbytes
     accessors[0] |= {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
     attributes = {attribute: k for k, attribute in enumerate(columns)}
@@ -73,10 +74,6 @@ def glb(splats: Splats, name: str) -> bytes:
     length = 12 + 8 + len(head) + 8 + start
     front = struct.pack("<5I", _MAGIC, 2, length, len(head), _JSON) + head + struct.pack("<2I", start, _BINARY)
     return front + b"".join(array.tobytes() for array in arrays)
-
-
-def _accessor(view: int, array: np.ndarray) -> dict[str, Any]:
-    return {"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": _TYPES[array.shape[1]]}
 
 
 def _harmonic(m: int) -> str:

@@ -28,7 +28,7 @@ from vvgt_cli.volume.labelled import (
     described_by,
     labelled_volume,
 )
-from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -74,14 +74,6 @@ def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
         raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
     check_storage(h5py, file[name], path, f"{path}:/{name}")
     return file[name]
-
-
-def read_part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
-    """Read a part of a dataset from a file that is open no longer than that."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[name][index])
 
 
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:

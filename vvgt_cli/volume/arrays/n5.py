@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bz2
 import itertools
-import json
 import lzma
 import math
 import struct
@@ -23,7 +22,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.zarr import MAX_METADATA
+from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -76,11 +75,8 @@ class N5Array:
             return None
         mode, axes = struct.unpack_from(">HH", packed)
         sizes = struct.unpack_from(f">{axes}I", packed, 4) if axes == len(self.shape) else ()
-        if (
-            mode not in (0, 1)
-            or not sizes
-            or any(not 0 < n <= c for n, c in zip(sizes[::-1], self.blocks, strict=True))
-        ):
+        fits = all(0 < n <= c for n, c in zip(sizes[::-1], self.blocks, strict=bool(sizes)))
+        if mode not in (0, 1) or not sizes or not fits:
             raise DataError(f"{file}: a block of mode {mode} and {sizes} values; expected at most {self.blocks[::-1]}")
         need_bytes = math.prod(sizes) * self.dtype.itemsize
         found = unpack(self.compression, packed[4 + 4 * axes + 4 * (mode == 1) :], need_bytes, str(file))
@@ -144,15 +140,7 @@ def holds_n5(path: Path) -> bool:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    file = folder / METADATA
-    if not file.is_file():
-        return {}
-    if file.stat().st_size > MAX_METADATA:
-        raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
-    found = json.loads(file.read_text("utf-8"))
-    if not isinstance(found, dict):
-        raise DataError(f"{file}: expected a JSON object of metadata")
-    return found
+    return json_object(folder / METADATA) if (folder / METADATA).is_file() else {}
 
 
 def read_n5(path: Path, options: ReadOptions) -> Volume:
@@ -165,12 +153,8 @@ def read_n5(path: Path, options: ReadOptions) -> Volume:
     with library_errors(str(path), "N5"):
         place = _choose(path, options)
         array = _array(place)
-        stem = path.name.removesuffix(".n5") or path.name
-        inner = place.relative_to(path).as_posix()
-        name = stem if inner == "." else f"{stem}:{inner}"
-        return labelled_volume(
-            array.read, array.dtype.newbyteorder("="), _axes(array), {}, options, str(place), name, array.blocks
-        )
+        dtype, name = array.dtype.newbyteorder("="), name_in(path, place)
+        return labelled_volume(array.read, dtype, _axes(array), {}, options, str(place), name, array.blocks)
 
 
 def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
@@ -178,16 +162,9 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
     if not path.is_dir() or not holds_n5(path):
         return []
     try:
-        return [_array(place).shape for place in _levels(_inside(path, options.array))]
+        return [_array(place).shape for place in _levels(inside(path, options.array))]
     except (OSError, ValueError, TypeError, KeyError, DataError, UsageError):
         return []  # said where it is read
-
-
-def _inside(path: Path, wanted: str | None) -> Path:
-    here = path / (wanted or "").strip("/")
-    if not here.resolve().is_relative_to(path.resolve()):
-        raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
-    return here
 
 
 def _levels(group: Path) -> list[Path]:
@@ -202,7 +179,7 @@ def _levels(group: Path) -> list[Path]:
 
 def _choose(path: Path, options: ReadOptions) -> Path:
     """Return the folder of the array asked for, or of the only one; for a pyramid, that of the level."""
-    here = _inside(path, options.array)
+    here = inside(path, options.array)
     if "dimensions" in _metadata(here):
         if options.level is not None:
             raise UsageError(f"{path}: an array without levels; leave out --level {options.level}")
@@ -284,9 +261,7 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
     names = [str(a) for a in named] if named else ["x", "y", "z", *[""] * n][:n]
     units = [str(u or "") for u in _list(unit, spatial)] or [""] * spatial
     rest = n - spatial
-    shift = [
-        s * (f - 1) / 2 for s, f in zip(steps, factors, strict=True)
-    ]  # a mean of as many voxels lies in their middle
+    shift = [s * (f - 1) / 2 for s, f in zip(steps, factors, strict=True)]  # a mean of voxels lies in their middle
     scale = [s * f for s, f in zip(steps, factors, strict=True)]
     return names[::-1], ([*units, *[""] * rest])[::-1], ([*scale, *[1.0] * rest])[::-1], ([*shift, *[0.0] * rest])[::-1]
 

@@ -142,7 +142,10 @@ def check_header(path: Path) -> dict[str, Variable]:
         for _ in range(header.items(_VARIABLE)):
             name = _plain(header.name())
             found[name] = _variable(header, sizes, records)
-    return _with_steps(found)
+    rows = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
+    padded = sum(-(-n // 4) * 4 for n in rows)  # each to four bytes, where there are several
+    step = padded if len(rows) > 1 else sum(rows)
+    return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}
 
 
 def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Variable:
@@ -161,10 +164,3 @@ def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Va
         raise header.bad(f"declares {records} records of {need} bytes")
     shape = tuple(sizes[k][1] or max(records, 0) for k in along)
     return Variable(tuple(sizes[k][0] for k in along), shape, kind, begin, endless, attributes)
-
-
-def _with_steps(found: dict[str, Variable]) -> dict[str, Variable]:
-    """Add to variables the bytes between their records, each padded to four where there are several."""
-    sizes = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
-    step = sizes[0] if len(sizes) == 1 else sum(-(-n // 4) * 4 for n in sizes)
-    return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}

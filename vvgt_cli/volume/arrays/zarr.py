@@ -57,7 +57,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
             attributes,
             options,
             str(place),
-            _name(path, place),
+            name_in(path, place),
             array.chunks,
         )
 
@@ -74,10 +74,38 @@ def _array(zarr: Any, place: Path) -> Any:
     return array
 
 
-def _name(path: Path, place: Path) -> str:
-    stem = path.name.removesuffix(".zip").removesuffix(".ozx").removesuffix(".zarr").removesuffix(".ome") or path.name
+def name_in(path: Path, place: Path) -> str:
+    """Return the name of a volume at a place in a store."""
+    stem = path.name.removesuffix(".zip").removesuffix(".ozx")
+    stem = stem.removesuffix(".n5").removesuffix(".zarr").removesuffix(".ome") or path.name
     inner = place.relative_to(path).as_posix()
     return stem if inner == "." else f"{stem}:{inner}"
+
+
+def inside(path: Path, wanted: str | None) -> Path:
+    """Return the place in a store that an option names; by default the store itself.
+
+    Raises:
+        UsageError: it lies elsewhere.
+    """
+    here = path / (wanted or "").strip("/") if wanted else path
+    if not here.resolve().is_relative_to(path.resolve()):
+        raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
+    return here
+
+
+def json_object(file: Path) -> dict[str, Any]:
+    """Read a file of metadata.
+
+    Raises:
+        DataError: more than `MAX_METADATA` bytes, or no object of JSON.
+    """
+    if file.stat().st_size > MAX_METADATA:
+        raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
+    found = json.loads(file.read_text("utf-8"))
+    if not isinstance(found, dict):
+        raise DataError(f"{file}: expected a JSON object of metadata")
+    return found
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -85,11 +113,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
     for name in _METADATA:
         file = folder / name
         if file.is_file():
-            if file.stat().st_size > MAX_METADATA:
-                raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
-            found = json.loads(file.read_text("utf-8"))
-            if not isinstance(found, dict):
-                raise DataError(f"{file}: expected a JSON object of metadata")
+            found = json_object(file)
             if name == ".zarray":
                 return {"node_type": "array", **found}
             return {"node_type": "group", **found} if name == ".zgroup" else found
@@ -108,11 +132,7 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
 
 def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
     """Return folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
-    here = path
-    if wanted is not None:
-        here = path / wanted.strip("/")
-        if not here.resolve().is_relative_to(path.resolve()):
-            raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
+    here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
         return here, facts

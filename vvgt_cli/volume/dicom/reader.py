@@ -97,7 +97,8 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
         slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
         slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
-        slices = _ordered(slices)
+        normal = np.cross(*slices[0].rows)
+        slices.sort(key=lambda s: float(s.position @ normal))
         spacing, direction, heights = _geometry(slices, path, options)
         values, (slope, intercept) = _pixels(slices, path)
     values, (slope, intercept) = select_component(
@@ -296,12 +297,6 @@ def _alike(a: _Slice, b: _Slice) -> bool:
         all(a.header.get(k) == b.header.get(k) for k in ("Rows", "Columns", "SamplesPerPixel")) and a.tiles == b.tiles
     )
     return bool(same and np.allclose(a.rows, b.rows, atol=ANGLE) and np.allclose(a.spacing, b.spacing, rtol=1e-4))
-
-
-def _ordered(slices: list[_Slice]) -> list[_Slice]:
-    """Sort slices by position along the normal."""
-    normal = np.cross(*slices[0].rows)
-    return sorted(slices, key=lambda s: float(s.position @ normal))
 
 
 def _geometry(

@@ -70,7 +70,9 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
 def _only(found: dict[str, Files], path: Path) -> Files:
     """Return the single series of spatially located images, ignoring scouts and segmentations."""
     aside = {
-        uid: f for uid, f in found.items() if all(_localiser(h) or is_segmentation(h) or _unplaced(h) for _, h in f)
+        uid: files
+        for uid, files in found.items()
+        if all(_localiser(h) or is_segmentation(h) or not any(key in h for key in _PLACES) for _, h in files)
     }
     left = {uid: f for uid, f in found.items() if uid not in aside} or found
     if len(left) > 1:
@@ -110,10 +112,6 @@ def _listed(found: dict[str, Files]) -> str:
 
 def _localiser(header: Any) -> bool:
     return "LOCALIZER" in [str(word).upper() for word in header.get("ImageType") or []]
-
-
-def _unplaced(header: Any) -> bool:
-    return not any(key in header for key in _PLACES)
 
 
 def one_stack(

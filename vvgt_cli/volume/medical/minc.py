@@ -16,10 +16,10 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAGIC
 from vvgt_cli.volume.arrays.conventions import text_of
-from vvgt_cli.volume.arrays.hdf5 import checked_dataset, read_part
+from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf3 import check_header
 from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import placed

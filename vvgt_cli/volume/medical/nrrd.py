@@ -116,13 +116,6 @@ def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] 
     return odd[0] if odd else None
 
 
-def _time_axis(path: Path, fields: Fields, axis: int | None) -> bool:
-    """Tell whether the axis beyond space is one of time."""
-    kinds = fields.get("kinds", "").lower().split()
-    kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
-    return kind == "time" or (kind == "list" and _SEQUENCE.search(path.name) is not None)
-
-
 def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | None:
     """Choose along a block's last axis, which is one of time: by ``time``, or by ``component``.
 
@@ -281,7 +274,9 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
     color = "rgb" in fields.get("kinds", "").lower()
     label = f"axis {axis}" if axis is not None else ""
     component = options.component
-    if _time_axis(path, fields, axis):
+    kinds = fields.get("kinds", "").lower().split()
+    kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
+    if kind == "time" or (kind == "list" and _SEQUENCE.search(path.name)):
         component = _step(block, options, str(path))
     elif options.time:
         raise UsageError(

@@ -91,14 +91,10 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
             check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
         field = contiguous(field)
     unit = "" if picture.spacing == (None, None, None) else "um"
-    return Volume(field, _spacing(picture, options), picture.origin, name=name, unit=unit)
-
-
-def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, float]:
-    """Return the spacing (x, y, z); an axis without a size is as wide as the others, as in `Facts.voxel` of TIFF."""
     x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
-    across = x or y or z or 1.0
-    return options.spacing_or((x or across, y or across, z or across))
+    across = x or y or z or 1.0  # of an axis without a size, as in `Facts.voxel` of TIFF
+    spacing = options.spacing_or((x or across, y or across, z or across))
+    return Volume(field, spacing, picture.origin, name=name, unit=unit)
 
 
 def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:

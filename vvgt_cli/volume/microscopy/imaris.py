@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.libraries import read_part
 from vvgt_cli.volume.microscopy.image import Box, Color, Picture, picture_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -84,11 +85,8 @@ def _place(level: int, time: int, channel: int) -> str:
 
 
 def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarray:
-    """Read a box from a file that is open no longer than that; datasets are padded to whole chunks."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[_place(level, time, channel)][box])
+    """Read a box; datasets are padded to whole chunks."""
+    return read_part(path, _place(level, time, channel), box)
 
 
 def _count(group: Any, what: str, inside: str = "DataSet") -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat
@@ -54,7 +55,7 @@ def check_blocks(path: Path, root: dict[str, str], encoding: str, data_start: in
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     word = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
     room = path.stat().st_size * ratio + _SLACK
-    for array in _arrays(path, data_start, word, bool(root.get("compressor"))):
+    for array in _arrays(path, word, bool(root.get("compressor"))):
         name = array.attributes.get("Name", "")
         if int(array.attributes.get("NumberOfTuples", "0")) > room:
             raise DataError(f"{path}: array {name!r} declares more tuples than the file can hold; is the file whole?")
@@ -75,17 +76,50 @@ def _characters(head: np.ndarray, word: np.dtype) -> int:
     return 4 * -(-(3 + int(head[0])) * word.itemsize // 3)
 
 
-def _arrays(path: Path, data_start: int, word: np.dtype, compressed: bool) -> list[_Array]:
+def walk_xml(
+    path: Path, start: Callable[[str, dict[str, str], int], bool | None], end: Callable[[str], None],
+    text: Callable[[str], None] | None = None,
+) -> None:  # fmt: skip
+    """Call ``start``, ``end`` and ``text`` for the elements of an XML file.
+
+    ``start`` is told the byte at which an element begins; where it returns True, nothing is read from there on.
+
+    Raises:
+        DataError: damaged, or it declares entities.
+    """
+    parser, ended = expat.ParserCreate(), False
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal ended
+        ended = ended or bool(start(tag, attributes, parser.CurrentByteIndex))
+
+    def entity(*_: object) -> None:
+        raise DataError(f"{path}: its XML declares entities; expected none")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = begin, end, text
+    parser.EntityDeclHandler = entity
+    with open(path, "rb") as file:
+        try:
+            while not ended and (chunk := file.read(_CHUNK)):
+                parser.Parse(chunk)
+            if not ended:
+                parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            if not ended:
+                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+
+
+def _arrays(path: Path, word: np.dtype, compressed: bool) -> list[_Array]:
     found: list[_Array] = []
     inside = False
-    parser = expat.ParserCreate()
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str], _: int) -> bool:
         nonlocal inside
         inside = tag in ("DataArray", "Array")
         if inside:
             inline = compressed and attributes.get("format") == "binary"
             found.append(_Array(attributes, wanted=4 * word.itemsize if inline else 0))
+        return tag == "AppendedData"
 
     def text(data: str) -> None:
         if inside:
@@ -95,14 +129,7 @@ def _arrays(path: Path, data_start: int, word: np.dtype, compressed: bool) -> li
         nonlocal inside
         inside = False
 
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
-    with open(path, "rb") as file:
-        try:
-            while (data_start < 0 or file.tell() < data_start) and (chunk := file.read(_CHUNK)):
-                parser.Parse(chunk)
-        except expat.ExpatError as error:
-            if data_start < 0:
-                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+    walk_xml(path, start, end, text)
     return found
 
 

@@ -5,7 +5,6 @@ Layout: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format, "Ima
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.libraries import library_errors
+from vvgt_cli.volume.libraries import library_errors, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, stored_or_held
@@ -77,21 +76,14 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     dtype = dataset.dtype.newbyteorder("=")
     selected_dtype(info, options.component, source)  # raises where a component must be chosen
     behind = (int(options.component or 0),) if len(dataset.shape) > len(before) + 3 else ()
-    read = partial(_read, path, name, before, behind, dtype)
+
+    def read(box: Slices) -> np.ndarray:
+        return np.ascontiguousarray(read_part(path, name, (*before, *box, *behind)), dtype)
+
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
     values = stored_or_held(read, dtype, shape, chunks, source, options.stored)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
-
-
-def _read(
-    path: Path, name: str, before: tuple[int, ...], behind: tuple[int, ...], dtype: np.dtype, box: Slices
-) -> np.ndarray:
-    """Read a box from a file that is open no longer than that."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.ascontiguousarray(file[name][(*before, *box, *behind)], dtype)
 
 
 def _times(h5py: Any, file: Any, path: Path) -> list[float]:

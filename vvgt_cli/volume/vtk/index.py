@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.vtk.blocks import walk_xml
 
 MOST = 100_000  # files that an index may name
 DEEPEST = 8  # indexes that name indexes
@@ -124,7 +124,7 @@ def _parse(path: Path) -> Index:
     found = Index(path, "")
     blocks: list[tuple[str, str, int]] = []  # tag, name, level
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str], _: int) -> None:
         if tag == "VTKFile":
             found.kind = attributes.get("type", "")
         name = attributes.get("name") or attributes.get("index", "")
@@ -150,29 +150,6 @@ def _parse(path: Path) -> Index:
     if found.kind == "Collection" and any(math.isinf(entry.time) for entry in found.entries):
         raise DataError(f"{path}: a time step that is not finite; expected numbers")
     return found
-
-
-def walk_xml(
-    path: Path, start: Callable[[str, dict[str, str]], None], end: Callable[[str], None],
-    text: Callable[[str], None] | None = None,
-) -> None:  # fmt: skip
-    """Call ``start``, ``end`` and ``text`` for the elements of an XML file.
-
-    Raises:
-        DataError: damaged, or it declares entities.
-    """
-
-    def entity(*_: object) -> None:
-        raise DataError(f"{path}: its XML declares entities; expected none")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
-    parser.EntityDeclHandler = entity
-    try:
-        with open(path, "rb") as file:
-            parser.ParseFile(file)
-    except expat.ExpatError as error:
-        raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
 
 
 def files_of(index: Index, entries: list[Entry], above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, Entry]]:

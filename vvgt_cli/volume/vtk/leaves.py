@@ -86,7 +86,8 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
         raise DataError(f"{source}: no dataset in it; expected an image, a grid or a mesh")
     for leaf in leaves:
         check_cells(leaf.data, source)
-    deep = [leaf for leaf in leaves if _fills(leaf.data)]
+    filled = (leaf for leaf in leaves if leaf.data.GetNumberOfCells() > 0 and not leaf.data.IsA("vtkPolyData"))
+    deep = [leaf for leaf in filled if leaf.data.GetMaxSpatialDimension() == 3]
     if len(leaves) == 1 or not deep:
         return dataset_volume(leaves[0].data, options, source, name)
     infos = arrays_in(deep)
@@ -121,11 +122,6 @@ def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:
     """Return a sorting key that puts coarse blocks first: by level, images of one level by their cells."""
     data = row[0].data
     return row[0].level, -float(np.prod(data.GetSpacing())) if data.IsA("vtkImageData") else 0.0
-
-
-def _fills(data: Any) -> bool:
-    """Tell whether a dataset has cells that fill a volume."""
-    return data.GetNumberOfCells() > 0 and not data.IsA("vtkPolyData") and data.GetMaxSpatialDimension() == 3
 
 
 def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tuple[Leaf, np.ndarray]:

@@ -17,7 +17,8 @@ from typing import Any
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, data_file
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time, walk_xml
+from vvgt_cli.volume.vtk.blocks import walk_xml
+from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
@@ -198,7 +199,7 @@ def _xdmf(path: Path) -> Any:
     texts: list[str] = []
     coded = False
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str], _: int) -> None:
         nonlocal coded
         coded = tag == "DataItem" and attributes.get("Format", "XML").upper() in ("HDF", "HDF5", "H5", "BINARY", "TIFF")
         texts.clear()

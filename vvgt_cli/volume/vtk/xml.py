@@ -10,7 +10,6 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 
@@ -22,13 +21,12 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
-from vvgt_cli.volume.vtk.blocks import check_blocks
+from vvgt_cli.volume.vtk.blocks import check_blocks, walk_xml
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 from vvgt_cli.volume.vtk.packed import packed_array
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
-_CHUNK = 1 << 16
 DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
@@ -71,9 +69,8 @@ def scan(path: Path) -> Scan:
         DataError: not well-formed, or not a VTKFile.
     """
     found = Scan()
-    parser = expat.ParserCreate()
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str], position: int) -> bool:
         if tag == "VTKFile":
             found.root, found.kind = attributes, attributes.get("type", "")
         elif tag.removeprefix("P") in ("ImageData", "RectilinearGrid", "StructuredGrid"):
@@ -90,26 +87,21 @@ def scan(path: Path) -> Scan:
         elif tag in ("DataArray", "PDataArray") and found.where and found.pieces == (tag == "DataArray"):
             _note_array(found, attributes, path)
         elif tag == "AppendedData":
-            found.appended, found.data_start = attributes.get("encoding", ""), parser.CurrentByteIndex
+            found.appended, found.data_start = attributes.get("encoding", ""), position
+        return found.data_start >= 0
 
     def end(tag: str) -> None:
         if tag in DATA:
             found.where = ""
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    with open(path, "rb") as file:
-        try:
-            while found.data_start < 0 and (chunk := file.read(_CHUNK)):
-                parser.Parse(chunk)
-        except expat.ExpatError as error:
-            if found.data_start < 0:
-                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
-        if found.data_start >= 0:
+    walk_xml(path, start, end)
+    if found.data_start >= 0:
+        with open(path, "rb") as file:
             file.seek(found.data_start)
             mark = re.match(rb"[^>]*>\s*_", file.read(4096))
-            if mark is None:  # VTK's reader would begin elsewhere
-                raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
-            found.data_start += mark.end()
+        if mark is None:  # VTK's reader would begin elsewhere
+            raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
+        found.data_start += mark.end()
     return found
 
 

@@ -1,0 +1,44 @@
+"""`vvgt plugin`: every adapter is listed, short, and says how it is enabled."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from vvgt_cli.integrations.plugins import FOLDER, PLUGINS, plugin
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_each_is_listed_with_its_program(vvgt) -> None:
+    lines = vvgt("plugin").out.decode().splitlines()
+    assert [line.split()[0] for line in lines[::2]] == list(PLUGINS)
+    assert all(line.strip().startswith("tried with ") for line in lines[1::2])
+
+
+@pytest.mark.parametrize("name", PLUGINS)
+def test_one_prints_its_file_and_how_it_is_enabled(vvgt, name: str) -> None:
+    path, *lines = vvgt("plugin", name).out.decode().splitlines()
+    assert Path(path).is_file()
+    assert lines
+    assert "{" not in "".join(lines).replace("{:04d}", "")
+    if name in ("slicer", "paraview"):  # loaded by its place
+        assert any(str(Path(path).parent) in line for line in lines)
+
+
+def test_an_unknown_one_is_refused(vvgt) -> None:
+    result = vvgt("plugin", "slicr")
+    assert result.code == 2
+    assert result.error.startswith("vvgt: error: no plugin 'slicr'; expected one of ")
+
+
+def test_adapters_are_listed_and_packaged() -> None:
+    stated = [path for path in FOLDER.rglob("*.py") if "\nEnable:\n" in path.read_text("utf-8")]
+    assert sorted(stated) == sorted(plugin(name).path for name in PLUGINS)
+    for path in stated:
+        assert len(path.read_text("utf-8").splitlines()) <= 150
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    beside = [path for path in stated if path.parent != FOLDER] + [FOLDER / "napari.yaml"]
+    assert {str(path.relative_to(FOLDER)) for path in beside} == set(data["vvgt_cli.integrations"])

@@ -1,0 +1,142 @@
+"""PyVista: the volumes of a plotter as a file of Gaussians, with functions, light and camera (docs/programs.md).
+
+Tried: PyVista 0.49
+Enable:
+    vvgt.export_plotter(plotter, "page.html")
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.layered import Content
+from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.gaussians.header import camera_of as camera_in
+from vvgt_cli.integrations.vtk_property import property_json
+from vvgt_cli.integrations.vtk_scene import Drawn, drawn, volumes_of
+from vvgt_cli.integrations.vtk_view import camera_of, lights_of
+from vvgt_cli.library.functions import convert
+from vvgt_cli.library.inputs import GoalLike, Look, Reading, volume_of
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.types import triple
+
+FINER = 8  # times as fine as the first volume a layer may be
+SLACK = 1e-3  # voxels
+AROUND = "around"  # name of an empty volume that holds all
+
+
+def export_plotter(
+    plotter: Any, path: str | os.PathLike[str], goal: GoalLike = None, *, live: bool = False, overwrite: bool = True,
+    progress: bool = False,
+) -> Conversion:  # fmt: skip
+    """Write the volumes that a pyvista.Plotter shows as Gaussians: functions, light and camera are the plotter's.
+
+    Args:
+        plotter: pyvista.Plotter, of whose active subplot visible volumes are taken, several as layers.
+        path: the file, as in `Result.save`.
+        goal: as in `convert`.
+        live: as in `convert`.
+        overwrite: replace an existing file.
+        progress: as in `convert`.
+
+    Returns:
+        The conversion, whose file opens at the plotter's camera. One warning names what was not taken.
+
+    Raises:
+        DataError, UsageError: see `convert` and `Result.save`; the plotter shows no volume.
+    """
+    renderer = plotter.renderer
+    shown = volumes_of(renderer)
+    if not shown:
+        raise UsageError("plotter: shows no volume; call plotter.add_volume(...) first")
+    layers, notes, shaded = [], _others(renderer), [v.GetProperty() for v in shown if v.GetProperty().GetShade()]
+    for volume in shown:
+        found = drawn(volume)
+        more, about = _layers(found, volume.GetProperty())
+        layers += more
+        notes += found.notes + about
+    lights, unlike = lights_of(renderer) if shaded else (["none"], [])
+    if 0 < len(shaded) < len(shown):
+        notes.append("volumes without shading beside shaded ones")
+    light = LightOptions(tuple(lights))
+    if shaded:
+        lighting = read_transfer_function(property_json(shaded[0])[0]).lighting
+        names = ("ambient", "diffuse", "specular", "specular_power")
+        light = replace(light, **{name: getattr(lighting, name) for name in names})
+    if not renderer.camera.is_set:  # before anything was drawn; the same happens in show()
+        renderer.camera_position = renderer.get_default_cam_pos()
+        renderer.ResetCamera()
+    camera, up, askew = camera_of(renderer)
+    notes += unlike + askew
+    if notes:
+        warnings.warn(f"not taken from the plotter: {'; '.join(dict.fromkeys(notes))}", stacklevel=2)
+    (first, function), *rest = _ordered(layers)
+    look = Look(function, light=light, layers=[SourceRequest(content, tf=tf) for content, tf in rest])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", f"{AROUND}, none: nothing is visible")
+        result = convert(first, look, goal, live=live, progress=progress)
+    assert isinstance(result, Conversion)
+    result.ply = replace(result.ply, camera=camera_in(camera.split(",")), up=up)
+    result.save(path, overwrite=overwrite)
+    return result
+
+
+def _others(renderer: Any) -> list[str]:
+    """Return notes on visible surfaces, which are not volumes."""
+    actors = renderer.GetActors()
+    count = sum(bool(actors.GetItemAsObject(k).GetVisibility()) for k in range(actors.GetNumberOfItems()))
+    return [f"{count} surface{'s' * (count > 1)}"] if count else []
+
+
+def _layers(found: Drawn, prop: Any) -> tuple[list[tuple[Content, TransferFunction]], list[str]]:
+    """Return a volume's components, or its own colours, each with its function, and notes.
+
+    Raises:
+        UsageError: opacity of another component than that of the colours.
+    """
+    data = found.data.GetPointData() if found.data.GetPointData().GetScalars() else found.data.GetCellData()
+    array = data.GetArray(found.array) if found.array else data.GetScalars()
+    count, colored = array.GetNumberOfComponents(), not prop.GetIndependentComponents()
+    if count == 2 and colored:
+        raise UsageError(f"{array.GetName()}: two dependent components; expected one, independent ones, or colours")
+    reading: Reading = {"array": array.GetName()}
+    if found.mask is not None:
+        reading["mask"] = found.mask
+    each: list[Reading] = [reading] if count == 1 else [{**reading, "component": k} for k in range(count)]
+    parts = [volume_of(found.data, one) for one in each]
+    contents = [Content(tuple(parts), color=True)] if count > 1 and colored else [Content((part,)) for part in parts]
+    functions = [property_json(prop, k, found.scale) for k in range(len(contents))]
+    notes = [note for _, some in functions for note in some]
+    if len(contents) > 1:
+        notes.append("mixing of components (by extinction instead)")
+    return [(one, read_transfer_function(f)) for one, (f, _) in zip(contents, functions, strict=True)], notes
+
+
+def _ordered(layers: Sequence[tuple[Content, TransferFunction]]) -> list[tuple[Content, TransferFunction]]:
+    """Return the layers, first one whose box holds those of all; else an empty volume that does comes first."""
+    volumes = [content.volumes[0] for content, _ in layers]
+    unit = np.array(list(product((0, 1), repeat=3)))
+    corners = [(unit * v.dims - 0.5) * v.spacing @ v.axes.T + v.origin for v in volumes]
+    everything = np.concatenate(corners)
+    for k, v in enumerate(volumes):
+        index = (everything - v.origin) @ np.linalg.inv(v.axes).T / v.spacing
+        if (index > -0.5 - SLACK).all() and (index < np.array(v.dims) - 0.5 + SLACK).all():
+            return [layers[k], *layers[:k], *layers[k + 1 :]]
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    dims = np.ceil((high - low) / (FINER * min(min(v.spacing) for v in volumes))).astype(int)
+    step = (high - low) / dims
+    empty = np.zeros(dims[::-1], np.uint8)
+    around = Volume(empty, triple(step.tolist()), triple((low + step / 2).tolist()), name=AROUND)
+    clear = PiecewiseOpacity(np.zeros(1), np.zeros(1))
+    return [(Content((around,)), TransferFunction("none", clear, ColorMap(np.zeros(1), np.zeros((1, 3))))), *layers]
