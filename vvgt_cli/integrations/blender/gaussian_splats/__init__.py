@@ -65,8 +65,7 @@ def converted(scene: Any, item: Any, path: str, options: list[str]) -> list[str]
         low, high = json.loads("".join(said[said.index("{") :]))["range"]
         function, notes = shown.function(low, high, item)
         tf.write_text(json.dumps(function), "utf-8")
-        corners = [item.matrix_world @ Vector(corner) for corner in item.bound_box]
-        view, more = scene_of.camera_words(scene, sum(corners, Vector()) / 8)
+        view, more = scene_of.camera_words(scene, item.matrix_world @ (sum(map(Vector, item.bound_box), Vector()) / 8))
         words = ["--grid", shown.grid, "--tf", str(tf), "--up", "z", *view, "-o", path, "--overwrite", *options]
         command.run(["convert", str(source), *words])
     return [*notes, *more]
@@ -104,7 +103,8 @@ class ImportSplats(Splats, bpy.types.Operator, ImportHelper):
         notes = imported(self.filepath)[1]
         if self.scene:
             context.scene.view_settings.view_transform = "Standard"
-            context.scene.cycles.transparent_max_bounces = 1024
+            if hasattr(context.scene, "cycles"):
+                context.scene.cycles.transparent_max_bounces = 1024
         return notes
 
 

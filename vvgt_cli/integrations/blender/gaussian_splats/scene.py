@@ -41,7 +41,9 @@ def camera_words(scene: Any, centre: Any) -> tuple[list[str], list[str]]:
     if camera is None or camera.data.type != "PERSP":
         return [], [f"camera ({camera.data.type.lower()})"] if camera else []
     eye, ahead = camera.matrix_world.translation, camera.matrix_world.to_3x3() @ Vector((0, 0, -1))
-    corner = camera.data.view_frame(scene=scene)[0] - Vector((camera.data.shift_x, camera.data.shift_y, 0))
+    top, bottom = camera.data.view_frame(scene=scene)[:2]
     target = eye + ahead * max((centre - eye).dot(ahead), 1e-3)
-    angle = math.degrees(2 * math.atan(abs(corner.y / corner.z)))
-    return ["--camera", ",".join(f"{n:.9g}" for n in (*eye, *target, angle))], []
+    angle = math.degrees(2 * math.atan(abs((top.y - bottom.y) / (2 * top.z))))
+    roll, shift = abs(camera.matrix_world.col[0].z) > 1e-3, camera.data.shift_x or camera.data.shift_y
+    notes = [note for note, found in (("the camera's roll", roll), ("the camera's shift", shift)) if found]
+    return ["--camera", ",".join(f"{n:.9g}" for n in (*eye, *target, angle))], notes
