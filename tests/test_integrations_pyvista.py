@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def plotter(*grids: Any, opacity: Any = RAMP, **options: Any) -> Any:
         shown.mapper.SetAutoAdjustSampleDistances(False)
         shown.mapper.SetSampleDistance(0.1)
     middle = np.array(shown.center)
-    shown.camera_position = [tuple(middle + np.array([50, -45, 35])), tuple(middle), (0.1, 0, 1)]
+    shown.camera_position = [tuple(middle + np.array([50, -45, 35])), tuple(middle), (0, 0, 1)]
     shown.camera.view_angle = FIELD
     return shown
 
@@ -69,6 +70,18 @@ def test_a_plotter_without_a_volume_is_refused(tmp_path: Path) -> None:
     shown.mapper.SetInputData(two)
     with pytest.raises(vvgt.UsageError, match="pair: two dependent components"):
         vvgt.export_plotter(shown, tmp_path / "a.html", FEW)
+
+
+def test_volumes_beside_each_other_are_lit_as_the_plotters(tmp_path: Path) -> None:
+    """Where none of their boxes holds the others."""
+    grid = pyvista.wrap(lump())
+    shown = plotter(grid, moved(grid), shade=True, ambient=0.3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = vvgt.export_plotter(shown, tmp_path / "a.ply", FEW)
+    assert result.ply.light is not None
+    assert result.ply.light.ambient == 0.3
+    assert np.ptp(result.gaussians.means, axis=0).max() > 0.8  # both of them
 
 
 @pytest.mark.long

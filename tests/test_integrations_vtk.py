@@ -214,7 +214,8 @@ def test_the_command_is_found_by_variable_and_path(monkeypatch, tmp_path):
     assert heard == ["convert a"]
     monkeypatch.setenv("VVGT", "sh -c 'echo vvgt: error: no such file >&2; exit 1'")
     with pytest.raises(RuntimeError, match="no such file"):
-        command.run([])
+        command.run([], heard.append)
+    assert heard == ["convert a"]  # an error is raised, not told as well
     monkeypatch.delenv("VVGT")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RuntimeError, match="not in PATH; install it"):

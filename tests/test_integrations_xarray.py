@@ -48,7 +48,7 @@ def test_arrays_of_dask_are_never_read_as_a_whole() -> None:
 
     with dask.config.set(scheduler=get):
         assert len(lazy.vvgt.convert("viridis", GOAL, blocks=16).gaussians) > 50
-    assert len(asked) > 8
+    assert len(asked) >= 8
     assert max(asked) < 8  # chunks at once, of eight
 
 
