@@ -56,7 +56,8 @@ def picture(volume: Volume, name: str | None) -> tuple[np.ndarray, str]:
         tf = from_histogram(numbers, volume.hounsfield, volume.density)
     else:
         tf = resolve(read_transfer_function(name), numbers, hounsfield=volume.hounsfield)
-    scene = Scene.build(volume, tf, unit_distance(None, volume, tf)[0], (numbers.lo, numbers.hi))
+    distance, limits = unit_distance(None, volume, tf)[0], (numbers.lo, numbers.hi)
+    scene = Scene.build(volume, tf, distance, limits, lighting=tf.lighting)
     azimuth, elevation = np.radians([AZIMUTH, ELEVATION])
     level = np.cos(elevation)
     eye = 3 * np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])

@@ -10,6 +10,7 @@ import pytest
 from tests.test_volume_slices import write_series
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.look.histogram import _side
+from vvgt_cli.look.recognise import air_and_tissue, in_hounsfield
 from vvgt_cli.volume import ReadOptions, read_volume
 
 
@@ -53,3 +54,14 @@ def test_colours_go_half_by_rank_and_half_by_value() -> None:
     assert x.tolist() == [0, 1.5, 2.5, 4.5, 5]
     rank, value = np.array([0, 0.05, 0.25, 0.7, 1]), x / 5
     np.testing.assert_allclose(rgb[:, 0], 4 * (rank + value) / 2)
+
+
+def test_hounsfield_units_are_known_by_air_alone_where_values_reach_bone() -> None:
+    rng = np.random.default_rng(4)
+    for bone, known in ((900, True), (200, False)):  # a skull without soft tissue; nothing that tells it from others
+        values = np.concatenate([rng.normal(-1000, 10, 9000), rng.uniform(-900, bone, 1000)]).reshape(10, 10, 100)
+        counts, edges = np.histogram(values, 256)
+        assert in_hounsfield(counts.astype(float), edges) == known
+        assert not air_and_tissue(counts.astype(float), edges)
+    counts, edges = np.histogram(np.concatenate([rng.normal(0, 10, 9000), rng.uniform(100, 1900, 1000)]), 256)
+    assert not in_hounsfield(counts.astype(float), edges)

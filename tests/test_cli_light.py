@@ -9,9 +9,12 @@ import pytest
 
 import vvgt_cli
 from vvgt_cli import Look
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.ply import _rows
-from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.lighting import MATTE, Lighting, LightOptions
+from vvgt_cli.volume import Volume
 
 SOURCE = "example:marschner-lobb:24"
 SMALL = ("--max-gaussians", "300", "--size", "48", "--steps", "24")
@@ -141,6 +144,48 @@ def test_the_library_takes_names_directions_and_options():
     _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
     assert np.abs(images - dark).max() > 0.05
     np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays
+
+
+def test_presets_with_surfaces_and_label_maps_are_lit_unless_told_otherwise() -> None:
+    values = np.zeros((8, 8, 8), np.int16) - 1000
+    values[2:6, 2:6, 2:6], values[:, :1] = 1200, 40
+    scan, labels = Volume(values), Volume((values == 1200).astype(np.uint8))
+    names = ("ct-bone", "ct-vessels", "ct-skin", "mr-head", "mr-angio", "ct-soft-tissue", "ct-lung", "viridis", None)
+    found = {name: load(SourceRequest(scan, tf=name)).lighting for name in names}
+    assert [name for name, light in found.items() if light == MATTE] == list(names[:5])
+    assert [name for name, light in found.items() if light is None] == list(names[5:])
+    table = load(SourceRequest(labels, labels="auto")).lighting
+    assert table is not None
+    assert table.ambient + table.diffuse == 1
+    unlit, layer = LightOptions(("none",)), SourceRequest(labels, labels="auto")
+    assert load(SourceRequest(scan, tf="ct-bone", light=unlit)).lighting is None
+    assert load(SourceRequest(labels, labels="auto", light=unlit)).lighting is None
+    assert load(SourceRequest(scan, tf="viridis", layers=(layer,))).lighting is None  # the first layer decides
+    assert load(SourceRequest(scan, tf="ct-bone", layers=(layer,))).lighting == MATTE
+    above = load(SourceRequest(scan, tf="ct-bone", light=LightOptions(("above",)))).lighting
+    assert above == Lighting(False, ((0.0, 0.0, 1.0),), 0.2, 1.0, 0.0)
+
+
+def test_files_are_lit_by_default_in_memory_in_blocks_and_live(vvgt, tmp_path) -> None:
+    np.save(tmp_path / "v.npy", np.pad(np.arange(1, 9, dtype=np.uint8).reshape(2, 2, 2).repeat(4, 0).repeat(4, 1), 2))
+    look, headers = ("--labels", "auto", *SMALL[:4]), {}
+    ways = {
+        "a": ("--steps", 0),
+        "b": ("--steps", 0, "--blocks", 16),
+        "live": ("--live",),
+        "flat": ("--live", "--light", "none"),
+    }
+    for name, more in ways.items():
+        done = vvgt("convert", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.ply")
+        assert done.code == 0, done.err
+        assert ("--light none omits it" in done.err) == (name != "flat")
+        headers[name] = read_ply(tmp_path / f"{name}.ply")[1].light
+    assert headers == dict.fromkeys(("a", "b", "live"), LabelTable.lighting) | {"flat": None}
+    again = {"as": (), "new": ("--labels", "auto")}
+    for name, more in again.items():  # a new table brings its light, the file's own look does not
+        where = tmp_path / f"{name}.ply"
+        assert vvgt("recolor", tmp_path / "flat.ply", *more, "--opacity-unit-distance", 2, "-o", where).code == 0
+        assert read_ply(where)[1].light == (LabelTable.lighting if more else None)
 
 
 def test_a_network_leaves_harmonics_as_they_are(folder, vvgt):

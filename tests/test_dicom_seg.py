@@ -141,7 +141,7 @@ def test_a_scan_with_its_segmentation(tmp_path: Path) -> None:
 def test_by_command(vvgt, tmp_path: Path) -> None:
     write_seg(tmp_path / "s.dcm", scan(tmp_path / "ct"), organs())
     with pytest.warns(UserWarning, match="s: read as a label map by its segments"):
-        done = vvgt("init", tmp_path / "s.dcm", *SMALL[:4], "-o", tmp_path / "a.ply")
+        done = vvgt("init", tmp_path / "s.dcm", "--light", "none", *SMALL[:4], "-o", tmp_path / "a.ply")
     assert done.code == 0, done.err
     colors = read_ply(str(tmp_path / "a.ply"))[0].colors
     assert (colors[:, 0] - colors[:, 2] > 0.9).any()

@@ -216,7 +216,8 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
     np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
     labels = wanted("convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
-    assert labels == set(ahead.for_grid(ahead.CONVERT)) - {*ahead.REGRESS, ahead.MIX}  # of other grids, and of more
+    grid = ahead.for_grid(ahead.for_light(ahead.CONVERT, False))
+    assert labels == set(ahead.for_degree(grid, 2)) - {*ahead.REGRESS, ahead.MIX}  # of other grids, and of more
     wanted("convert", "seg.npy", *fit, "--steps", 24, "--light", "above", "--shadows", "--blocks", 16, "-o", "h.ply")
     dark = ("--light", "above", "--shadows", "--specular", 0)
     flat = wanted("convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")

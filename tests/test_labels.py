@@ -268,7 +268,8 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
 def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> None:
     for k in range(2):
         np.save(tmp_path / f"run_seg_{k}.npy", np.where(balls() == 3, 3 if k else 1, balls()).astype(np.uint8))
-    done = vvgt("convert", tmp_path / "run_seg_*.npy", "--labels", "auto", *SMALL, "-o", tmp_path / "o_{}.ply")
+    look = ("--labels", "auto", "--light", "none")
+    done = vvgt("convert", tmp_path / "run_seg_*.npy", *look, *SMALL, "-o", tmp_path / "o_{}.ply")
     assert done.code == 0, done.err
     first, second = (read_ply(str(tmp_path / f"o_{k}.ply"))[0].colors for k in range(2))
     wanted = distinct([1]).labels[0].color
@@ -316,7 +317,7 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     solid = grid[2, 2, 2, 3]
     np.testing.assert_allclose(grid[..., 3], solid * ((a > 0).astype(int) + (b > 0)), rtol=1e-6)
     np.testing.assert_allclose(grid[..., :3], solid * np.stack([a == 1, b == 2, b == 1], axis=-1), rtol=1e-6)
-    done = vvgt("convert", path, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
+    done = vvgt("convert", path, "--split-labels", "--light", "none", *SMALL, "-o", tmp_path / "p_{}.ply")
     assert done.code == 0, done.err
     index = json.loads((tmp_path / "p_index.json").read_text())
     assert [(row["name"], row["file"]) for row in index["files"]] == [
@@ -347,7 +348,7 @@ def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> No
     far = np.where(balls() == 3, 2_000_000_000, balls()).astype(np.int32)
     for k in range(2):
         np.save(tmp_path / f"run_seg_{k}.npy", far)
-    done = vvgt("convert", tmp_path / "run_seg_*.npy", *SMALL, "-o", tmp_path / "o_{}.ply")
+    done = vvgt("convert", tmp_path / "run_seg_*.npy", "--light", "none", *SMALL, "-o", tmp_path / "o_{}.ply")
     assert done.code == 0, done.err
     colors = read_ply(str(tmp_path / "o_1.ply"))[0].colors
     near = np.abs(colors[:, None] - [e.color for e in distinct([1, 2_000_000_000]).labels]).max(axis=2).min(axis=1)

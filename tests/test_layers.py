@@ -101,6 +101,32 @@ def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None
     assert "2 x 2 x 2 voxels; expected the 24 x 24 x 24" in vvgt("info", tmp_path / "v.nii", "--mask", wrong).error
 
 
+@pytest.mark.filterwarnings("ignore:.*of smaller bodies")
+def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, vvgt) -> None:
+    z, y, x = np.indices((20, 24, 40)) - 10.0
+    head = np.hypot(np.hypot(z, y), x) < 8
+    rest = (np.abs(z) < 9) & (np.abs(y) < 9) & (x > 18) & (x < 24)
+    values = np.where(head, 40, np.where(rest, 200, -1000)).astype(np.int16)
+    np.save(tmp_path / "v.npy", values)
+    for stored in (False, True):
+        data = read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300, stored=stored)).data[:]
+        np.testing.assert_array_equal(np.isnan(data), rest)
+        np.testing.assert_array_equal(data[~rest], values[~rest])
+    with pytest.warns(UserWarning, match=r"--keep-largest -300: hides 40\.7 % of the voxels above, of smaller bodies"):
+        assert (read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300)).data == 40).sum() == head.sum()
+    with pytest.raises(DataError, match="--keep-largest 300: no voxel lies above"):
+        read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=300))
+    with pytest.raises(UsageError, match="--keep-largest nan: expected a finite"):
+        ReadOptions(keep_largest=float("nan"))
+    whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
+    assert whole.gaussians.means[:, 0].max() < 0.2
+    for name, more in {"a": (), "b": ("--blocks", 16), "live": ("--live",)}.items():
+        given = ("--tf", "gray:0.9,1", "--keep-largest", -300, "--max-gaussians", 200, "--size", 40, *more)
+        made = vvgt("convert", tmp_path / "v.npy", *given, "-o", tmp_path / f"{name}.ply")
+        assert made.code == 0, made.err
+        assert read_ply(tmp_path / f"{name}.ply")[0].means[:, 0].max() < 0.2  # the rest lies from 0.4 on
+
+
 # ---- colours
 
 

@@ -209,14 +209,15 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     table = {"1": {"name": "one", "color": [1, 0, 0]}, "2": {"name": "two", "color": [0, 0, 1], "opacity": 0}}
     (tmp_path / "t.json").write_text(json.dumps(table))
     whole = read_ply(label_file)[0]
-    assert vvgt("recolor", label_file, "--labels", tmp_path / "t.json", "-o", tmp_path / "a.ply").code == 0
+    look = ("--labels", tmp_path / "t.json", "--light", "none")
+    assert vvgt("recolor", label_file, *look, "-o", tmp_path / "a.ply").code == 0
     found, header = read_ply(tmp_path / "a.ply")
     assert header.live is None
     assert len(found) == (whole.live[:, LABEL_ROW] == 0).sum()  # type: ignore[index]
     np.testing.assert_allclose(found.colors, np.tile([1, 0, 0], (len(found), 1)), atol=1e-6)
     scores = []
     for file in (label_file, tmp_path / "a.ply"):
-        shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", "--labels", tmp_path / "t.json")
+        shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", *look)
         scores.append(json.loads(vvgt(*shown, "--json", "--no-conditions").out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
     assert scores[0] > 18

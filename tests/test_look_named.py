@@ -15,10 +15,11 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.open import needs_histogram
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look import from_histogram, read_transfer_function, resolve
-from vvgt_cli.look.histogram import fitting
+from vvgt_cli.look.presets import fitting
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.look.recognise import foreground, moments
 from vvgt_cli.volume import Volume, statistics
+from vvgt_cli.volume.bodies import largest
 
 RANDOM = np.random.default_rng(11)
 CT = np.concatenate([RANDOM.normal(-1000, 15, 5000), RANDOM.normal(40, 40, 4000), RANDOM.normal(700, 150, 1000)])
@@ -73,7 +74,9 @@ def test_hounsfield_units_are_taken_as_they_are_and_others_by_percentiles(name: 
         crop = statistics(Volume(CT[10:]))  # without air: the file has to say
         np.testing.assert_array_equal(resolve(function, crop, hounsfield=True).breakpoints(), function.breakpoints())
     stored = statistics(Volume((CT + 3000) * 0.25))
-    with pytest.warns(UserWarning, match="not in Hounsfield units; shown by percentiles of the foreground"):
+    with pytest.warns(
+        UserWarning, match=r"values 48.* to 1030.* are not in Hounsfield units; shown by percentiles of the foreground"
+    ):
         shown = resolve(function, stored)
     lo, hi = shown.node_range()
     assert 500 < lo < hi <= stored.hi
@@ -145,7 +148,7 @@ def test_info_names_a_function_that_fits(tmp_path: Path, vvgt: Callable) -> None
     assert suggested(str(tmp_path / "ct.npy")) == "ct-bone"
     np.save(tmp_path / "soft.npy", np.where(CT > 200, 40, CT))
     assert suggested(str(tmp_path / "soft.npy")) == "ct-soft-tissue"
-    np.save(tmp_path / "lung.npy", np.where(CT > 200, -800, CT))
+    np.save(tmp_path / "lung.npy", phantom("chest"))
     assert suggested(str(tmp_path / "lung.npy")) == "ct-lung"
     np.save(tmp_path / "any.npy", RANDOM.uniform(0, 1, (5, 6, 7)))
     assert suggested(str(tmp_path / "any.npy")) is None
@@ -201,6 +204,75 @@ def test_lungs_are_those_of_a_chest(part: str, options: dict[str, float], name: 
     """Not the surfaces and the rest of a head, whose voxels lie between air and tissue too."""
     volume = Volume(phantom(part, **options), hounsfield=True)
     assert fitting(statistics(volume), volume) == name
+
+
+def engine(rng: np.random.Generator) -> np.ndarray:
+    """Two metals in air, 0 to 255."""
+    values = np.zeros((60, 70, 90))
+    values[8:50, 10:60, 8:80] = 150
+    values[15:40, 20:50, 20:70] = 0
+    values[20:30, 10:60, 30:40] = 220
+    return (values + rng.normal(8, 3, values.shape)).clip(0, 255)
+
+
+def brain(rng: np.random.Generator) -> np.ndarray:
+    """Nested tissues under a coil's slope, with the noise of magnitudes."""
+    z, y, x = (np.indices((60, 70, 90)).T - [29.5, 34.5, 44.5]).T
+    radius = np.sqrt((z / 26) ** 2 + (y / 31) ** 2 + (x / 36) ** 2)
+    values = np.select([radius < 0.5, radius < 0.8, radius < 0.85, radius < 0.95], [230, 170, 30, 330], 0)
+    return np.hypot(values * (1 + x / 120) + rng.normal(0, 9, x.shape), rng.normal(0, 9, x.shape))
+
+
+def cushion(rng: np.random.Generator, shell: float) -> np.ndarray:
+    """A ball of tissue, in Hounsfield units, above a slab of foam in a shell."""
+    z, y, x = np.indices((60, 70, 90))
+    values = np.where((z - 20) ** 2 + (y - 35) ** 2 + (x - 45) ** 2 < 300, 40.0, -1000.0)
+    values[41:59, 8:62, 8:82] = shell
+    values[42:58, 10:60, 10:80] = -800
+    return values + rng.normal(0, 12, values.shape)
+
+
+def flame(rng: np.random.Generator) -> np.ndarray:
+    z, y, x = np.indices((60, 70, 90)) / 45 - 1
+    return np.exp(-4 * (x**2 + y**2)) * np.exp(-(z**2)) * 2100
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "facts", "name"),
+    [
+        (engine, "u1", {"space": "RAS"}, None),
+        (engine, "f4", {"space": "RAS"}, None),
+        (engine, "i2", {"modality": "CT"}, None),
+        (brain, "i2", {"space": "RAS"}, "mr-head"),
+        (brain, "i2", {}, None),  # of no space, of unknown size
+        (brain, "i2", {"modality": "MR"}, "mr-head"),
+        (brain, "i2", {"modality": "PT", "space": "RAS"}, None),
+        (brain, "i2", {"space": "RAS", "spacing": (0.02, 0.02, 0.02)}, None),
+        (brain, "u1", {"space": "RAS"}, None),
+        (flame, "f4", {}, None),
+        (lambda rng: cushion(rng, -800), "i2", {"modality": "CT", "hounsfield": True}, "ct-soft-tissue"),
+        (lambda rng: cushion(rng, 200), "i2", {"modality": "CT", "hounsfield": True}, "ct-soft-tissue"),
+        (lambda rng: phantom("head") + 1024, "i2", {"space": "RAS"}, None),  # stored values
+        (lambda rng: phantom("chest") + 1024, "i2", {"space": "RAS"}, None),
+        (lambda rng: phantom("head"), "i2", {"space": "RAS"}, "ct-bone"),
+        (lambda rng: phantom("head"), "i2", {"modality": "MR"}, "mr-head"),
+        (lambda rng: phantom("chest"), "i2", {"space": "RAS"}, "ct-lung"),
+    ],
+)
+def test_a_preset_fits_or_none(make: Callable, kind: str, facts: dict[str, object], name: str | None) -> None:
+    values = make(np.random.default_rng(2)).clip(0 if kind == "u1" else None, 255 if kind == "u1" else None)
+    volume = Volume(values.astype(kind), **{"spacing": (2.5, 2.5, 2.5), **facts})
+    assert fitting(statistics(volume), volume) == name
+
+
+def test_largest_is_the_body_with_most_voxels() -> None:
+    mask = np.zeros((5, 6, 7), bool)
+    mask[0, 0, :6] = mask[2:4, 2:4, 2:4] = True
+    mask[4, 4, 4] = True  # a corner does not connect
+    found = largest(mask)
+    assert found.sum() == 8
+    assert found[2:4, 2:4, 2:4].all()
+    assert not largest(np.zeros((2, 3, 4), bool)).any()
 
 
 @pytest.mark.parametrize("name", ["density-contour", "ct-bone", "mr-head"])

@@ -12,10 +12,13 @@ from PIL import Image
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.images.movies import write_movie
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.splat import render
 
 
@@ -117,3 +120,49 @@ def test_errors_of_ffmpeg_are_reported(tmp_path):
     with pytest.raises(DataError, match="ffmpeg went away"):
         write_movie(tmp_path / "a.mp4", pictures())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_volume_is_drawn_by_the_ray_caster_in_memory_and_in_blocks(tmp_path, vvgt):
+    z, y, x = np.indices((20, 24, 32))
+    np.save(tmp_path / "v.npy", np.exp(-((z - 9) ** 2 + (y - 8) ** 2 + (x - 20) ** 2) / 40).astype(np.float32))
+    look = ("--tf", "viridis:0.3,0.6", "--light", "headlight", "--size", 48)
+    for name, more in {"whole": (), "blocks": ("--blocks", 16)}.items():
+        done = vvgt("render", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.png")
+        assert done.code == 0, done.err
+        assert ("in blocks of 16" in done.err) == bool(more)
+    whole, blocks = (np.asarray(Image.open(tmp_path / f"{name}.png"), float) for name in ("whole", "blocks"))
+    assert whole.shape == (48, 48, 4)
+    assert 0.02 < (whole[..., 3] > 128).mean() < 0.5
+    assert np.abs(whole - blocks).mean() < 0.5
+    source = load(SourceRequest(str(tmp_path / "v.npy"), tf="viridis:0.3,0.6", light=LightOptions(("headlight",))))
+    camera = orbit_views(3, size=48)[0]
+    assert (camera.rotation == orbit_views(1, size=48)[0].rotation).all()
+    wanted = render_view(source.scene(), camera, RenderSettings())
+    np.testing.assert_allclose(whole[..., 3] / 255, wanted[..., 3], atol=0.01)
+    assert vvgt("render", tmp_path / "v.npy", *look, "--orbit", 3, "-o", tmp_path / "d").code == 0
+    first = np.asarray(Image.open(sorted((tmp_path / "d").glob("*.png"))[0]), float)
+    np.testing.assert_array_equal(first, whole)
+    assert (tmp_path / "d" / "transforms.json").is_file()
+    assert not (tmp_path / "transforms.json").exists()
+    assert vvgt("render", tmp_path / "v.npy", *look, "--orbit", 4, "-o", tmp_path / "t.gif").code == 0
+    assert len(gif(tmp_path / "t.gif")[0]) == 4
+
+
+def test_a_single_picture_and_what_it_is_not_given(ply, tmp_path, vvgt):
+    assert vvgt("render", ply[1], "--exr", "-o", tmp_path / "a.png").code == 0
+    assert (tmp_path / "a.exr").is_file()
+    assert "exists" in vvgt("render", ply[1], "-o", tmp_path / "a.png").error
+    (tmp_path / "a.png").unlink()
+    assert "a.exr exists" in vvgt("render", ply[1], "--exr", "-o", tmp_path / "a.png").error
+    assert not (tmp_path / "a.png").exists()
+    for more, said in (
+        (("--orbit", 2, "-o", tmp_path / "b.png"), "one picture of 2 views"),
+        (("--crop", "1:,:,:", "-o", tmp_path / "b.png"), "holds Gaussians; reading options"),
+        (("--blocks", 16, "-o", tmp_path / "b.png"), "holds Gaussians; reading options"),
+        (("-o", tmp_path / "d"), "or one picture"),
+    ):
+        failed = vvgt("render", ply[1], *more)
+        assert (failed.code, said in failed.error) == (2, True), failed.error
+    failed = vvgt("render", "example:blob:12", "--rule", "inria", "-o", tmp_path / "b.png")
+    assert (failed.code, "is for Gaussians" in failed.error) == (2, True)
+    assert not (tmp_path / "b.png").exists()

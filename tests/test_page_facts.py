@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -217,3 +218,31 @@ def test_a_legend_of_labels_names_those_that_are_shown() -> None:
     assert found["of"] == 38
     assert found["labels"][:2] == [["part 1", "ff0080"], ["part 3", "ff0080"]]
     assert len(found["labels"]) == 24
+
+
+def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
+    def listed(name: str) -> dict[str, Any]:
+        done = vvgt("info", tmp_path / name, "--sharing", "--json")
+        assert done.code == 0, done.err
+        return json.loads(done.out)
+
+    values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
+    nibabel.save(nibabel.Nifti1Image(values, np.diag([2, 2, 2, 1])), tmp_path / "Doe_John.nii")
+    (tmp_path / "t.json").write_text(json.dumps({"1": {"name": "tumour", "color": [1, 0, 0]}}))
+    given = ("--labels", tmp_path / "t.json", "--max-gaussians", 100, "--size", 40)
+    quick = ("--steps", 0)
+    kinds = {"a.ply": quick, "live.ply": ("--live",), "n.ply": ("--no-comments", *quick), "a.html": ("--live",)}
+    for name, more in kinds.items():
+        assert vvgt("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name).code == 0
+        assert "Doe" not in json.dumps(listed(name))
+    plain, live, bare, page = map(listed, ("a.ply", "live.ply", "n.ply", "a.html"))
+    assert {"title", "function", "names", "command", "checksum", "place", "picture"} <= set(plain)
+    assert plain["names"] == ["tumour"]
+    assert "values" not in plain
+    assert live["names"] == ["tumour"]
+    assert {"values", "place"} <= set(live)
+    assert "other functions" in live["picture"]
+    assert {"values", "date"} <= set(page)
+    assert set(bare) == {"kind", "name", "picture", "remove"}
+    assert "not Gaussians" in vvgt("info", tmp_path / "Doe_John.nii", "--sharing").error
+    assert vvgt("info", "--machine", "--sharing").code == 2

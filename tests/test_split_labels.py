@@ -21,6 +21,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.look.labels import distinct
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.score.views import score_test_views
 from vvgt_cli.volume import Volume
 
@@ -52,7 +53,7 @@ def test_the_files_hold_the_gaussians_of_the_whole(vvgt, tmp_path: Path, monkeyp
     made = []
     fitted = split.fit_gaussians
     monkeypatch.setattr(split, "fit_gaussians", lambda run, request: made.append(fitted(run, request)) or made[-1])
-    files = converted(vvgt, tmp_path, nested(cut=True))
+    files = converted(vvgt, tmp_path, nested(cut=True), "--light", "none")
     whole, together = rows(made[-1]), [row for part in files.values() for row in rows(part)]
     assert sorted(files) == [1, 3]
     assert len(together) <= 600
@@ -85,7 +86,7 @@ def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path
     for number, name in names.items():
         plan = json.loads((tmp_path / name).read_text())["plan"]
         assert plan["gaussians"] == len(files[number])
-        assert plan["bytes"] == file_bytes(len(files[number]), 0)
+        assert plan["bytes"] == file_bytes(len(files[number]), 2)  # lit
         assert len(files[number]) in counts
 
 
@@ -113,7 +114,8 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
     """The closed form of a solid ball, nearer than with the surface where a cell is half opaque."""
     from vvgt_cli.closed_form import VbmOptions, initialise, surface_offset
 
-    source = load(SourceRequest(Volume(np.where(nested() > 0, 1, 0).astype(np.uint8)), labels=distinct([1])))
+    solid = Volume(np.where(nested() > 0, 1, 0).astype(np.uint8))
+    source = load(SourceRequest(solid, labels=distinct([1]), light=LightOptions(("none",))))
     assert source.scene().labels
 
     def score() -> float:

@@ -17,6 +17,7 @@ from vvgt_cli.commands.live_site import Cloud, PageController, parse_labels
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.live_facts import LABEL_ROW
+from vvgt_cli.look.lighting import LightOptions
 
 Z, Y, X = np.mgrid[:12, :12, :12] // 6
 CUBES = (1 + X + 2 * Y + 4 * Z).astype(np.uint8)
@@ -27,7 +28,7 @@ def eight(tmp_path_factory: pytest.TempPathFactory) -> Cloud:
     """Eight cubes, each a label, live."""
     path = tmp_path_factory.mktemp("eight") / "eight.npy"
     np.save(path, CUBES)
-    how = ["--labels", "auto", "--live", "--max-gaussians", "200", "--size", "100", "--quiet"]
+    how = ["--labels", "auto", "--light", "none", "--live", "--max-gaussians", "200", "--size", "100", "--quiet"]
     assert run(["convert", str(path), *how, "-o", str(path.with_suffix(".ply"))]) == 0
     return Cloud.of(path.with_suffix(".ply").read_bytes(), "eight")
 
@@ -62,7 +63,7 @@ def test_saved_labels_have_the_colours_of_the_page(controller: tuple[str, PageCo
 
 def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> None:
     np.save(tmp_path / "eight.npy", CUBES)
-    source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto")
+    source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto", light=LightOptions(("none",)))
     told: list[Message] = []
     console = MessageConsole(told.append)
     volume = LoadedVolume(source, "eight", console)

@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,10 +26,13 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
+from vvgt_cli.commands import view
 from vvgt_cli.commands.converter import Converter, Failed, Start
 from vvgt_cli.commands.live_site import Cloud, PageController, parse_function, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
+from vvgt_cli.conversion import convert_batch
 from vvgt_cli.conversion.live import apply_light
+from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
@@ -390,3 +394,31 @@ def test_names_to_save_under() -> None:
     assert plain_name("/x/</b>.nii.gz") == "b"
     assert plain_name("..") == "volume"
     assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"
+
+
+def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, monkeypatch) -> None:
+    shown: list[tuple[list[str], list[float]]] = []
+
+    def serve(run, request, clouds, announce) -> None:
+        shown.append(([name for name, _ in clouds], [float(read_ply(f)[0].means[:, 0].mean()) for _, f in clouds]))
+
+    x = np.indices((12, 12, 24))[2]
+    for k in range(3):
+        np.save(tmp_path / f"run_{k}.npy", np.exp(-((x - 5 - 6 * k) ** 2) / 8).astype(np.float32))
+    loose = vvgt("view", *sorted(tmp_path.glob("run_*.npy")))
+    assert (loose.code, "quote the pattern" in loose.error) == (2, True)
+    monkeypatch.setattr(view, "_serve", serve)
+    (temporary := tmp_path / "t").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    done = vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis")
+    assert done.code == 0, done.err
+    names, means = shown[0]
+    assert len(names) == 3
+    assert means == sorted(means)
+    assert means[2] - means[0] > 0.6  # 12 voxels of 24, whose box is 2 wide, in haze
+    assert not list(temporary.glob("vvgt-*"))
+    assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
+    saved: list[ConvertRequest] = []
+    monkeypatch.setattr(convert_batch, "convert_files", lambda request, console: saved.append(request))
+    assert vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis", "-o", tmp_path / "a.html").code == 0
+    assert (saved[0].output, saved[0].source.tf, saved[0].live) == (str(tmp_path / "a.html"), "viridis", False)

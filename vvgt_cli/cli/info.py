@@ -20,6 +20,7 @@ from vvgt_cli.progress import Console
 @click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file", required=False)
 @click.option("--machine", is_flag=True, help="Describe this machine instead: processors, memory, GPU.")
+@click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, dates, values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
 @layer_looks_option
@@ -28,8 +29,8 @@ from vvgt_cli.progress import Console
 @placed_read_options
 @common_options
 def command(
-    file: str | None, machine: bool, as_json: bool, tf: str | None, layers: tuple[str, ...], tf_range: str,
-    opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
+    file: str | None, machine: bool, sharing: bool, as_json: bool, tf: str | None, layers: tuple[str, ...],
+    tf_range: str, opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
 ) -> None:  # fmt: skip
     """Describe FILE: a volume, transfer function, label table, view set, .ply of Gaussians, or index of several.
 
@@ -39,18 +40,22 @@ def command(
       vvgt info example:frog
       vvgt info frog.ply --json | jq .gaussians
       vvgt info presets.xml#CT-AAA
+      vvgt info head.html --sharing
       vvgt info --machine
     """
     from vvgt_cli.commands.inspect import inspect, machine_facts
     from vvgt_cli.commands.recolor import function_of
+    from vvgt_cli.commands.sharing import what_leaves
     from vvgt_cli.errors import UsageError
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
-    if machine == (file is not None):
+    if machine == (file is not None) or (machine and sharing):
         raise UsageError("expected a file, or --machine")
     if file is None:
         facts = machine_facts()
+    elif sharing:
+        facts = plain(what_leaves(file))
     else:
         look = function_of(tf, tf_range, opacity_unit_distance, layers=layers)
         facts = plain(inspect(file, ReadOptions(**read), look))

@@ -80,6 +80,10 @@ _READ = dict(
         help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",
     ),
     mask=click.option("--mask", metavar="FILE", help="Volume of the same size; voxels where it is 0 are hidden."),
+    keep_largest=click.option(
+        "--keep-largest", type=float, metavar="VALUE",
+        help="Of what lies above VALUE, hide all but the largest connected body: -300 removes the head rest of a CT.",
+    ),
 )  # fmt: skip
 read_options = group("read", **_READ)
 placed_read_options = group(
@@ -140,15 +144,22 @@ _LIGHT = dict(
     lights=click.option(
         "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
         help="Light at the eye ('headlight') or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, "
-        "below, left, right, anterior, ... Repeatable. Default: given by the function's file, else none.",
+        "below, left, right, anterior, ... Repeatable. Default: a headlight if the function has one, as presets such "
+        "as ct-bone and label maps do, else none.",
     ),
-    ambient=click.option("--ambient", type=float, metavar="KA", help="Ambient coefficient. Default: 0.1."),
-    diffuse=click.option("--diffuse", type=float, metavar="KD", help="Diffuse coefficient. Default: 0.7."),
+    ambient=click.option(
+        "--ambient", type=float, metavar="KA", help="Ambient coefficient. Default: the function's, or 0.1."
+    ),
+    diffuse=click.option(
+        "--diffuse", type=float, metavar="KD", help="Diffuse coefficient. Default: the function's, or 0.7."
+    ),
     specular=click.option(
-        "--specular", type=float, metavar="KS", help="Specular coefficient; highlights are white. Default: 0.2."
+        "--specular", type=float, metavar="KS",
+        help="Specular coefficient; highlights are white. Default: the function's, or 0.2.",
     ),
     specular_power=click.option(
-        "--specular-power", type=float, metavar="P", help="Specular exponent; larger is glossier. Default: 10."
+        "--specular-power", type=float, metavar="P",
+        help="Specular exponent; larger is glossier. Default: the function's, or 10.",
     ),
 )  # fmt: skip
 layer_looks_option = click.option(

@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import (
-    common_options,
-    layer_looks_option,
-    overwrite_option,
-    relight_options,
-    tf_range_option,
-    unit_distance_option,
-)
+from vvgt_cli.cli.blocks import block_options, block_options_of
+from vvgt_cli.cli.fit import rule_option, source_request
+from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
+if TYPE_CHECKING:
+    from vvgt_cli.field.source import SourceRequest
 
-@click.command("render", short_help="Render pictures or a movie of a .ply.")
-@click.argument("ply", metavar="OUT.ply")
+
+@click.command("render", cls=SectionedCommand, short_help="Render pictures or a movie of Gaussians or a volume.")
+@click.argument("file", metavar="FILE")
 @click.option("--camera", metavar="FILE", help="Camera poses from a transforms.json, in the unit frame.")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the up axis.")
 @click.option(
     "--size",
     type=click.IntRange(1, 16384),
     metavar="PX",
-    help="Image height in pixels. Default: that of the camera file, for an orbit the size recorded in the .ply, or "
-    "400.",
+    help="Image height in pixels. Default: that of the camera file, else the size recorded in the .ply, or 400.",
 )
 @click.option(
     "-o", "--output", required=True, metavar="DIR|FILE",
-    help="Output directory, created if missing, or a movie such as turn.gif or turn.mp4.",
+    help="One picture such as out.png, a directory for several, created if missing, or a movie such as turn.gif or "
+    "turn.mp4.",
 )  # fmt: skip
 @click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
 @click.option(
@@ -41,17 +39,15 @@ from vvgt_cli.progress import Console
     metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )
-@click.option("--labels", metavar="TABLE|auto", help="Table of labels to show a live .ply of a label map under.")
-@click.option("--tf", metavar="TF", help="Transfer function to show a .ply of 'vvgt convert --live' under.")
-@layer_looks_option
-@tf_range_option
-@unit_distance_option
-@relight_options
-@rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
+@tf_options
+@light_options
+@rule_option("Viewer to imitate when drawing Gaussians. Default: the one recorded in the file, or inria.")
+@placed_read_options
+@block_options
 @overwrite_option
 @common_options
 def command(
-    ply: str,
+    file: str,
     camera: str | None,
     orbit: int | None,
     size: int | None,
@@ -59,23 +55,23 @@ def command(
     output: str,
     exr: bool,
     background: tuple[float, float, float] | None,
-    tf: str | None,
-    labels: str | None,
-    layers: tuple[str, ...],
-    tf_range: str,
-    opacity_unit_distance: str | None,
+    optics: dict[str, Any],
     light: dict[str, Any],
+    read: dict[str, Any],
+    blocks: dict[str, Any],
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Render the Gaussians of OUT.ply as viewers do: one PNG per view and a transforms.json.
+    """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
-    Choose the views with --camera or --orbit. With -o turn.gif or turn.mp4 they become a movie at 25 frames per second,
-    which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-",
-    or FOLDER of streamed levels: FOLDER#1 is its level 1, FOLDER#view what viewers show each camera.
-    A .ply of 'vvgt convert --live' can be shown under any function (--tf) and light (--light).
+    Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif
+    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. The up axis is the one
+    recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels: FOLDER#1
+    is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown under any
+    function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name.
 
     Examples:
+      vvgt render head.nrrd --tf ct-bone --size 800 -o head.png
       vvgt render frog.ply --orbit 36 --size 800 -o turn
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
@@ -83,10 +79,22 @@ def command(
     from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.commands.render import RenderRequest, render_file
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.volume import ReadOptions
 
-    if (camera is None) == (orbit is None):
-        raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    function = function_of(tf, tf_range, opacity_unit_distance, labels, light, layers)
-    render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite, function), console)
+    given: str | SourceRequest = file
+    function, options = None, block_options_of(blocks)
+    if is_splats(file) or (file == "-" and read["dims"] is None):
+        if ReadOptions(**read) != ReadOptions() or options is not None:
+            raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
+        tf, tf_range, distance, labels, layers = optics.values()
+        function = function_of(tf, tf_range, distance, labels, light, layers)
+    elif rule is not None:
+        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume: omit it")
+    else:
+        given = source_request(file, read, optics, light)
+    render_file(
+        RenderRequest(given, output, camera, orbit, size, rule, exr, background, overwrite, function, options), console
+    )

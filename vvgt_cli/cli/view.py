@@ -6,7 +6,14 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options, title_option
+from vvgt_cli.cli.options import (
+    common_options,
+    light_options,
+    overwrite_option,
+    placed_read_options,
+    tf_options,
+    title_option,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -34,6 +41,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @title_option
 @tf_options
+@light_options
 @placed_read_options
 @overwrite_option
 @common_options
@@ -46,6 +54,7 @@ def command(
     title: str | None,
     read: dict[str, Any],
     optics: dict[str, Any],
+    light: dict[str, Any],
     overwrite: bool,
     console: Console,
 ) -> None:
@@ -56,7 +65,8 @@ def command(
 
     A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
     address is printed; Ctrl-C stops the server. Several files, a glob, or an index written by convert form a series
-    with a slider.
+    with a slider. A series of volumes (a quoted glob, or a file of several time steps) is converted first, refined only
+    with -o.
 
     A folder with a lod-meta.json is streamed: near parts load in fine detail, far ones coarsely. FOLDER#1 is level 1
     alone.
@@ -69,6 +79,7 @@ def command(
       vvgt view example:frog
       vvgt view head.nrrd --tf bone.json
       vvgt view head_index.json
+      vvgt view 'run_*.vti' --tf viridis
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html
     """
@@ -80,6 +91,6 @@ def command(
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
     if not live and output is None:
         raise UsageError("--no-live is for a page that is saved; give -o OUT.html, or omit it")
-    source = source_request(files[0], read, optics)
+    source = source_request(files[0], read, optics, light)
     request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, title)
     view(request, lambda url: click.echo(url), console)

@@ -235,7 +235,7 @@ def _channels(content: Content) -> list[dict[str, Any]]:
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.field.layered import open_content
     from vvgt_cli.look import unit_distance
-    from vvgt_cli.look.histogram import fitting
+    from vvgt_cli.look.presets import fitting
     from vvgt_cli.volume import statistics
     from vvgt_cli.volume.label_maps import recognised
 
@@ -280,10 +280,11 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         **axis_facts(volume.affine, volume.space),
         "extent": volume.extent,
         "scaling": [volume.slope, volume.intercept],
+        **({"modality": volume.modality} if volume.modality else {}),
         "range": [numbers.lo, numbers.hi],
         "nan": numbers.nan_count,
         "inf": numbers.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
         **listed,
-        **({"tf": fits} if (fits := None if kinds else fitting(numbers, volume)) else {}),
+        **({} if kinds else {"tf": fitting(numbers, volume)}),
     }

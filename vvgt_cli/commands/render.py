@@ -1,35 +1,41 @@
-"""`render`: pictures or a movie of Gaussians."""
+"""`render`: pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import to_box_frame
+from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.commands.views_in_blocks import draw_in_blocks
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
-from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.images.movies import RATE, SUFFIXES, movie_ready, write_movie
-from vvgt_cli.jit.ahead import DRAW, for_degree
+from vvgt_cli.jit.ahead import DRAW, RAYCAST, for_blocks, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.volume.space import shear_text
 
-VIEWS_FILE = "transforms.json"
+VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
+Draw = Callable[[Camera], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -37,20 +43,22 @@ class RenderRequest:
     """Pictures to draw.
 
     Attributes:
-        ply: Gaussians, "-" for standard input; of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`).
-        output: directory for the images, or a movie by its ending (`vvgt_cli.images.movies.SUFFIXES`).
+        given: file of Gaussians, "-" for standard input, of streamed levels those that the name selects
+            (`vvgt_cli.gaussians.formats.levels`); or a volume with its look.
+        output: directory for the images, one picture (`PICTURE`), or a movie by its ending
+            (`vvgt_cli.images.movies.SUFFIXES`).
         camera: view-set file, or None.
-        orbit: number of views on a circle around the file's up axis, or None; one of the two is given.
-        size: image height in pixels; None: the view set's own, or what the file is made for.
-        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
+        orbit: number of views on a circle around the up axis, or None; not both. A single picture needs neither.
+        size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
+        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by; None: the file's.
         exr: write EXR too.
         background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
         overwrite: replace images that exist.
         function: look to show live Gaussians under; None: the look of the file.
+        blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
     """
 
-    ply: str
+    given: str | SourceRequest
     output: str
     camera: str | None = None
     orbit: int | None = None
@@ -60,6 +68,12 @@ class RenderRequest:
     background: tuple[float, float, float] | None = None
     overwrite: bool = False
     function: FunctionRequest | None = None
+    blocks: BlockOptions | None = None
+
+    @property
+    def single(self) -> bool:
+        """Return whether the output is one picture."""
+        return Path(self.output).suffix.lower() == PICTURE
 
     @property
     def movie(self) -> bool:
@@ -67,10 +81,21 @@ class RenderRequest:
         return Path(self.output).suffix.lower() in SUFFIXES
 
     def cameras(self, size: int | None = None, up: str = "none") -> list[Camera]:
-        """Return the views; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults."""
+        """Return the views; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults.
+
+        Raises:
+            UsageError: no views are given, or several for one picture.
+        """
+        if (self.camera is None) == (self.orbit is None) and not (self.single and self.camera is None):
+            raise UsageError("give the views with either --camera FILE or --orbit N, or one picture, as -o out.png")
         if self.camera is not None:
-            return read_cameras(self.camera, self.size)
-        cameras = orbit_views(self.orbit or 0, size=self.size or size or SIZE)
+            cameras = read_cameras(self.camera, self.size)
+        else:
+            cameras = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
+        if self.single and len(cameras) > 1:
+            raise UsageError(f"-o {self.output}: one picture of {len(cameras)} views; expected a directory")
+        if self.camera is not None:
+            return cameras
         return [to_box_frame(camera, upright_matrix(up))[0] for camera in cameras]
 
 
@@ -88,80 +113,125 @@ def _check_directory(request: RenderRequest, names: list[str]) -> None:
 
 
 def render_file(request: RenderRequest, console: Console | None = None) -> int:
-    """Write one PNG (and EXR) per view and `transforms.json`, or a movie of the views; return their number.
+    """Write one PNG (and EXR) per view and `transforms.json`, one picture, or a movie; return the number of views.
 
     Raises:
         UsageError: an image exists, or the directory cannot be made.
-        DataError: Gaussians or a view set that are not valid, or a missing library for movies.
+        DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
     """
     console = console or Console()
     run = Run(console, ConversionReport("render"))
     cameras = request.cameras()
-    if request.movie:
-        if request.exr:
-            raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
-        check_outputs([Output("-o", request.output)], [request.ply], request.overwrite)
-        movie_ready(request.output)
+    if request.movie and request.exr:
+        raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
+    if request.movie or request.single:
+        inputs = [request.given] if isinstance(request.given, str) else request.given.paths()
+        floats = [Output("--exr", str(Path(request.output).with_suffix(".exr")))] if request.exr else []
+        check_outputs([Output("-o", request.output), *floats], inputs, request.overwrite)
     else:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
-    with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request)
-        stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-    cameras, rule = request.cameras(header.made_for, header.up), file_rule(header, request.rule)
-    run.compile(for_degree(DRAW, gaussians.degree))
-    with run.stage("render") as stage:
-        note = (_movie if request.movie else _pictures)(request, console, seen, cameras, rule)
-        stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {rule.name} in {note}"
+    if request.movie:
+        movie_ready(request.output)
+    with ExitStack() as stack:
+        if isinstance(request.given, str):
+            draw, cameras, by = _gaussians(run, request, request.given)
+        else:
+            draw, by = _volume(run, request, request.given, cameras, stack)
+        with run.stage("render") as stage:
+            note = (_movie if request.movie else _pictures)(request, console, draw, cameras)
+            stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {by} in {note}"
     return len(cameras)
 
 
-def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
+def _gaussians(run: Run, request: RenderRequest, name: str) -> tuple[Draw, list[Camera], str]:
+    """Return the renderer of Gaussians, the views in their file's orientation, and the name of the rule."""
+    from vvgt_cli.splat import render
+
+    with run.stage("read") as stage:
+        seen, gaussians, header = _opened(request, name)
+        stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
+    rule = file_rule(header, request.rule)
+    run.compile(for_degree(DRAW, gaussians.degree))
+    return lambda camera: render(seen(camera), camera, rule), request.cameras(header.made_for, header.up), rule.name
+
+
+def _volume(
+    run: Run, request: RenderRequest, asked: SourceRequest, cameras: list[Camera], stack: ExitStack
+) -> tuple[Draw, str]:
+    """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
+    from vvgt_cli.dvr import RenderSettings, render_view
+
+    settings, options = RenderSettings(), request.blocks or automatic(asked, run.console)
+    if options is not None:
+        needs = FieldNeeds(1, cameras[0].height)
+        found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
+        source = _upright(found.source)
+        run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
+        return draw_in_blocks(found, settings, cameras), "ray casting in blocks"
+    with run.stage("read") as stage:
+        source = _upright(load(asked))
+        stage.note = describe_source(source)
+    run.compile(source.kernels(RAYCAST), source.kernel_type())
+    scene = source.scene()
+    return render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes), "ray casting"
+
+
+def _upright(source: Source) -> Source:
+    """Refuse a sheared volume, which no pinhole camera sees."""
+    if source.volume.sheared:
+        text = shear_text(source.volume.axes)
+        raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
+    return source
+
+
+def _opened(request: RenderRequest, name: str) -> tuple[Seen, Gaussians, PlyHeader]:
     """Return the Gaussians for a camera, those for all cameras or the coarsest level, and the header."""
-    manifest = by_view(request.ply)
+    manifest = by_view(name)
     if manifest is None:
-        gaussians, header = open_gaussians(request.ply)
-        gaussians = recolored(request.ply, gaussians, header, request.function)
+        gaussians, header = open_gaussians(name)
+        gaussians = recolored(name, gaussians, header, request.function)
         return lambda camera: gaussians, gaussians, header
     levels = StreamedLevels(manifest)
-    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
+    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
     turned = up_matrix(header.up)
 
     def seen(camera: Camera) -> Gaussians:
         field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
-        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), request.ply))
+        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), name))
 
-    return seen, recolored(request.ply, coarsest, header, request.function), header
+    return seen, recolored(name, coarsest, header, request.function), header
 
 
-def _pictures(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
-    """Write PNG, EXR and `transforms.json`; return the directory."""
+def _pictures(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
+    """Write PNG and EXR, and `transforms.json` beside several; return the directory or file."""
     from vvgt_cli.images import over, write_exr, write_png
-    from vvgt_cli.splat import render
 
-    directory = Path(request.output)
-    directory.mkdir(exist_ok=True)
+    where = Path(request.output)
+    if not request.single:
+        where.mkdir(exist_ok=True)
     bar = console.bar("render")
     for done, camera in enumerate(cameras, 1):
-        image = render(seen(camera), camera, rule)
+        image = draw(camera)
+        path = where if request.single else where / f"{camera.name}.png"
         if request.exr:
-            write_exr(directory / f"{camera.name}.exr", image, camera=camera, overwrite=request.overwrite)
+            write_exr(path.with_suffix(".exr"), image, camera=camera, overwrite=request.overwrite)
         shown = image if request.background is None else over(image, request.background)
-        write_png(directory / f"{camera.name}.png", shown, request.overwrite)
+        write_png(path, shown, request.overwrite)
         if bar:
             bar(done, len(cameras))
-    write_text(str(directory / VIEWS_FILE), transforms_json(cameras), request.overwrite)
-    return str(directory)
+    if not request.single:
+        write_text(str(where / VIEWS_FILE), transforms_json(cameras), request.overwrite)
+    return str(where)
 
 
-def _movie(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
+def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
     """Write one movie; return its name and what it holds.
 
     Raises:
         UsageError: views of several sizes.
     """
     from vvgt_cli.images import over
-    from vvgt_cli.splat import render
 
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise UsageError(f"-o {request.output}: views of several sizes; a movie has one: give --size")
@@ -169,7 +239,7 @@ def _movie(request: RenderRequest, console: Console, seen: Seen, cameras: list[C
 
     def pictures() -> Iterator[np.ndarray]:
         for done, camera in enumerate(cameras, 1):
-            yield over(render(seen(camera), camera, rule), request.background or BLACK)
+            yield over(draw(camera), request.background or BLACK)
             if bar:
                 bar(done, len(cameras))
 

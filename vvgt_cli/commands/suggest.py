@@ -20,6 +20,7 @@ def suggest_transfer_functions(
         UsageError: a file that exists, or a folder that cannot be made.
         DataError: invalid input, or data of a single value.
     """
+    from vvgt_cli.look.presets import fitting
     from vvgt_cli.look.suggest import suggest
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.volume import statistics
@@ -46,4 +47,6 @@ def suggest_transfer_functions(
         stage.note = f"{count} functions in {folder}"
     for path, suggestion in zip(paths, suggestions, strict=True):
         run.console.message(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
+    preset = fitting(numbers, grid)
+    run.console.message(f"preset that fits: --tf {preset}" if preset else "no preset fits ('vvgt tf list')")
     return paths

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 import time
 import webbrowser
 from collections.abc import Callable, Sequence
@@ -43,7 +44,8 @@ class ViewRequest:
     """Gaussians or a volume to show.
 
     Attributes:
-        files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume.
+        files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume, or one
+            series of volumes: a glob, or a file of several time steps.
         source: how to read the volume, and its function; left at its defaults for files of Gaussians.
         output: file to write instead of showing, None for none.
         port: of the server; 0 takes a free one.
@@ -78,6 +80,9 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
     """
     run = Run(console or Console(), ConversionReport("view"))
     clouds = named_files(request.files)
+    if len(clouds) == 1 and _is_series(source := replace(request.source, volume=clouds[0][1])):
+        _show_series(run, request, source, announce)
+        return
     if request.output is None:
         _serve(run, request, clouds, announce)
         return
@@ -90,6 +95,40 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         write_gaussians(run, request.output, gaussians, options, request.overwrite, editor=editor)
         run.compile(for_degree(DRAW, gaussians.degree))
         report_agreement(run, request.output, gaussians, options)
+
+
+def _is_series(source: SourceRequest) -> bool:
+    """Return whether a volume is several frames: a glob of files, or a file of several time steps."""
+    from vvgt_cli.conversion.frames import is_glob_of_volumes, list_steps
+
+    if source.path == STDIN or is_splats(source.path) or is_streamed(source.path):
+        return False
+    return is_glob_of_volumes(source.path) or (
+        os.path.isfile(source.path) and source.read.time is None and len(list_steps(source)) > 1
+    )
+
+
+def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce: Callable[[str], None]) -> None:
+    """Convert the frames of a volume: refined to a page that is written, or as live Gaussians that are shown."""
+    from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+
+    if request.output is not None:
+        if not is_page(request.output):
+            raise UsageError(f"-o {request.output}: holds one frame; expected a page (.html), or --time N")
+        whole = ConvertRequest(source, request.output, overwrite=request.overwrite, title=request.title)
+        convert_files(whole, console=run.console)
+        return
+    with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
+        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=request.title)
+        try:
+            convert_files(quick, console=run.console)
+        except UsageError as error:  # what has no live form takes longer
+            run.console.message(f"converted without a live form: {error}")
+            convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
+        clouds = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
+        shown = replace(request, files=tuple(file for _, file in clouds), source=SourceRequest(source.path))
+        _serve(run, shown, clouds, announce)
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
@@ -110,10 +149,10 @@ def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
     """Refuse options for volumes with a file of Gaussians."""
-    plain = SourceRequest(given.volume)
-    if replace(given, volume=plain.volume, light=plain.light) != plain:
+    if given != SourceRequest(given.volume):
         raise UsageError(
-            f"{name} holds Gaussians; --tf, --labels, --layer and reading options are for volumes only: omit them"
+            f"{name} holds Gaussians; --tf, --labels, --layer, light and reading options are for volumes only: omit "
+            "them ('vvgt recolor' relights live files)"
         )
 
 
@@ -124,7 +163,8 @@ def _only_gaussians(files: Sequence[str]) -> None:
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(
-            f"{(volumes or [STDIN])[0]}: not Gaussians; a series needs files of Gaussians: convert it first"
+            f"{(volumes or [STDIN])[0]}: not Gaussians; expected files of Gaussians, or one volume: for a series of "
+            "volumes, quote the pattern so that the shell does not expand it, as 'run_*.vti'"
         )
 
 

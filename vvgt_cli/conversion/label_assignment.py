@@ -103,9 +103,12 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
             _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
     found: np.ndarray = votes.argmax(axis=1)
     lost = votes.max(axis=1) == 0
-    colors = np.array([label.color for *_, label in shown])
+    colors, own = (
+        rgb / np.maximum(rgb.max(axis=1, keepdims=True), 1e-3)  # lit ones are darker
+        for rgb in (np.array([label.color for *_, label in shown]), gaussians.colors)
+    )
     for k in np.flatnonzero(lost):
-        found[k] = np.abs(colors - gaussians.colors[k]).sum(axis=1).argmin()
+        found[k] = np.abs(colors - own[k]).sum(axis=1).argmin()
     return found
 
 

@@ -26,7 +26,7 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
@@ -143,7 +143,7 @@ def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) ->
     if len(labels) == 1 or len({id(label.volume) for label in labels}) > 1:
         return [_alone(label, console) for label in labels]  # a Gaussian would mix colours of overlapping segments
     whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
-    plain = replace(whole, source=replace(whole.source, light=LightOptions()))
+    plain = replace(whole, source=replace(whole.source, light=LightOptions((NONE,))))
     with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None

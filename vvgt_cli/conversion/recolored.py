@@ -32,7 +32,8 @@ class FunctionRequest:
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         labels: for a label map, a table of labels, its file, or "auto"; None: the table of the file.
-        light: options of the light; without options that of the function's file, else that of the Gaussians' file.
+        light: options of the light; without options that of a new look (of the first layer's), else that of the
+            Gaussians' file.
         layers: for a file of several layers or channels, looks of some of them; the others keep theirs.
     """
 
@@ -169,19 +170,19 @@ def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRe
     if function.layers:
         first = function.layers[0].layer
         raise UsageError(f"{name}: has one layer; expected --tf or --labels instead of --layer {first}")
-    tf, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
+    own, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
     if isinstance(shown, LabelTable):
         check_labels([shown])
     else:
         check_visible(shown, header.live.statistics())
-    light = light_of(function.light, tf.lighting or header.light, header.space)
+    light = light_of(function.light, own or header.light, header.space)
     return shown, _options(header, shown, distance, label, light)
 
 
 def _layer_look(
     name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: FunctionRequest, recorded: float | None
-) -> tuple[TransferFunction | LabelTable, TransferFunction | LabelTable, float, str]:
-    """Return the look of one layer as given and on its values, its opacity unit distance, and how that was chosen.
+) -> tuple[Lighting | None, TransferFunction | LabelTable, float, str]:
+    """Return the light of a new look, the look on the layer's values, its unit distance, and how that was chosen.
 
     ``recorded`` is the unit distance in the file.
     """
@@ -191,7 +192,8 @@ def _layer_look(
     given, asked = function.labels if facts.labels else function.tf, function.unit_distance
     if given is None and asked is None and recorded is not None:
         asked = repr(recorded)
-    return tf, shown, *unit_distance(asked, grid_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    distance = unit_distance(asked, grid_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    return None if given is None else tf.lighting, shown, *distance
 
 
 def _options(
@@ -225,8 +227,7 @@ def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionReques
         one = asked.get(k, LayerLook(""))
         request = FunctionRequest(one.tf, "data", one.unit_distance, one.labels)
         placed.append(_layer_look(f"{name}, layer {k}", header, layer, request, layer.distance))
-    presets = [tf.lighting for tf, *_ in placed if tf.lighting is not None]
-    light = light_of(function.light, presets[0] if presets else header.light, header.space)
+    light = light_of(function.light, placed[0][0] or header.light, header.space)
     looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
     return looks, _options(header, looks, *placed[0][2:], light)
 

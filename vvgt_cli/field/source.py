@@ -39,7 +39,7 @@ class SourceRequest:
         unit_distance: a length, "paraview" or "mean-spacing"; None is the function's own distance, else "paraview".
         statistics: one per component, of the whole series; they replace the volume's own in placing the functions'
             nodes.
-        light: lighting; by default that of the function's file, if it has any.
+        light: lighting; by default that of the first layer's function or table, if it has any.
         labels: label table or its file, "auto" or "none"; None is "auto" for a recognised label map.
         layers: volumes laid over it, each with its own look but the same light.
     """
@@ -155,7 +155,8 @@ class Source:
     @property
     def title(self) -> str:
         """Kind and size of the volume, which identify no file and nobody."""
-        kind = "CT" if self.volume.hounsfield else "label map" if self.labels_alone else "volume"
+        kind = "label map" if self.labels_alone else self.volume.modality
+        kind = kind or ("CT" if self.volume.hounsfield else "volume")
         return f"{kind}, {' x '.join(map(str, self.volume.dims))}"
 
     @property
@@ -325,7 +326,6 @@ def _layered(
     access: Access,
 ) -> Source:  # fmt: skip
     """Return the optics grid that is the sum of a volume and its layers."""
-    lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
         try:
@@ -336,6 +336,7 @@ def _layered(
                 f"{name}: {error.steps} time steps; expected one per layer: --layer FILE,time=N (0 to {last})"
             ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
+    lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
     numbers = access.statistics(layers[0].volume)
     _check_seen(layers, access)
     grid = common_grid(layers, content.stored)
@@ -371,6 +372,7 @@ def describe_source(source: Source) -> str:
     values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
+    light += " (its own; --light none omits it)" if light and source.lighting == source.tf.lighting else ""
     name = source.name if len(source.layers) > 1 else source.tf.name
     return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
 

@@ -69,7 +69,7 @@ class Look:
         range: "data", "rescale" or (lo, hi): position of the function's nodes.
         unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
         light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: that
-            of the function's file.
+            of the function or label table (of the first layer), which presets such as ct-bone have.
         labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
     """
@@ -178,6 +178,7 @@ class Reading(TypedDict, total=False):
     space: str
     crop: str
     mask: Any
+    keep_largest: float
     affine: Any
     origin: Sequence[float]
 

@@ -10,9 +10,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.names import named_function
-from vvgt_cli.look.recognise import SIDE, background_bins, foreground, in_hounsfield, moments
+from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
 from vvgt_cli.look.resolve import StatisticsLike, resolve
-from vvgt_cli.volume.types import Volume
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"
@@ -24,9 +23,6 @@ DEPTH = 4.0  # optical depth of the foreground along the longest edge, on averag
 RISE = 2.0  # power of the distance from the background by which ranges of values share that depth
 NODES = 33  # of opacity, a side
 SMOOTH = 3.0  # filled bins: standard deviation of what counts are averaged by
-LUNG, EDGE, BODY, BONE = (-900.0, -600.0), (-500.0, -200.0), (-500.0, np.inf), (300.0, np.inf)  # HU
-MUCH_LUNG, SOME_BONE = 0.12, 0.005  # of the voxels of the body, and of lungs
-OVER_BONE = 2.5  # times as many voxels as bone has are lungs in a chest; a skull has more bone than that
 LABELS = 0.25  # share of the bins up to which those that are filled are values of their own, not averaged
 OPAQUE = 0.5  # most opacity per unit distance
 FAINT = 0.01  # opacity of data of a single value
@@ -164,30 +160,3 @@ def worth_showing(side: slice, counts: np.ndarray) -> bool:
     inside = counts[side]
     # of the foreground as a whole: all but the voxels of the highest bin, which is always background
     return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
-
-
-def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
-    """Return the name of a function that shows something of a volume, None if none is made for such data.
-
-    Densities get contours. Hounsfield units get the lungs if they are large, else bone if there is any, else soft
-    tissue. Voxels on a surface to air have any value in between, `EDGE`'s as often as `LUNG`'s; foam of head rests lies
-    below. Other volumes in an anatomical space, with a background, are treated as MR of a head.
-    """
-    counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
-    if not counts.any() or statistics.lo == statistics.hi:
-        return None
-    if volume.density:
-        return contours(counts, edges)
-    if volume.hounsfield or in_hounsfield(counts, edges):
-        lung, edge, body, bone = (_share(counts, edges, *span) for span in (LUNG, EDGE, BODY, BONE))
-        lung -= edge
-        if lung > max(MUCH_LUNG * (lung + body), OVER_BONE * bone):
-            return "ct-lung"
-        return "ct-bone" if bone > SOME_BONE * body else "ct-soft-tissue"
-    return "mr-head" if volume.space is not None and foreground(counts) is not counts else None
-
-
-def _share(counts: np.ndarray, edges: np.ndarray, lo: float, hi: float) -> float:
-    """Return the number of voxels with values from ``lo`` to ``hi``, interpolated linearly within bins."""
-    below = np.interp((lo, hi), edges, np.concatenate([[0.0], np.cumsum(counts)]))
-    return float(below[1] - below[0])

@@ -12,6 +12,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import Named
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
@@ -51,7 +52,7 @@ class LabelTable:
 
     name: str
     labels: tuple[Label, ...]
-    lighting = None
+    lighting = Lighting(ambient=0.4, diffuse=0.6, specular=0.0)  # head-on a label has its own colour
     opacity_unit_distance = None
     opacity_unit_share = None
 

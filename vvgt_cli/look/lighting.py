@@ -144,6 +144,9 @@ class LightOptions:
         return Lighting(HEADLIGHT in self.lights, fixed, **(kept | given))
 
 
+MATTE = Lighting(ambient=0.2, diffuse=1.0, specular=0.0)  # as most presets of 3D Slicer have it
+
+
 def _directions(lights: Sequence[str], space: str | None) -> tuple[Direction, ...]:
     return tuple(_direction(light, space) for light in lights)
 

@@ -51,7 +51,19 @@ def _foot(falling: np.ndarray) -> int:
 
 
 def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
-    """Return whether data values are Hounsfield units: one of their peaks is air's, another one tissue's."""
+    """Return whether data values are Hounsfield units.
+
+    One of their peaks is air's and another one tissue's; or the background is air, and values reach beyond tissue (a
+    skull, or what a mask keeps of a scan).
+    """
+    if air_and_tissue(counts, edges):
+        return True
+    first, last = background_bins(counts)
+    return first < last and AIR[0] <= edges[first] and edges[last] <= AIR[1] and edges[-1] > TISSUE[1]
+
+
+def air_and_tissue(counts: np.ndarray, edges: np.ndarray) -> bool:
+    """Return whether one peak of data values is air's, and another one tissue's."""
     cumulative = np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum()
     spans = (AIR, BETWEEN, TISSUE)
     air, between, tissue = (float(np.diff(np.interp(span, edges, cumulative))[0]) for span in spans)

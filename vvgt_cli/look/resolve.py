@@ -81,7 +81,9 @@ def resolve(
     lo, hi = _data_range(statistics)
     if tf.otherwise is not None and chosen == "data" and not (hounsfield or _in_hounsfield(statistics)):
         warnings.warn(
-            f"{tf.name}: the data are not in Hounsfield units; shown by {BY[tf.otherwise.domain]}", stacklevel=2
+            f"{tf.name}: values {lo:g} to {hi:g} are not in Hounsfield units; shown by {BY[tf.otherwise.domain]}, a "
+            "guess: compare with no --tf, or give --tf-range LO,HI",
+            stacklevel=2,
         )
         tf = replace(tf.otherwise, name=f"{tf.name} ({BY[tf.otherwise.domain]})")
     if tf.domain in BY:

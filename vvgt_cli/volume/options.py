@@ -32,6 +32,7 @@ class ReadOptions:
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
         crop: ``x0:x1,y0:y1,z0:z1``, the voxels to keep, as `vvgt_cli.volume.cut.parse_crop` has it.
         mask: file or `Volume` of the same size (before or after ``crop``); where it is 0 nothing is shown.
+        keep_largest: data value; of what lies above, all but the largest connected body is hidden.
         packed: values are read front to back only, so that compressed ones may stay in the file
             (`vvgt_cli.volume.blocks.Packed`).
         stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
@@ -52,6 +53,7 @@ class ReadOptions:
     space: str | None = None
     crop: str | None = None
     mask: str | Volume | None = None
+    keep_largest: float | None = None
     packed: bool = False
     stored: bool = False
     level: int | None = None
@@ -73,6 +75,7 @@ class ReadOptions:
             ("space", self.space, self.space in (None, "RAS", "LPS"), "RAS or LPS"),
             ("component", part, part != "" and not (isinstance(part, int) and part < 0),
              "an index (0, 1, ...), a channel's name or magnitude"),
+            ("keep-largest", self.keep_largest, math.isfinite(self.keep_largest or 0), "a finite data value"),
             ("level", self.level, (self.level or 0) >= 0, "full, or the number of a level (0, 1, ...)"),
             ("time", self.time, (self.time or 0) >= 0, "the index of a time step (0, 1, ...)"),
         ):  # fmt: skip

@@ -14,6 +14,7 @@ from typing import Any
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.blocks import read_head
+from vvgt_cli.volume.bodies import without_other_bodies
 from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
@@ -48,13 +49,13 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     options = options or ReadOptions()
     if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
-    if options.crop is not None or options.mask is not None:
+    if (options.crop, options.mask, options.keep_largest) != (None, None, None):
         options = replace(options, packed=False)
     return cut(in_space(_read(source, options), options.space), options)
 
 
 def cut(volume: Volume, options: ReadOptions) -> Volume:
-    """Apply the options' mask and crop to a volume.
+    """Apply the options' crop, mask and largest body to a volume.
 
     Raises:
         DataError: a mask of another size.
@@ -66,7 +67,10 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
-    return volume if mask is None else masked(volume, mask, options.stored)
+    volume = volume if mask is None else masked(volume, mask, options.stored)
+    if options.keep_largest is None:
+        return volume
+    return masked(volume, without_other_bodies(volume, options.keep_largest), options.stored)
 
 
 def _read(source: str, options: ReadOptions) -> Volume:

@@ -65,6 +65,7 @@ class Volume:
         slope, intercept: stored-value scaling (NIfTI, DICOM), slope finite and not 0.
         space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
         hounsfield: whether the file says that data values are Hounsfield units.
+        modality: as DICOM abbreviates it, "CT" or "MR"; "" unknown.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
@@ -87,6 +88,7 @@ class Volume:
     reference: str | None = None
     density: bool = False
     unit: str = ""
+    modality: str = ""
     quantity: str = ""
     value_unit: str = ""
 

@@ -22,7 +22,7 @@ from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.lighting import MOST, Lighting
+from vvgt_cli.look.lighting import MATTE, MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume.types import triple
 
@@ -198,8 +198,8 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
-    """Return the initial light of the page: the file's headlight, else its first light, or none."""
-    one = lighting or Lighting()
+    """Return the initial light of the page: the file's headlight, else its first light, or none, of `MATTE` matter."""
+    one = lighting or MATTE
     kind = "none" if lighting is None else "headlight" if one.headlight else "direction"
     toward = np.array(one.directions[0] if one.directions else (-0.5, -0.7, 0.5)) @ axes
     return {

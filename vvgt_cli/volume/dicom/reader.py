@@ -23,6 +23,7 @@ from vvgt_cli.volume.dicom.files import Source, headers_in, read_file
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Files, choose_series, one_stack
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
@@ -110,6 +111,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         f"{path.resolve().name.removesuffix('.dcm').removesuffix('.zip')}{title}", slope, intercept,
         "LPS" if slices[0].placed else None, all(s.hounsfield for s in slices),
         None if reference is None else str(reference),
+        modality=printable(str(slices[0].header.get("Modality", "")))[:16],
     )  # fmt: skip
     return volume if heights is None else _resampled(volume, heights, options, path)
 

@@ -1,0 +1,49 @@
+"""What leaves with a file of Gaussians, for `vvgt info --sharing`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians.formats import is_splats, read_splats
+from vvgt_cli.gaussians.formats.page_live import HELD
+
+OURS = ("vvgt ", "SplatRenderMode")
+FACE = (
+    "shows what the volume shows, such as the face of a head whose skin is visible: --crop, --mask or a function "
+    "without skin removes it"
+)
+LATER = "; other functions can be chosen later, which show what this one hides"
+
+
+def what_leaves(file: str) -> dict[str, Any]:
+    """Return what a file of Gaussians or a page of one cloud holds besides Gaussians: names, dates, places, values.
+
+    Raises:
+        DataError: a file that is not valid.
+        UsageError: not a file of Gaussians.
+    """
+    if not is_splats(file):
+        raise UsageError(
+            f"--sharing {file}: not Gaussians; expected a .ply, a page or another file that 'convert' wrote"
+        )
+    _, header = read_splats(file)
+    layers = () if header.live is None else header.live.layers
+    page = Path(file).suffix.lower() == ".html"
+    live = bool(layers) or (page and f'id="{HELD}-0"' in Path(file).read_text("utf-8"))
+    names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
+    legend = json.loads(header.legend or "{}")
+    made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
+    found = {
+        "title": header.title, "function": header.function, "date": header.date,
+        "command": made and made.command, "checksum": made and made.sha256,
+        "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
+        "place": header.space in ("RAS", "LPS") and header.affine and "position and directions in the scanner",
+        "values": live and "data values under each Gaussian, and their histogram",
+        "other": [text for text in header.comments if not text.startswith(OURS)],
+    }  # fmt: skip
+    facts |= {key: value for key, value in found.items() if value}
+    facts["picture"] = FACE + LATER * live
+    return facts | {"remove": "--no-comments omits all but the picture and the values, --title names it otherwise"}
