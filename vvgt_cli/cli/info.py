@@ -20,7 +20,7 @@ from vvgt_cli.progress import Console
 @click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file", required=False)
 @click.option("--machine", is_flag=True, help="Describe this machine instead: processors, memory, GPU.")
-@click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, dates, values.")
+@click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, places, values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
 @layer_looks_option

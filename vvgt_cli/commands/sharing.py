@@ -19,7 +19,7 @@ LATER = "; other functions can be chosen later, which show what this one hides"
 
 
 def what_leaves(file: str) -> dict[str, Any]:
-    """Return what a file of Gaussians or a page of one cloud holds besides Gaussians: names, dates, places, values.
+    """Return what a file of Gaussians or a page of one cloud holds besides Gaussians: names, places, values.
 
     Raises:
         DataError: a file that is not valid.
@@ -37,7 +37,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     legend = json.loads(header.legend or "{}")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
     found = {
-        "title": header.title, "function": header.function, "date": header.date,
+        "title": header.title, "function": header.function,
         "command": made and made.command, "checksum": made and made.sha256,
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
         "place": header.space in ("RAS", "LPS") and header.affine and "position and directions in the scanner",

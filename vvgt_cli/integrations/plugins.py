@@ -15,6 +15,7 @@ PLUGINS = {  # file of each, in this folder; its docstring has the lines "Tried:
     "napari": "napari.py",
     "jupyter": "jupyter.py",
     "xarray": "xarray.py",
+    "blender": "blender/gaussian_splats/__init__.py",
 }
 
 
@@ -46,5 +47,6 @@ def plugin(name: str) -> Plugin:
     path = FOLDER / PLUGINS[name]
     lines = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()
     tried = next(line.removeprefix("Tried:").strip() for line in lines if line.startswith("Tried:"))
-    enable = [line.strip().format(file=path, folder=path.parent) for line in lines[lines.index("Enable:") + 1 :]]
+    places = {"file": path, "folder": path.parent, "above": path.parents[1]}
+    enable = [line.strip().format(**places) for line in lines[lines.index("Enable:") + 1 :]]
     return Plugin(name, path, lines[0], tried, tuple(filter(None, enable)))
