@@ -32,7 +32,8 @@ def what_leaves(file: str) -> dict[str, Any]:
     _, header = read_splats(file)
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
-    live = bool(layers) or (page and f'id="{HELD}-0"' in Path(file).read_text("utf-8"))
+    text = Path(file).read_text("utf-8") if page else ""
+    live = bool(layers) or f'id="{HELD}-0"' in text
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
@@ -42,7 +43,8 @@ def what_leaves(file: str) -> dict[str, Any]:
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
         "place": header.space in ("RAS", "LPS") and header.affine and "position and directions in the scanner",
         "values": live and "data values under each Gaussian, and their histogram",
-        "other": [text for text in header.comments if not text.startswith(OURS)],
+        "slices": 'id="slices-0"' in text and "of the volume, also of what its look hides",
+        "other": [line for line in header.comments if not line.startswith(OURS)],
     }  # fmt: skip
     facts |= {key: value for key, value in found.items() if value}
     facts["picture"] = FACE + LATER * live
