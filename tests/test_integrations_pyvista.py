@@ -62,6 +62,11 @@ def test_a_plotter_without_a_volume_is_refused(tmp_path: Path) -> None:
     empty = pyvista.Plotter(off_screen=True)
     with pytest.raises(vvgt.UsageError, match=r"shows no volume; call plotter.add_volume"):
         vvgt.export_plotter(empty, tmp_path / "a.html")
+    unnamed = plotter()
+    unnamed.mapper.SetScalarModeToUseCellFieldData()
+    unnamed.mapper.SelectScalarArray("other")
+    with pytest.raises(vvgt.UsageError, match="ImageData without an array that its mapper draws; expected"):
+        vvgt.export_plotter(unnamed, tmp_path / "a.html")
     two = pyvista.wrap(lump())
     two["pair"] = np.ones((two.n_points, 2), np.float32)
     shown = plotter()
@@ -70,6 +75,13 @@ def test_a_plotter_without_a_volume_is_refused(tmp_path: Path) -> None:
     shown.mapper.SetInputData(two)
     with pytest.raises(vvgt.UsageError, match="pair: two dependent components"):
         vvgt.export_plotter(shown, tmp_path / "a.html", FEW)
+
+
+def test_shading_of_further_volumes_is_named(tmp_path: Path) -> None:
+    shown = plotter(pyvista.wrap(lump()), pyvista.wrap(lump()), shade=True, ambient=0.3)
+    shown.volume.prop.ambient = 0.6  # of the second
+    with pytest.warns(UserWarning, match="plotter: ambient, diffuse, specular and power of other volumes than the"):
+        vvgt.export_plotter(shown, tmp_path / "a.ply", FEW)
 
 
 def test_volumes_beside_each_other_are_lit_as_the_plotters(tmp_path: Path) -> None:

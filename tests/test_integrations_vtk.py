@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingVolumeOpenGL2  # noqa: F401  # registers what the classes below become
+from vtkmodules.vtkCommonCore import vtkFloatArray
 from vtkmodules.vtkCommonDataModel import vtkImageData, vtkPiecewiseFunction, vtkPlane
 from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkRenderingCore import (
@@ -141,6 +142,28 @@ def test_a_moved_volume_is_where_vtk_draws_it():
         )
 
 
+def test_the_array_is_the_mappers_own():
+    """Of cells beside active scalars of points, of the same name; a mapper without data draws nothing."""
+    data, cells = image(), vtkFloatArray()
+    cells.SetName("ramp")
+    cells.SetNumberOfTuples(data.GetNumberOfCells())
+    cells.Fill(7)
+    data.GetCellData().AddArray(cells)
+    renderer, volume = shown(data)
+    assert drawn(volume).array is data.GetPointData().GetScalars()
+    volume.GetMapper().SetScalarModeToUseCellFieldData()
+    volume.GetMapper().SelectScalarArray("ramp")
+    found = drawn(volume)
+    assert found.array is cells
+    assert (volume_in_memory(found.data, ReadOptions()).data == 7).all()
+    volume.GetMapper().SelectScalarArray("other")
+    assert drawn(volume).array is None
+    empty = vtkVolume()
+    empty.SetMapper(vtkFixedPointVolumeRayCastMapper())
+    renderer.AddVolume(empty)
+    assert volumes_of(renderer) == [volume]
+
+
 def test_an_uneven_scale_is_named():
     _, volume = shown(image())
     volume.SetScale(1, 1, 8)
@@ -202,6 +225,11 @@ def test_camera_and_lights():
     light.SetFocalPoint(0, 0, 0)
     renderer.AddLight(light)
     assert lights_of(renderer) == (["3.0,0.0,1.0"], [])
+    light.SwitchOff()
+    assert lights_of(renderer) == (["headlight"], [])  # which VTK makes when it draws
+    renderer.AutomaticLightCreationOff()
+    assert lights_of(renderer) == (["headlight"], ["absence of lights (headlight instead)"])
+    light.SwitchOn()
     light.SetIntensity(0.5)
     light.SetPositional(True)
     assert len(lights_of(renderer)[1]) == 2
@@ -216,6 +244,11 @@ def test_the_command_is_found_by_variable_and_path(monkeypatch, tmp_path):
     with pytest.raises(RuntimeError, match="no such file"):
         command.run([], heard.append)
     assert heard == ["convert a"]  # an error is raised, not told as well
+    place = tmp_path / "my \\programs" / "vvgt"
+    place.parent.mkdir()
+    place.symlink_to("/bin/echo")
+    monkeypatch.setenv("VVGT", str(place))
+    assert command.command() == [str(place)]
     monkeypatch.delenv("VVGT")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RuntimeError, match="not in PATH; install it"):

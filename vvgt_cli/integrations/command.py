@@ -19,7 +19,8 @@ def command() -> list[str]:
         RuntimeError: there is none.
     """
     given = os.environ.get("VVGT")
-    found = shlex.split(given) if given else [place] if (place := shutil.which("vvgt")) else []
+    whole = shutil.which(given or "vvgt")  # a path may hold spaces and backslashes
+    found = [whole] if whole else shlex.split(given or "")
     if not found or shutil.which(found[0]) is None:
         what = f"VVGT={given}: no such program" if given else "vvgt: not in PATH"
         raise RuntimeError(f"{what}; install it (pip install vvgt) or set VVGT to its path, as /opt/venv/bin/vvgt")

@@ -57,8 +57,8 @@ def words(folder: Path, volume: Any = None, segmentation: Any = None, renderer: 
         taken += ["--layer", path] if taken else [path]
         notes = notes + more
     if renderer is not None:
-        camera, _, more = neighbour("vtk_view").camera_of(renderer)
-        taken += ["--camera", camera]
+        camera, up, more = neighbour("vtk_view").camera_of(renderer)
+        taken += ["--camera", camera, "--up", up]
         notes = notes + more
     return taken, notes
 

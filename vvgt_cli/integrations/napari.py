@@ -20,8 +20,10 @@ from napari.layers import Layer
 
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.errors import UsageError
-from vvgt_cli.library.functions import convert, read_volume
-from vvgt_cli.library.inputs import Look, source_of
+from vvgt_cli.field.layered import Content
+from vvgt_cli.integrations.layers import together
+from vvgt_cli.library.functions import read_volume
+from vvgt_cli.library.inputs import Look
 
 NODES = 33  # of a colour map, which napari interpolates between 256 colours
 
@@ -52,9 +54,8 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
 
 
 def _converted(layers: Sequence[Any], step: int) -> Any:
-    """Convert a time step: the first layer with the others laid over it."""
-    first, *others = [(_volume(layer, step), _look(layer)) for layer in layers]
-    return convert(first[0], replace(first[1], layers=[source_of(*other, {}) for other in others]))
+    """Convert a time step of all layers, unlit: napari's views of images have no light."""
+    return together([(Content((_volume(layer, step),)), _look(layer)) for layer in layers], "none")
 
 
 def _values(layer: Any) -> Any:

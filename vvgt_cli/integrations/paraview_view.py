@@ -23,15 +23,13 @@ def representation_of(source: Any) -> tuple[Any, Any]:
     view = None if connection is None or connection.IsRemote() else simple.GetActiveView()
     if view is None or not hasattr(view.SMProxy, "GetRenderer"):
         return None, None
-    upstream = []
+    upstream = []  # nearest first
     while source is not None:
         upstream.append(source)
         source = source.GetInputAlgorithm(0, 0) if source.GetNumberOfInputPorts() else None
-    for one in view.Representations:
-        shown = getattr(one, "Input", None)
-        if shown is not None and one.Visibility and shown.SMProxy.GetClientSideObject() in upstream:
-            return one, view
-    return None, view
+    inputs = [(getattr(one, "Input", None), one) for one in view.Representations]
+    shown = [(made.SMProxy.GetClientSideObject(), one) for made, one in inputs if made is not None and one.Visibility]
+    return next((one for at in upstream for made, one in shown if made is at), None), view
 
 
 def look(source: Any, options: dict[str, Any], function: str) -> tuple[list[str], list[float] | None, list[str]]:

@@ -9,31 +9,22 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
-
-import numpy as np
 
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content
-from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.header import camera_of as camera_in
+from vvgt_cli.integrations.layers import Layer, together
 from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import Drawn, drawn, volumes_of
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of
-from vvgt_cli.library.functions import convert
 from vvgt_cli.library.inputs import GoalLike, Look, Reading, volume_of
-from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.volume import Volume
-from vvgt_cli.volume.types import triple
 
-FINER = 8  # times as fine as the first volume a layer may be
-SLACK = 1e-3  # voxels
-AROUND = "around"  # name of an empty volume that holds all
+COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 
 
 def export_plotter(
@@ -71,9 +62,10 @@ def export_plotter(
         notes.append("volumes without shading beside shaded ones")
     light = LightOptions(tuple(lights))
     if shaded:
-        lighting = read_transfer_function(property_json(shaded[0])[0]).lighting
-        names = ("ambient", "diffuse", "specular", "specular_power")
-        light = replace(light, **{name: getattr(lighting, name) for name in names})
+        lighting, *others = [read_transfer_function(property_json(one)[0]).lighting for one in shaded]
+        light = replace(light, **{name: getattr(lighting, name) for name in COEFFICIENTS})
+        if any(getattr(one, name) != getattr(lighting, name) for one in others for name in COEFFICIENTS):
+            notes.append("ambient, diffuse, specular and power of other volumes than the first shaded one")
     if not renderer.camera.is_set:  # before anything was drawn; the same happens in show()
         renderer.camera_position = renderer.get_default_cam_pos()
         renderer.ResetCamera()
@@ -81,12 +73,7 @@ def export_plotter(
     notes += unlike + askew
     if notes:
         warnings.warn(f"not taken from the plotter: {'; '.join(dict.fromkeys(notes))}", stacklevel=2)
-    (first, function), *rest = _ordered(layers)
-    look = Look(function, light=light, layers=[SourceRequest(content, tf=tf) for content, tf in rest])
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", f"{AROUND}, none: nothing is visible")
-        result = convert(first, look, goal, live=live, progress=progress)
-    assert isinstance(result, Conversion)
+    result = together(layers, light, goal, live=live, progress=progress)
     result.ply = replace(result.ply, camera=camera_in(camera.split(",")), up=up)
     result.save(path, overwrite=overwrite)
     return result
@@ -99,14 +86,16 @@ def _others(renderer: Any) -> list[str]:
     return [f"{count} surface{'s' * (count > 1)}"] if count else []
 
 
-def _layers(found: Drawn, prop: Any) -> tuple[list[tuple[Content, TransferFunction]], list[str]]:
+def _layers(found: Drawn, prop: Any) -> tuple[list[Layer], list[str]]:
     """Return a volume's components, or its own colours, each with its function, and notes.
 
     Raises:
-        UsageError: opacity of another component than that of the colours.
+        UsageError: nothing that is drawn, or opacity of another component than that of the colours.
     """
-    data = found.data.GetPointData() if found.data.GetPointData().GetScalars() else found.data.GetCellData()
-    array = data.GetArray(found.array) if found.array else data.GetScalars()
+    array = found.array
+    if array is None:
+        what = f"a {found.data.GetClassName()} without an array that its mapper draws"
+        raise UsageError(f"plotter: {what}; expected one image, grid or mesh with active scalars")
     count, colored = array.GetNumberOfComponents(), not prop.GetIndependentComponents()
     if count == 2 and colored:
         raise UsageError(f"{array.GetName()}: two dependent components; expected one, independent ones, or colours")
@@ -120,23 +109,4 @@ def _layers(found: Drawn, prop: Any) -> tuple[list[tuple[Content, TransferFuncti
     notes = [note for _, some in functions for note in some]
     if len(contents) > 1:
         notes.append("mixing of components (by extinction instead)")
-    return [(one, read_transfer_function(f)) for one, (f, _) in zip(contents, functions, strict=True)], notes
-
-
-def _ordered(layers: Sequence[tuple[Content, TransferFunction]]) -> list[tuple[Content, TransferFunction]]:
-    """Return the layers, first one whose box holds those of all; else an empty volume that does comes first."""
-    volumes = [content.volumes[0] for content, _ in layers]
-    unit = np.array(list(product((0, 1), repeat=3)))
-    corners = [(unit * v.dims - 0.5) * v.spacing @ v.axes.T + v.origin for v in volumes]
-    everything = np.concatenate(corners)
-    for k, v in enumerate(volumes):
-        index = (everything - v.origin) @ np.linalg.inv(v.axes).T / v.spacing
-        if (index > -0.5 - SLACK).all() and (index < np.array(v.dims) - 0.5 + SLACK).all():
-            return [layers[k], *layers[:k], *layers[k + 1 :]]
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    dims = np.ceil((high - low) / (FINER * min(min(v.spacing) for v in volumes))).astype(int)
-    step = (high - low) / dims
-    empty = np.zeros(dims[::-1], np.uint8)
-    around = Volume(empty, triple(step.tolist()), triple((low + step / 2).tolist()), name=AROUND)
-    clear = PiecewiseOpacity(np.zeros(1), np.zeros(1))
-    return [(Content((around,)), TransferFunction("none", clear, ColorMap(np.zeros(1), np.zeros((1, 3))))), *layers]
+    return [(one, Look(read_transfer_function(f))) for one, (f, _) in zip(contents, functions, strict=True)], notes

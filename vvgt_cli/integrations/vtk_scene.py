@@ -20,25 +20,39 @@ class Drawn:
     """A volume that a renderer shows.
 
     Attributes:
-        data: vtkDataSet with the drawn array alone, placed in the world.
-        array: its name; "" where the mapper names none and the active scalars are drawn.
+        data: vtkDataSet with one array of the drawn one's name, placed in the world.
+        array: the array that is drawn, None for none.
         scale: world length of a unit of the data.
         mask: (nz, ny, nx) uint8, 0 where cropping or clipping planes hide a voxel; None where there are none.
         notes: what is drawn and cannot be taken.
     """
 
     data: Any
-    array: str
+    array: Any
     scale: float
     mask: np.ndarray | None
     notes: list[str]
 
 
 def volumes_of(renderer: Any) -> list[Any]:
-    """Return the visible vtkVolumes of a renderer."""
+    """Return the visible vtkVolumes of a renderer that have data."""
     found = renderer.GetVolumes()
     volumes = [found.GetItemAsObject(k) for k in range(found.GetNumberOfItems())]
-    return [volume for volume in volumes if volume.GetVisibility() and volume.GetMapper() is not None]
+    mappers = [(volume, volume.GetMapper()) for volume in volumes if volume.GetVisibility()]
+    return [volume for volume, mapper in mappers if mapper is not None and mapper.GetInputDataObject(0, 0) is not None]
+
+
+def _array(mapper: Any, data: Any) -> tuple[Any, bool]:
+    """Return the array that a mapper draws, None for none, and whether it is of cells."""
+    from vtkmodules.vtkCommonCore import reference
+    from vtkmodules.vtkRenderingCore import vtkAbstractMapper
+
+    if not data.IsA("vtkDataSet"):
+        return None, False
+    where: Any = reference(0)
+    choice = mapper.GetScalarMode(), mapper.GetArrayAccessMode(), mapper.GetArrayId(), mapper.GetArrayName() or ""
+    found = vtkAbstractMapper.GetAbstractScalars(data, *choice, where)
+    return found, found is not None and where == 1
 
 
 def drawn(volume: Any, data: Any = None) -> Drawn:
@@ -49,8 +63,8 @@ def drawn(volume: Any, data: Any = None) -> Drawn:
         data: vtkDataSet to take in place of the mapper's (another time step, a file's copy).
     """
     mapper = volume.GetMapper()
-    data = mapper.GetDataSetInput() if data is None else data
-    array = mapper.GetArrayName() or "" if mapper.GetScalarMode() in (3, 4) else ""
+    data = mapper.GetInputDataObject(0, 0) if data is None else data
+    array, cells = _array(mapper, data)
     notes = []
     if (blend := getattr(mapper, "GetBlendMode", int)()) != 0:
         notes.append(f"blending by {BLENDS[blend]} (composited instead)")
@@ -64,13 +78,17 @@ def drawn(volume: Any, data: Any = None) -> Drawn:
         if crops and not data.GetDirectionMatrix().IsIdentity():
             crops = False
             notes.append("cropping regions of an oblique image (VTK places them along its axes)")
-        mask = _mask(mapper, crops, data, array, matrix)
+        mask = _mask(mapper, crops, data, cells, matrix)
     elif getattr(mapper, "GetCropping", bool)() or mapper.GetClippingPlanes() is not None:
         notes.append("cropping of a mesh")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if np.ptp(lengths) > 1e-6 * lengths.max():
         notes.append("uneven scale: opacity is per mean length")
-    return Drawn(placed(data, volume.GetMatrix()), array, float(np.prod(lengths) ** (1 / 3)), mask, notes)
+    alone = data.NewInstance()
+    alone.ShallowCopy(data)
+    if array is not None and array.GetName():  # another of its name, of cells or points, is not read
+        (alone.GetPointData() if cells else alone.GetCellData()).RemoveArray(array.GetName())
+    return Drawn(placed(alone, volume.GetMatrix()), array, float(np.prod(lengths) ** (1 / 3)), mask, notes)
 
 
 def _numbers(matrix: Any, n: int) -> np.ndarray:
@@ -109,15 +127,13 @@ def placed(data: Any, matrix: Any) -> Any:
     return moved
 
 
-def _mask(mapper: Any, crops: bool, image: Any, array: str, matrix: np.ndarray) -> np.ndarray | None:
+def _mask(mapper: Any, crops: bool, image: Any, cells: bool, matrix: np.ndarray) -> np.ndarray | None:
     """Return which voxels cropping and clipping planes leave, None where there are none."""
     planes = mapper.GetClippingPlanes()
     count = planes.GetNumberOfItems() if planes is not None else 0
     if not (count or crops):
         return None
-    points = image.GetPointData()
-    inside = (points.GetArray(array) if array else points.GetScalars()) is None  # data of cells
-    low, dims = np.array(image.GetExtent()[::2], float) + 0.5 * inside, np.array(image.GetDimensions()) - inside
+    low, dims = np.array(image.GetExtent()[::2], float) + 0.5 * cells, np.array(image.GetDimensions()) - cells
     index = [low[a] + np.arange(dims[a]) for a in range(3)]
 
     def height(affine: np.ndarray, normal: Sequence[float]) -> np.ndarray:

@@ -61,4 +61,6 @@ def lights_of(renderer: Any) -> tuple[list[str], list[str]]:
         notes.append("intensity and colour of lights (white, 1 each, instead)")
     places = [(light.GetTransformedPosition(), light.GetTransformedFocalPoint()) for light in fixed]
     names = [",".join(repr(float(p[k] - q[k])) for k in range(3)) for p, q in places]
+    if not lights and not renderer.GetAutomaticLightCreation():  # else VTK makes a headlight when it draws
+        notes.append("absence of lights (headlight instead)")
     return (["headlight"] if moving or not names else []) + names, notes

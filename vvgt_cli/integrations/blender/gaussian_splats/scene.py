@@ -44,6 +44,7 @@ def camera_words(scene: Any, centre: Any) -> tuple[list[str], list[str]]:
     top, bottom = camera.data.view_frame(scene=scene)[:2]
     target = eye + ahead * max((centre - eye).dot(ahead), 1e-3)
     angle = math.degrees(2 * math.atan(abs((top.y - bottom.y) / (2 * top.z))))
-    roll, shift = abs(camera.matrix_world.col[0].z) > 1e-3, camera.data.shift_x or camera.data.shift_y
+    right, up = (camera.matrix_world.col[k].normalized().z for k in (0, 1))
+    roll, shift = abs(right) > 1e-3 or up < 1e-3, camera.data.shift_x or camera.data.shift_y
     notes = [note for note, found in (("the camera's roll", roll), ("the camera's shift", shift)) if found]
     return ["--camera", ",".join(f"{n:.9g}" for n in (*eye, *target, angle))], notes

@@ -1,0 +1,63 @@
+"""Layers of which none need hold the others, converted together."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.field.layered import Content
+from vvgt_cli.library.functions import convert
+from vvgt_cli.library.inputs import GoalLike, LightLike, Look, source_of
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.types import triple
+
+FINER = 8  # times as fine as the first volume a layer may be
+SLACK = 1e-3  # voxels
+AROUND = "around"  # name of an empty volume that holds all
+
+Layer = tuple[Content, Look]
+
+
+def together(layers: Sequence[Layer], light: LightLike, goal: GoalLike = None, **options: Any) -> Conversion:
+    """Convert volumes, each with its look, under one light, wherever they lie; ``options`` are those of `convert`.
+
+    Raises:
+        DataError, UsageError: see `convert`.
+    """
+    (first, look), *rest = _ordered(layers)
+    look = replace(look, light=light, layers=[source_of(*one, {}) for one in rest])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", f"{AROUND}, none: nothing is visible")
+        result = convert(first, look, goal, **options)
+    assert isinstance(result, Conversion)
+    return result
+
+
+def _ordered(layers: Sequence[Layer]) -> list[Layer]:
+    """Return the layers, first one whose box holds those of all; else an empty volume that does comes first."""
+    volumes = [content.volumes[0] for content, _ in layers]
+    unit = np.array(list(product((0, 1), repeat=3)))
+    corners = [(unit * v.dims - 0.5) * v.spacing @ v.axes.T + v.origin for v in volumes]
+    everything = np.concatenate(corners)
+    for k, v in enumerate(volumes):
+        index = (everything - v.origin) @ np.linalg.inv(v.axes).T / v.spacing
+        if (index > -0.5 - SLACK).all() and (index < np.array(v.dims) - 0.5 + SLACK).all():
+            return [layers[k], *layers[:k], *layers[k + 1 :]]
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    dims = np.ceil((high - low) / (FINER * min(min(v.spacing) for v in volumes))).astype(int)
+    step = (high - low) / dims
+    empty = np.zeros(dims[::-1], np.uint8)
+    around = Volume(
+        empty, triple(step.tolist()), triple((low + step / 2).tolist()), name=AROUND, space=volumes[0].space,
+        unit=volumes[0].unit,
+    )  # fmt: skip
+    clear = PiecewiseOpacity(np.zeros(1), np.zeros(1))
+    nothing = TransferFunction("none", clear, ColorMap(np.zeros(1), np.zeros((1, 3))))
+    return [(Content((around,)), Look(nothing)), *layers]
