@@ -1,7 +1,9 @@
 # Snakemake: a page of every volume, under one function. The same command leaves the same bytes, so that results can be
-# kept between workflows (snakemake --cache).
+# kept between workflows: snakemake --cache, with their folder in the environment variable SNAKEMAKE_OUTPUT_CACHE. The
+# version of vvgt is not in the cache's key ("omit-software"): clear the folder when you update it.
 #
-#   snakemake --snakefile splats.smk --cores 4 --config function=bone.json -- head.html
+#   export SNAKEMAKE_OUTPUT_CACHE=~/.cache/splats
+#   snakemake --snakefile splats.smk --cores 4 --cache --config function=bone.json -- head.html
 #
 # --threads does not change the bytes; --time-budget does (docs/commands/convert.md, "Same command, same bytes").
 

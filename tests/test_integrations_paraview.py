@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from tests.vtk_scenes import LUMP, camera_at, lump, places, psnr
 from vvgt_cli.cli.main import run as vvgt
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians.rules import rule_of
+from vvgt_cli.integrations import command, paraview_job, paraview_view
 from vvgt_cli.splat import render
 
 ROOT = Path(__file__).parent.parent
@@ -86,6 +90,75 @@ def ours(path: Path, said: str) -> np.ndarray:
     return render(gaussians, camera, rule_of("inria"))
 
 
+OPTIONS = {"Gaussians": 100, "Steps": 0, "Live": 0, "Light": 0, "Function": ""}
+
+
+def test_the_folder_of_a_job_is_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is not is left, and nothing stays behind a failure."""
+    monkeypatch.setattr(paraview_job, "look", lambda *_: ([], None, []))
+    folder, mine = tmp_path / ".a.ply.vvgt-parts", tmp_path / "a.ply.parts"
+    for path in (folder, mine):
+        path.mkdir()
+        (path / "mine.txt").write_text("mine")
+    with pytest.raises(RuntimeError, match="is not of vvgt"):
+        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+    assert (folder / "mine.txt").exists()
+    (folder / "mine.txt").rename(folder / "look.json")  # of a job that was killed
+    job = paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+    assert job.words == []
+    job.end()
+    with pytest.raises(RuntimeError, match="No such file or directory"):
+        paraview_job.Job(str(tmp_path / "none" / "a.ply"), OPTIONS, None)
+    monkeypatch.setattr(paraview_job, "look", lambda *_: 1 / 0)
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply.parts"]
+
+
+def test_a_simulation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is wrong with the settings, or the place of the files."""
+    heard: list[str] = []
+    step = SimpleNamespace(timestep=0, time=0.0)
+    modules = {"paraview": ModuleType("paraview"), "paraview.simple": MagicMock()}
+    monkeypatch.setattr(command, "tell", lambda text, failed=False: heard.append(text))
+    monkeypatch.setattr(paraview_job, "look", lambda *_: ([], None, []))
+    for name in (str(tmp_path / "a.ply"), "a_{step}.ply", str(tmp_path / "none" / "a_{:02d}.ply")):
+        monkeypatch.setenv("VVGT_OUTPUT", name)
+        with monkeypatch.context() as stubs:
+            for key, module in modules.items():
+                stubs.setitem(sys.modules, key, module)
+            runpy.run_path(str(ROOM / "catalyst.py"))["catalyst_execute"](step)
+    assert ["a place for the step" in heard[0], "'step'" in heard[1], "No such file" in heard[2]] == [True] * 3
+    assert len(heard) == 3
+
+
+def test_the_nearest_source_that_is_shown_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    def algorithm(above: Any) -> Any:
+        return SimpleNamespace(GetInputAlgorithm=lambda *_: above, GetNumberOfInputPorts=lambda: above is not None)
+
+    def representation(made: Any, visible: int) -> Any:
+        return SimpleNamespace(
+            Input=SimpleNamespace(SMProxy=SimpleNamespace(GetClientSideObject=lambda: made)), Visibility=visible
+        )
+
+    reader = algorithm(None)
+    near = algorithm(reader)
+    saved = algorithm(near)
+    shown = [
+        representation(reader, 1),
+        SimpleNamespace(Visibility=1),
+        representation(near, 1),
+        representation(saved, 0),
+    ]
+    view = SimpleNamespace(SMProxy=SimpleNamespace(GetRenderer=None), Representations=shown)
+    connection = SimpleNamespace(IsRemote=lambda: False)
+    paraview: Any = ModuleType("paraview")
+    paraview.servermanager = SimpleNamespace(ActiveConnection=connection)
+    paraview.simple = SimpleNamespace(GetActiveView=lambda: view)
+    monkeypatch.setitem(sys.modules, "paraview", paraview)
+    assert paraview_view.representation_of(saved) == (shown[2], view)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("case", "given", "least"),
@@ -124,7 +197,7 @@ def test_all_time_steps_are_frames_of_one_page(display: str, tmp_path: Path) -> 
     text = page.read_text()
     assert len(re.findall('id="splats-[0-9]+"', text)) == 3, said
     assert re.search('"name": "[^"]*2.5[^"]*"', text)
-    assert not list(tmp_path.glob("*.parts"))
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.long
@@ -145,7 +218,7 @@ def test_two_ranks_leave_one_file_a_time_step(tmp_path: Path) -> None:
     mpi = ("mpirun", "--allow-run-as-root", "--oversubscribe", "--mca", "mpi_yield_when_idle", "1", "-n", "2")
     said = run(*mpi, SYSTEM, script, ROOM / "catalyst.py", 2, 40, tmp_path / "whole.vti", **settings)
     print(re.search("simulation .*", said))
-    assert sorted(path.name for path in tmp_path.glob("*")) == ["dye_00.ply", "dye_01.ply", "whole.vti"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dye_00.ply", "dye_01.ply", "whole.vti"]
     words = ["init", str(tmp_path / "whole.vti"), "-o", str(tmp_path / "one.ply"), "--tf", "viridis", "--quiet"]
     assert vvgt([*words, "--max-gaussians", "3000"]) == 0
     drawn = []

@@ -31,19 +31,35 @@ finally:
 producer = TrivialProducer(registrationName=os.environ.get("VVGT_CHANNEL", "input"))
 
 
+def _settings() -> tuple[str, int, dict[str, Any]] | None:
+    """Return the file's name, the steps between two files, and options; None, and a line that says why, for none."""
+    name = os.environ.get("VVGT_OUTPUT", "step_{:06d}.ply")
+    function = os.environ.get("VVGT_TF", "")
+    try:
+        count, every = int(os.environ.get("VVGT_GAUSSIANS", "100000")), int(os.environ.get("VVGT_EVERY", "1"))
+        if every < 1 or name.format(0) == name.format(1):
+            raise ValueError("expected 1 or more steps, and a place for the step in the file's name, as a_{:06d}.ply")
+    except (ValueError, LookupError) as error:
+        tell(f"VVGT_OUTPUT={name}, VVGT_EVERY, VVGT_GAUSSIANS: {error}; no file is written", failed=True)
+        return None
+    return name, every, {"Gaussians": count, "Steps": 0, "Live": 0, "Light": 0, "Function": function}
+
+
+SETTINGS = _settings()
+
+
 def catalyst_execute(info: Any) -> None:
     """Write the file of a time step; each rank hands over its own block."""
-    if info.timestep % int(os.environ.get("VVGT_EVERY", "1")):
+    if SETTINGS is None or info.timestep % SETTINGS[1]:
         return
     producer.UpdatePipeline(info.time)
     source = producer.SMProxy.GetClientSideObject()
-    function, count = os.environ.get("VVGT_TF", ""), int(os.environ.get("VVGT_GAUSSIANS", "100000"))
-    options = {"Gaussians": count, "Steps": 0, "Live": 0, "Light": 0, "Function": function}
-    name = os.environ.get("VVGT_OUTPUT", "step_{:06d}.ply").format(info.timestep)
-    job = Job(name, options, source)
+    name, job = SETTINGS[0].format(info.timestep), None
     try:
+        job = Job(name, SETTINGS[2], source)
         job.save(source.GetOutputDataObject(0), info.time)
         job.convert()
-    except RuntimeError as error:  # the simulation goes on
+    except (RuntimeError, OSError, ValueError, KeyError) as error:  # the simulation goes on
         tell(f"{name}: {error}", failed=True)
-    job.end()
+    if job is not None:
+        job.end()

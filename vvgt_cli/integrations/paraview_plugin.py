@@ -128,6 +128,7 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
         pipeline = _pipeline()
         try:
             if self.step == 0:
+                self.job = None
                 self.job = Job(self.name, self.options, self.GetInputAlgorithm(0, 0))
             assert self.job is not None
             data = vtkDataObject.GetData(inputs[0].GetInformationObject(0))
@@ -137,7 +138,7 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
                 request.Set(pipeline.CONTINUE_EXECUTING(), 1)
                 return 1
             self.job.convert()
-        except RuntimeError as error:
+        except (RuntimeError, OSError, ValueError, KeyError) as error:
             tell(str(error), failed=True)
         request.Remove(pipeline.CONTINUE_EXECUTING())
         self.step = 0
