@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from xml.etree import ElementTree
 
 import numpy as np
@@ -136,3 +138,13 @@ def test_a_region_of_interest_hides_what_is_outside(scene) -> None:
     assert heights.min() > facts["at"][2] - 1.5  # mm: a voxel
     whole = open_gaussians(str(folder / "volume.ply"))[0].means[:, 2] / header.scale + header.centre[2]
     assert whole.min() < facts["at"][2] - 8
+
+
+def test_the_camera_and_its_up_are_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from vtkmodules.vtkRenderingCore import vtkRenderer
+
+    monkeypatch.setitem(sys.modules, "slicer", ModuleType("slicer"))
+    words = runpy.run_path(str(ROOT / "vvgt_cli" / "integrations" / "mrml.py"))["words"]
+    renderer = vtkRenderer()
+    renderer.GetActiveCamera().SetPosition(0, 0, 5)
+    assert words(tmp_path, renderer=renderer) == (["--camera", "0.0,0.0,5.0,0.0,0.0,0.0,30.0", "--up", "y"], [])
