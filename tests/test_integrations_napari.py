@@ -124,3 +124,17 @@ def test_what_cannot_be_saved_says_why(viewer, tmp_path) -> None:
     viewer.add_image(point(), visible=False)
     with pytest.raises(vvgt_cli.UsageError, match="no visible layer"):
         saved(viewer, tmp_path / "a.html")
+
+
+@pytest.mark.long
+def test_layers_apart_are_whole_and_unlit(viewer, tmp_path) -> None:
+    """Whichever is first: a label map, whose look alone would be lit."""
+    labels = np.zeros((20, 18, 16), np.uint8)
+    labels[2:5, 3:8, 4:9] = 1
+    viewer.add_labels(labels, opacity=1)
+    layer = viewer.add_image(point(), name="far", contrast_limits=(0, 90), translate=(0, 0, 40))
+    world = at(layer)
+    gaussians, header = read_ply(saved(viewer, tmp_path / "a.splats.ply"))
+    away = np.linalg.norm(gaussians.means / header.scale + header.centre - world, axis=1)
+    assert (away < 2).any()
+    assert header.light is None
