@@ -244,11 +244,13 @@ def test_other_programs_property_order_is_read():
     fields += ["f_dc_0", "f_dc_1", "f_dc_2"]
     rows = np.zeros(2, np.dtype([(f, "u1" if f == "red" else "<f4") for f in fields]))
     rows["rot_0"], rows["y"], rows["opacity"] = 1, (3, 4), (5, 6)
-    header = "ply\r\nformat binary_little_endian 1.0\r\ncomment by hand\r\nelement vertex 2\r\n"
+    comments = ("by hand", "vvgt later a fact of a later version")
+    header = "ply\r\nformat binary_little_endian 1.0\r\n" + "".join(f"comment {c}\r\n" for c in comments)
+    header += "element vertex 2\r\n"
     header += "".join(f"property {'uchar' if f == 'red' else 'float'} {f}\r\n" for f in fields) + "end_header\r\n"
     gaussians, parsed = read_ply(io.BytesIO(header.encode() + rows.tobytes()))
     assert (gaussians.means[:, 1].tolist(), gaussians.opacity_logits.tolist()) == ([3, 4], [5, 6])
-    assert (parsed.comments, parsed.version, parsed.frame) == (("by hand",), None, "unit")
+    assert (parsed.comments, parsed.version, parsed.frame) == (comments, None, "unit")
 
 
 def test_describe_counts_and_ranges():

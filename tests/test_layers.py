@@ -101,7 +101,7 @@ def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None
     assert "2 x 2 x 2 voxels; expected the 24 x 24 x 24" in vvgt("info", tmp_path / "v.nii", "--mask", wrong).error
 
 
-@pytest.mark.filterwarnings("ignore:.*of smaller bodies")
+@pytest.mark.filterwarnings("ignore:.*in smaller bodies")
 def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, vvgt) -> None:
     z, y, x = np.indices((20, 24, 40)) - 10.0
     head = np.hypot(np.hypot(z, y), x) < 8
@@ -112,7 +112,9 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
         data = read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300, stored=stored)).data[:]
         np.testing.assert_array_equal(np.isnan(data), rest)
         np.testing.assert_array_equal(data[~rest], values[~rest])
-    with pytest.warns(UserWarning, match=r"--keep-largest -300: hides 40\.7 % of the voxels above, of smaller bodies"):
+    with pytest.warns(
+        UserWarning, match=r"--keep-largest -300: hides 40\.7 % of the voxels above it, in smaller bodies"
+    ):
         assert (read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300)).data == 40).sum() == head.sum()
     with pytest.raises(DataError, match="--keep-largest 300: no voxel lies above"):
         read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=300))
@@ -120,10 +122,13 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
         ReadOptions(keep_largest=float("nan"))
     whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
     assert whole.gaussians.means[:, 0].max() < 0.2
-    for name, more in {"a": (), "b": ("--blocks", 16), "live": ("--live",)}.items():
+    runs = {"a": (), "b": ("--blocks", 16), "c": ("--blocks", 16, "--workers", 2), "live": ("--live",)}
+    for name, more in runs.items():
         given = ("--tf", "gray:0.9,1", "--keep-largest", -300, "--max-gaussians", 200, "--size", 40, *more)
-        made = vvgt("convert", tmp_path / "v.npy", *given, "-o", tmp_path / f"{name}.ply")
+        with pytest.warns(UserWarning, match=r"hides 40\.7 % of the voxels above it") as notes:
+            made = vvgt("convert", tmp_path / "v.npy", *given, "-o", tmp_path / f"{name}.ply")
         assert made.code == 0, made.err
+        assert len(notes) == 1  # in blocks too
         assert read_ply(tmp_path / f"{name}.ply")[0].means[:, 0].max() < 0.2  # the rest lies from 0.4 on
 
 
@@ -193,6 +198,32 @@ def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int)
     np.testing.assert_allclose(
         grid[..., 3], -np.log1p(-np.minimum(weight / 255, 1 - 1e-5)) / distance, rtol=2e-4, atol=1e-4
     )
+
+
+def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvgt, tmp_path: Path) -> None:
+    write_nrrd(tmp_path / "a.nrrd", colors())
+    given = (
+        "convert",
+        tmp_path / "a.nrrd",
+        "--max-gaussians",
+        100,
+        "--size",
+        40,
+        "--steps",
+        0,
+        "-o",
+        tmp_path / "a.ply",
+    )
+    for more in ((), ("--blocks", 16), ("--component", "color")):
+        done = vvgt(*given, "--keep-largest", 10, *more)
+        assert (done.code, "a.nrrd has colours; expected scalars: give a --mask" in done.error) == (2, True)
+    with pytest.raises(UsageError, match="has colours"):
+        library.convert(str(tmp_path / "a.nrrd"), keep_largest=10)
+    assert vvgt(*given, "--keep-largest", 10, "--component", 0).code == 0
+    for more in (("--overwrite",), ("--overwrite", "--blocks", 16)):
+        with pytest.warns(UserWarning, match="--keep-largest 10: hides"):
+            done = vvgt(*given, "--keep-largest", 10, "--component", "all", *more)
+        assert done.code == 0, done.err
 
 
 def test_colours_by_command(vvgt, tmp_path: Path) -> None:

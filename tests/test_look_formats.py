@@ -251,6 +251,8 @@ def test_inviwo_mask_and_data_values(file) -> None:
         ({"volumeProperties": []}, "a.vp.json", "expected a list of objects with components"),
         (vp_json(scalarOpacity=3), "a.vp.json", "scalarOpacity; expected an object with points"),
         (vp_json(scalarOpacityUnitDistance=0), "a.vp.json", "unit distance 0"),
+        (vp_json(rgbTransferFunction={"hsvWrap": "no", "points": [{"x": 0, "color": [1, 0, 0]}]}), "a.vp.json",
+         "hsvWrap: 'no'; expected true or false"),
         ({"scalarOpacity": 1, "colorTransfer": 2}, "a.json", "expected text, a count and numbers"),
         (XML.format(space="Hue"), "a.xml", "ColorSpace 'Hue'"),
         (XML.format(space="RGB").replace('"false"', '"true"'), "a.xml", "indexed colour map"),

@@ -245,4 +245,16 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     assert "values" in page
     assert set(bare) == {"kind", "name", "picture", "remove"}
     assert "not Gaussians" in vvgt("info", tmp_path / "Doe_John.nii", "--sharing").error
-    assert vvgt("info", "--machine", "--sharing").code == 2
+    assert "--machine describes this machine, --sharing a file" in vvgt("info", "--machine", "--sharing").error
+    for more in (("--tf", "viridis"), ("--crop", "0:4,:,:")):
+        assert (
+            "--sharing describes the file as it is; omit" in vvgt("info", tmp_path / "a.ply", "--sharing", *more).error
+        )
+    np.save(tmp_path / "v.npy", values)
+    camera = ("--camera", "9,0,0,0,0,0,30")
+    assert vvgt("convert", tmp_path / "v.npy", *given, *quick, *camera, "-o", tmp_path / "w.ply").code == 0
+    assert listed("w.ply")["camera"] == "eye and target in the world"
+    assert "camera" not in plain
+    assert plain["place"].endswith("in the scanner")
+    assert listed("w.ply")["place"] == "position and directions in the world"
+    assert plain["remove"].endswith("; positions of --frame world stay")

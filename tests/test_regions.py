@@ -259,3 +259,16 @@ def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path:
     )
     assert vvgt(*line).code == 0
     assert json.loads((tmp_path / "o" / "lod-meta.json").read_text())["count"] >= 1
+
+
+def test_regions_without_gaussians_are_written_lit_and_not(
+    vvgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.LARGEST", 1)
+    z, y, x = np.mgrid[:160, :60, :60]
+    balls = sum((np.hypot(np.hypot(x - 30, y - 30), z - at) < 14) * 200 for at in (24, 80, 136))
+    np.save(tmp_path / "v.npy", balls.astype(np.uint8))
+    fit = ("--tf", "viridis", "--size", "100", "--max-gaussians", "1", "--blocks", "64", "-q")
+    for light in ("none", "headlight"):
+        assert vvgt("init", tmp_path / "v.npy", *fit, "--light", light, "-o", tmp_path / f"{light}.ply").code == 0
+        assert len(read_splats(str(tmp_path / f"{light}.ply"))[0]) == 1

@@ -147,6 +147,18 @@ def test_gaussians_are_assigned_to_the_label_with_most_of_them() -> None:
     assert assign_labels(gaussians, faint)[2] == 0  # most of its extinction, not of its voxels
 
 
+def test_gaussians_near_no_label_are_told_by_colours_that_light_darkens() -> None:
+    volume, table = Volume(np.zeros((8, 8, 8), np.uint8)), distinct([1, 2, 3])
+    shades = ((0.24, 0.24, 0.24), (0.96, 0.96, 0.96), (0.8, 0.1, 0.1))
+    labels = [split.replace(label, color=rgb) for label, rgb in zip(table.labels, shades, strict=True)]
+    colors = np.array([*shades, (0.4, 0.05, 0.05), (0.7, 0.7, 0.7)])
+    means, turned = np.zeros((5, 3)), np.tile([1.0, 0, 0, 0], (5, 1))
+    gaussians = Gaussians(means, np.full((5, 3), -4.0), turned, np.zeros(5), colors)
+    for order in ((0, 1, 2), (2, 1, 0)):
+        found = assign_labels(gaussians, [(volume, table, labels[k]) for k in order])
+        np.testing.assert_array_equal(np.array(order)[found], [0, 1, 2, 2, 1])
+
+
 def hidden_of(source):
     field = Resident(source, source.scene())
     form = field.pyramid(VbmOptions(600, 64)).form

@@ -10,10 +10,14 @@ import pytest
 from tests.test_scale import bodies
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
 from vvgt_cli.closed_form.lit import base_rows
-from vvgt_cli.conversion.shards.cut import open_cut
+from vvgt_cli.conversion.shards.cut import cut_of
 from vvgt_cli.field.block_store import BlockStore
+from vvgt_cli.field.blocked import Pass
+from vvgt_cli.field.runners import InProcess
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
 
 FIT = ("--max-gaussians", "9000", "--size", "150", "--up", "z", "-q")
 LIGHTS = {
@@ -65,6 +69,7 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
         for shard in ("1/2", "2/2"):
             line = ("init", volume, *FIT, *lit, "--blocks", "32", "--shard", shard, "-o", tmp_path / "parts")
             assert vvgt(*line).code == 0
+    before = sorted(path.name for path in (tmp_path / "parts").iterdir())
     assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged.ply").code == 0
     assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "m" / "lod-meta.json").code == 0
     assert vvgt("init", volume, *FIT, *lit, "-o", tmp_path / "c" / "lod-meta.json").code == 0
@@ -72,7 +77,9 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
     assert all(other == one for other in others)
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]
     assert files[0] == files[1]
-    tiled_tree = open_cut(BlockStore(tmp_path / "parts"), "").tiled_tree
+    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == before
+    run_pass = Pass(InProcess(), BlockStore(tmp_path / "parts"), lambda _: None)
+    tiled_tree = cut_of(Run(Console(quiet=True), ConversionReport("merge")), run_pass).tiled_tree
     top, root = tiled_tree.top, tiled_tree.leaves_over_tiles(np.finfo(float).max)
     assert top is not None
     assert root is not None

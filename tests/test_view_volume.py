@@ -418,6 +418,11 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert means[2] - means[0] > 0.6  # 12 voxels of 24, whose box is 2 wide, in haze
     assert not list(temporary.glob("vvgt-*"))
     assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
+    for without in ("--no-live", "--no-slices"):
+        left = vvgt("view", tmp_path / "run_*.npy", without, "-o", tmp_path / "a.html")
+        assert (left.code, "no function editor and no slices" in left.error) == (2, True)
+    wrong = vvgt("view", tmp_path / "run_*.npy", "--crop", "30:,:,:")
+    assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []
     monkeypatch.setattr(convert_batch, "convert_files", lambda request, console: saved.append(request))
     assert vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis", "-o", tmp_path / "a.html").code == 0

@@ -43,6 +43,10 @@ class UsageError(VvgtError):
     exit_code = 2
 
 
+class NoLiveForm(UsageError):
+    """A volume or options without a live form: the same can be converted ordinarily."""
+
+
 class SeveralSteps(UsageError):
     """A file with several time steps, of which none was chosen.
 

@@ -50,15 +50,19 @@ def command(
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
-    if machine == (file is not None) or (machine and sharing):
+    if machine and sharing:
+        raise UsageError("--machine describes this machine, --sharing a file; expected one of them")
+    if machine == (file is not None):
         raise UsageError("expected a file, or --machine")
+    look, how = function_of(tf, tf_range, opacity_unit_distance, layers=layers), ReadOptions(**read)
+    if sharing and (look, how) != (None, ReadOptions()):
+        raise UsageError("--sharing describes the file as it is; omit --tf and reading options")
     if file is None:
         facts = machine_facts()
     elif sharing:
         facts = plain(what_leaves(file))
     else:
-        look = function_of(tf, tf_range, opacity_unit_distance, layers=layers)
-        facts = plain(inspect(file, ReadOptions(**read), look))
+        facts = plain(inspect(file, how, look))
     if as_json:
         import json
 

@@ -19,7 +19,7 @@ from vvgt_cli.progress import Console
 def command(folder: str, output: str, overwrite: bool, console: Console) -> None:
     """Merge the blocks that 'vvgt init --shard I/N' has written to FOLDER into a .ply.
 
-    The volume is no longer needed. FOLDER is left unchanged.
+    The volume is no longer needed. FOLDER is left as it is.
 
     Example:
       vvgt merge huge.blocks -o huge.ply

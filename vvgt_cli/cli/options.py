@@ -82,7 +82,8 @@ _READ = dict(
     mask=click.option("--mask", metavar="FILE", help="Volume of the same size; voxels where it is 0 are hidden."),
     keep_largest=click.option(
         "--keep-largest", type=float, metavar="VALUE",
-        help="Of what lies above VALUE, hide all but the largest connected body: -300 removes the head rest of a CT.",
+        help="Of what lies above VALUE, hide all but the largest connected body: -300 removes the head rest of a CT. "
+        "Each channel has its own; colours have none.",
     ),
 )  # fmt: skip
 read_options = group("read", **_READ)
@@ -284,9 +285,8 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")  # they are notes on standard error
-            console = (
-                click.get_current_context().find_object(type) or Console
-            )  # that of 3D Slicer (`vvgt_cli.cli.slicer`)
+            # that of 3D Slicer (`vvgt_cli.cli.slicer`), if there is one
+            console = click.get_current_context().find_object(type) or Console
             return function(*args, console=console(quiet, interruption=interruption), **kwargs)
 
     # click wraps a paragraph's lines unless it begins with \b

@@ -36,16 +36,19 @@ def what_leaves(file: str) -> dict[str, Any]:
     live = bool(layers) or f'id="{HELD}-0"' in text
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
+    scanned = header.space in ("RAS", "LPS")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
     found = {
         "title": header.title, "function": header.function,
         "command": made and made.command, "checksum": made and made.sha256,
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
-        "place": header.space in ("RAS", "LPS") and header.affine and "position and directions in the scanner",
+        "place": header.affine and f"position and directions in the {'scanner' if scanned else 'world'}",
+        "camera": header.camera and "eye and target in the world",
         "values": live and "data values under each Gaussian, and their histogram",
         "slices": 'id="slices-0"' in text and "of the volume, also of what its look hides",
         "other": [line for line in header.comments if not line.startswith(OURS)],
     }  # fmt: skip
     facts |= {key: value for key, value in found.items() if value}
     facts["picture"] = FACE + LATER * live
-    return facts | {"remove": "--no-comments omits all but the picture and the values, --title names it otherwise"}
+    remove = "--no-comments omits all but the picture and the values, --title names it otherwise"
+    return facts | {"remove": f"{remove}; positions of --frame world stay"}

@@ -20,7 +20,7 @@ from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
 from vvgt_cli.conversion.readback import report_agreement
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import NoLiveForm, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
@@ -119,6 +119,11 @@ def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce
     if request.output is not None:
         if not is_page(request.output):
             raise UsageError(f"-o {request.output}: holds one frame; expected a page (.html), or --time N")
+        if not (request.live and request.slices):
+            raise UsageError(
+                f"-o {request.output}: the page of a series has no function editor and no slices; omit --no-live and "
+                "--no-slices"
+            )
         whole = ConvertRequest(source, request.output, overwrite=request.overwrite, title=request.title)
         convert_files(whole, console=run.console)
         return
@@ -126,7 +131,7 @@ def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce
         quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=request.title)
         try:
             convert_files(quick, console=run.console)
-        except UsageError as error:  # what has no live form takes longer
+        except NoLiveForm as error:  # takes longer
             run.console.message(f"converted without a live form: {error}")
             convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
         clouds = named_files(sorted(map(str, Path(folder).glob("*index.json"))))

@@ -14,6 +14,7 @@ from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import planes, values_at
 
+DARKENED = 0.1  # difference of colours that counts as much as a label's colour taken for black
 OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
 
 
@@ -103,12 +104,11 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
             _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
     found: np.ndarray = votes.argmax(axis=1)
     lost = votes.max(axis=1) == 0
-    colors, own = (
-        rgb / np.maximum(rgb.max(axis=1, keepdims=True), 1e-3)  # lit ones are darker
-        for rgb in (np.array([label.color for *_, label in shown]), gaussians.colors)
-    )
+    colors = np.array([label.color for *_, label in shown])
     for k in np.flatnonzero(lost):
-        found[k] = np.abs(colors - own[k]).sum(axis=1).argmin()
+        own = gaussians.colors[k]
+        share = np.clip(colors @ own / np.maximum((colors**2).sum(axis=1), 1e-6), 0, 1)  # light darkens
+        found[k] = (np.abs(share[:, None] * colors - own).sum(axis=1) + DARKENED * (1 - share)).argmin()
     return found
 
 

@@ -23,7 +23,7 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
-from vvgt_cli.errors import NothingVisible, UsageError
+from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats.page_live import LiveForm
@@ -48,7 +48,7 @@ def check_live(request: ConvertRequest) -> None:
     """Check that a request has no option that live files do not take.
 
     Raises:
-        UsageError: names the options.
+        NoLiveForm: names the options.
     """
     fit, limits, light = request.fit, request.limits, request.source.light
     given = {
@@ -65,7 +65,7 @@ def check_live(request: ConvertRequest) -> None:
         "--ambient-occlusion": light.occlusion is not None,
     }
     if names := [name for name, there in given.items() if there]:
-        raise UsageError(f"--live: the file is made for every function, without fitting; remove {', '.join(names)}")
+        raise NoLiveForm(f"--live: the file is made for every function, without fitting; remove {', '.join(names)}")
 
 
 def live_refusal(request: ConvertRequest, source: Source) -> str | None:
@@ -73,8 +73,7 @@ def live_refusal(request: ConvertRequest, source: Source) -> str | None:
     try:
         check_live(request)
         check_layers(source)
-        box_lighting(source)
-    except UsageError as error:
+    except NoLiveForm as error:
         return str(error)
     return None
 
@@ -106,7 +105,7 @@ def convert_live(
     """Convert a field to live Gaussians with a baked look, and score them if ``scored``.
 
     Raises:
-        UsageError: the volume has colours, or the light needs the volume.
+        NoLiveForm: the volume has colours.
         DataError: nothing is visible.
     """
     source, fit = field.source, request.fit
@@ -183,10 +182,10 @@ def check_layers(source: Source) -> None:
     """Check that all layers have values or labels.
 
     Raises:
-        UsageError: a layer has colours.
+        NoLiveForm: a layer has colours.
     """
     if any(layer.colors for layer in source.layers):
-        raise UsageError(
+        raise NoLiveForm(
             f"{source.name}: has colours, which Gaussians cannot carry as one value; expected scalars or labels with "
             "--live: choose one component by --component N, or remove --live"
         )
@@ -210,11 +209,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
 
 
 def box_lighting(source: Source) -> Lighting | None:
-    """Return the light of a source, with directions in the box frame.
-
-    Raises:
-        UsageError: a preset has shadows or occlusion.
-    """
+    """Return the light of a source, with directions in the box frame."""
     if source.lighting is None:
         return None
     inward = np.linalg.inv(source.volume.axes)

@@ -215,7 +215,7 @@ class Conversion(Result):
         if not slices:
             return Extras(form)
         with run.stage("slices") as stage:
-            stage.note = str(self._slices or "of colours there are none")
+            stage.note = str(self._slices or "none: the volume has colours")
         return Extras(form, self._slices)
 
     @cached_property

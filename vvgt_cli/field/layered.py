@@ -160,8 +160,11 @@ def open_content(source: str, read: ReadOptions) -> Content:
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(f"{source}: {error.count} components; expected 3 or 4 for --component color") from None
+        color = asked == COLOR or (error.color and not asked and not overlapping)
+        if color and read.keep_largest is not None:
+            raise UsageError(f"--keep-largest: {source} has colours; expected scalars: give a --mask") from None
         parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
-        if asked == COLOR or (error.color and not asked and not overlapping):
+        if color:
             return Content(parts, True, stored=read.stored)
         colors = error.colors or [None] * error.count
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))

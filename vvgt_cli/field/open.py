@@ -21,6 +21,7 @@ from vvgt_cli.field.layered import NONE, Content, content_of, open_content
 from vvgt_cli.field.runners import InProcess, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
+from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.look.label_files import holds_table
@@ -31,7 +32,7 @@ from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.label_maps import named_so
 from vvgt_cli.volume.readers import SCHEMES, STEPPED
-from vvgt_cli.volume.stored import Stored, is_file_backed
+from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
@@ -123,6 +124,7 @@ def blocked(
         run_pass = Pass(runner, store, run.console.bar, options.shard)
         if store.open({**settings, "blocks": edge}, ours=options.shard is None):
             run.console.message(f"resuming with the blocks in {store.folder}")
+        request = _with_body(request, store)
         run.compile(COUNT_WHOLE + COUNT_REAL)
         access = BlockAccess(
             store, edge, lambda task: run_pass(task, "count"), needs.values or needs_histogram(request)
@@ -171,6 +173,24 @@ def _resolved(request: SourceRequest, options: BlockOptions, size: int) -> tuple
     if isinstance(read.mask, str):
         read = replace(read, mask=str(Path(read.mask).absolute()))
     return replace(request, volume=absolute, read=read, layers=layers), message
+
+
+def _with_body(request: SourceRequest, store: BlockStore) -> SourceRequest:
+    """Return the request with a mask in the store in place of ``keep_largest``, so that workers need not find the body.
+
+    Each of several channels keeps its own body, which workers find.
+    """
+    read, path = request.read, store.folder / "body.npy"
+    if read.keep_largest is None or not isinstance(request.volume, str):
+        return request
+    volumes = open_content(request.volume, replace(read, stored=True, packed=True)).volumes
+    if len(volumes) > 1:
+        return request
+    if not path.is_file():
+        shown = np.array([~np.isnan(plane) for plane in planes(volumes[0])], np.uint8)
+        with atomic_write(path, overwrite=True) as temporary:
+            np.save(temporary, shown)
+    return replace(request, read=replace(read, mask=str(path.absolute()), keep_largest=None))
 
 
 def _absolute(path: str) -> str:

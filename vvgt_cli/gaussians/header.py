@@ -275,7 +275,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
         return {"affine": tuple(affine)}
     if word in ("length-unit", "optics"):
         return {word.replace("-", "_"): words[0]}
-    return {"version": word}
+    return {} if text else {"version": word}
 
 
 def camera_of(words: Sequence[str]) -> tuple[float, ...]:

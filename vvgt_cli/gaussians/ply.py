@@ -135,7 +135,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
         rows[:, 3:6] = normals @ up_matrix(options.up).T
     rows[:, 6:9] = f_dc
     if placed.harmonics is not None:
-        rows[:, 9 : end - 8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), -1)
+        rows[:, 9 : end - 8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), end - 17)
     rows[:, end - 8] = placed.opacity_logits
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions

@@ -37,7 +37,7 @@ def without_other_bodies(volume: Volume, above: float) -> Volume:
             raise DataError(f"{what}: no voxel lies above; expected a lower value")
         kept = largest(matter)
         share = 100 * (1 - np.count_nonzero(kept) / count)
-        warnings.warn(f"{what}: hides {share:.3g} % of the voxels above, of smaller bodies", stacklevel=2)
+        warnings.warn(f"{what}: hides {share:.3g} % of the voxels above it, in smaller bodies", stacklevel=2)
         found: np.ndarray = (kept | ~matter).astype(np.uint8)
         return found
 

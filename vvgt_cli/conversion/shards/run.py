@@ -1,8 +1,9 @@
-"""Conversion to a file in batches: count, choose the size of cells, integrate, cut, refine, write; or by shards."""
+"""Conversion to a file in blocks and regions: count, integrate, cut, refine, write; or by shards."""
 
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -45,6 +46,7 @@ from vvgt_cli.jit.ahead import DRAW, INIT, OPTIMIZE, RENDER, for_blocks, for_deg
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
+DERIVED = ("coarse", "trees", "closed-", "errors-", "written-")  # what a merge adds to a folder of blocks
 A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
 
 
@@ -69,7 +71,7 @@ def writes_streaming(request: ConvertRequest) -> bool:
 
 
 def convert_in_batches(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Convert a volume to a `.ply` or to levels, with only blocks of it and batches of Gaussians in memory.
+    """Convert a volume to a `.ply` or to levels, with only blocks of it and regions of Gaussians in memory.
 
     With ``shard`` of ``request.blocks`` the output is a folder of blocks for `merge`.
 
@@ -130,15 +132,16 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
     degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
     chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
-    if chosen.is_file():  # by a run with the same budget that was interrupted
+    if chosen.is_file():
         steps = int(chosen.read_text("ascii"))
+        run.console.message(f"{steps} steps in the time budget, as the interrupted run chose")
     elif steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
         steps = min(steps, max(int(left / each), 0))
         if steps < fewest:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
-            return None
+            steps = 0
         with atomic_write(chosen, overwrite=True) as temporary:
             temporary.write_text(str(steps), "ascii")
     if not steps:
@@ -166,6 +169,9 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
         runner_of(BlockOptions(workers=workers), threads) as runner,
     ):
         write_merged(run, Pass(runner, store, run.console.bar), output, overwrite)
+    for kind in store.folder.iterdir():
+        if kind.name.startswith(DERIVED):
+            shutil.rmtree(kind)
     return run.finish()
 
 

@@ -128,6 +128,8 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
         colors = [rgb(f"{key} color", p.get("color")) for p in points]
     else:
         colors = [(grey, grey, grey) for grey in (number(f"{key} y", p.get("y")) for p in points)]
+    if not isinstance(component[key].get("hsvWrap", True), bool):
+        raise DataError(f"{key} hsvWrap: {component[key]['hsvWrap']!r}; expected true or false")
     bends, more = np.array([_bend(p) for p in points]), component[key]
     space = str(more.get("colorSpace", "RGB"))
     gradient = component.get("gradientOpacity") and not component.get("disableGradientOpacity")
@@ -145,7 +147,7 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
             bends[:, 0],
             bends[:, 1],
             space=space,
-            hsv_wrap=bool(more.get("hsvWrap", True)),
+            hsv_wrap=more.get("hsvWrap", True),
             log_scale=bool(more.get("useLogScale", False)),
             nan_color=rgb("nanColor", more.get("nanColor", [0.5, 0.0, 0.0])),
         ),
