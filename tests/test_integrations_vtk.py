@@ -19,8 +19,8 @@ from vtkmodules.vtkRenderingVolume import vtkFixedPointVolumeRayCastMapper
 
 from vvgt_cli.integrations import command
 from vvgt_cli.integrations.vtk_property import property_json
-from vvgt_cli.integrations.vtk_scene import drawn, volumes_of
-from vvgt_cli.integrations.vtk_view import camera_of, lights_of
+from vvgt_cli.integrations.vtk_scene import drawn
+from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.function import SPACES
 from vvgt_cli.volume import ReadOptions

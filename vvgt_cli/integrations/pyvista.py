@@ -18,8 +18,8 @@ from vvgt_cli.field.layered import Content
 from vvgt_cli.gaussians.header import camera_of as camera_in
 from vvgt_cli.integrations.layers import Layer, together
 from vvgt_cli.integrations.vtk_property import property_json
-from vvgt_cli.integrations.vtk_scene import Drawn, drawn, volumes_of
-from vvgt_cli.integrations.vtk_view import camera_of, lights_of
+from vvgt_cli.integrations.vtk_scene import Drawn, drawn
+from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.library.inputs import GoalLike, Look, Reading, volume_of
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.lighting import LightOptions

@@ -34,14 +34,6 @@ class Drawn:
     notes: list[str]
 
 
-def volumes_of(renderer: Any) -> list[Any]:
-    """Return the visible vtkVolumes of a renderer that have data."""
-    found = renderer.GetVolumes()
-    volumes = [found.GetItemAsObject(k) for k in range(found.GetNumberOfItems())]
-    mappers = [(volume, volume.GetMapper()) for volume in volumes if volume.GetVisibility()]
-    return [volume for volume, mapper in mappers if mapper is not None and mapper.GetInputDataObject(0, 0) is not None]
-
-
 def _array(mapper: Any, data: Any) -> tuple[Any, bool]:
     """Return the array that a mapper draws, None for none, and whether it is of cells."""
     from vtkmodules.vtkCommonCore import reference

@@ -1,4 +1,4 @@
-"""Camera and lights of a vtkRenderer, as the command's options take them; imports the standard library alone."""
+"""Volumes of a vtkRenderer, and its camera and lights as options of the command; imports the standard library alone."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ from collections.abc import Sequence
 from typing import Any
 
 HEADLIGHT, SCENE = 1, 3  # vtkLight's types; 2 moves with the camera
+
+
+def volumes_of(renderer: Any) -> list[Any]:
+    """Return the visible vtkVolumes of a renderer that have data."""
+    found = renderer.GetVolumes()
+    volumes = [found.GetItemAsObject(k) for k in range(found.GetNumberOfItems())]
+    mappers = [(volume, volume.GetMapper()) for volume in volumes if volume.GetVisibility()]
+    return [volume for volume, mapper in mappers if mapper is not None and mapper.GetInputDataObject(0, 0) is not None]
 
 
 def camera_of(renderer: Any) -> tuple[str, str, list[str]]:
