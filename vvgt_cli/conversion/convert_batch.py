@@ -58,6 +58,9 @@ if TYPE_CHECKING:
 
 WHOLE_RUN = Shard()
 PLACE = ("scale", "centre", "affine", "space", "length_unit", "up")  # facts of a file's place in the world
+SORTED = (
+    "{}: programs that sort Gaussians node by node (three.js, Babylon) show what a node encloses on top or not at all"
+)
 UNKNOWN = "0"  # stem of labels that are not read yet: not that of the index
 
 
@@ -315,8 +318,8 @@ def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: 
         with run.stage("write") as stage:
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
-        if is_page(output):
-            run.console.message(contents(clouds.clouds[0].ply, output, [cloud.shown_name() for cloud in clouds.clouds]))
+        names = [cloud.shown_name() for cloud in clouds.clouds]
+        run.console.message(contents(clouds.clouds[0].ply, output, names) if is_page(output) else SORTED.format(output))
         run.finish()
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import placed, same_place
+from vvgt_cli.gaussians.formats.metres import offset_in, placed
 from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
 from vvgt_cli.gaussians.formats.splats import Splats, joined, logits_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
@@ -55,11 +55,12 @@ def _file(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments
     for path, group in groups.items():
         number[path] = _child(document, number[path[:-1]], {"name": group})
     for node in nodes:
-        own: dict[str, Any] = {"mesh": _mesh(document, arrays, node)}
         if not node.name:
-            document["nodes"][0] |= own
+            document["nodes"][0]["mesh"] = _mesh(document, arrays, "", node.splats)
             continue
-        own |= {"name": node.name} | ({"extras": dict(node.facts)} if node.facts else {})
+        centre, splats = node.centred()
+        own = {"mesh": _mesh(document, arrays, node.name, splats), "name": node.name, "translation": centre.tolist()}
+        own |= {"extras": dict(node.facts)} if node.facts else {}
         _child(document, number[node.parents], own if node.visible else own | {"extensions": _HIDDEN})
     size = sum(array.nbytes for array in arrays)
     document["buffers"].append({"byteLength": size})
@@ -88,9 +89,9 @@ def _child(document: dict[str, Any], parent: int, node: dict[str, Any]) -> int:
     return number
 
 
-def _mesh(document: dict[str, Any], arrays: list[np.ndarray], node: Node) -> int:
-    """Add the mesh of a node and its arrays, and return its number."""
-    splats, accessors = node.splats, document["accessors"]
+def _mesh(document: dict[str, Any], arrays: list[np.ndarray], name: str, splats: Splats) -> int:
+    """Add a mesh and its arrays, and return its number."""
+    accessors = document["accessors"]
     columns = {
         "POSITION": splats.means,
         f"{EXTENSION}:ROTATION": splats.quaternions[:, [1, 2, 3, 0]],
@@ -112,7 +113,7 @@ def _mesh(document: dict[str, Any], arrays: list[np.ndarray], node: Node) -> int
         arrays.append(array)
         start += array.nbytes
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
-    document["meshes"].append(({"name": node.name} if node.name else {}) | {"primitives": [primitive]})
+    document["meshes"].append(({"name": name} if name else {}) | {"primitives": [primitive]})
     return len(document["meshes"]) - 1
 
 
@@ -144,19 +145,21 @@ def _read(content: bytes, name: str) -> Splats:
     document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
     comments = tuple(str(line).replace("\n", " ") for line in document["asset"].get("extras", {}).get("comments", []))
     found: list[Splats] = []
-    open_nodes = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
+    roots = document["scenes"][document.get("scene", 0)]["nodes"]
+    open_nodes: list[tuple[int, np.ndarray | None, np.ndarray]] = [(one, None, np.eye(4)) for one in reversed(roots)]
     met = 0
     while open_nodes:
         met += 1
         if met > len(document["nodes"]):
             raise ValueError("nodes in a circle, or in several places")
-        number, above = open_nodes.pop()
+        number, root, above = open_nodes.pop()
         node = document["nodes"][number]
         place = above @ _matrix(node)
-        open_nodes += [(child, place) for child in reversed(node.get("children", []))]
+        root = place if root is None else root
+        open_nodes += [(child, root, place) for child in reversed(node.get("children", []))]
         if "mesh" in node:
-            same_place(place, comments, name)
-            found.append(_columns(document, binary, node["mesh"], comments))
+            offset = offset_in(root, place, comments, name)
+            found.append(_columns(document, binary, node["mesh"], comments).moved(offset))
     return joined(found)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from vvgt_cli.gaussians.formats.splats import Splats
 
 ROOT = "Splats"  # name of the node that places the others
@@ -28,6 +30,14 @@ class Node:
     parents: tuple[str, ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
     visible: bool = True
+
+    def centred(self) -> tuple[np.ndarray, Splats]:
+        """Return the mean (3,) float64 of its Gaussians' centres, and the Gaussians about it.
+
+        Engines that sort nodes, not the Gaussians of all, do so by the nodes' origins.
+        """
+        centre = self.splats.means.mean(axis=0, dtype=np.float64)
+        return centre, self.splats.moved(-centre)
 
 
 def group_names(nodes: Sequence[Node]) -> dict[tuple[str, ...], str]:

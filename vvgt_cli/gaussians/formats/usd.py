@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import placed, same_place
+from vvgt_cli.gaussians.formats.metres import offset_in, placed
 from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
 from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, logits_of, opacities_of
 from vvgt_cli.volume.libraries import library_errors, need
@@ -75,7 +75,7 @@ def _package(content: bytes) -> bytes:
 def _stage(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments: tuple[str, ...], name: str) -> bytes:
     """Encode nodes; one without a name is the root itself."""
     usd = library(name)
-    from pxr import Sdf, UsdGeom
+    from pxr import Gf, Sdf, UsdGeom
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.usdc"
@@ -90,8 +90,13 @@ def _stage(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comment
         for group, shown in groups.items():
             prims[group] = _below(prims[group[:-1]], shown, "Xform")
         for node in nodes:
-            prim = _below(prims[node.parents], node.name, KIND) if node.name else prims[()]
-            _put(prim, node.splats, name)
+            prim, splats = prims[()], node.splats
+            if node.name:
+                prim = _below(prims[node.parents], node.name, KIND)
+                centre, splats = node.centred()
+                move = UsdGeom.Xformable(prim).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+                move.Set(Gf.Vec3d(*centre.tolist()))
+            _put(prim, splats, name)
             if node.facts:
                 prim.SetCustomData({key: _custom(value) for key, value in node.facts.items()})
             if not node.visible:
@@ -190,7 +195,9 @@ def _columns(prim: Any, comments: tuple[str, ...], name: str) -> Splats:
     """Return the Gaussians of a prim."""
     from pxr import UsdGeom
 
-    same_place(np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0)).T, comments, name)
+    root = prim.GetStage().GetPrimAtPath(prim.GetPath().GetPrefixes()[0])
+    above, place = (np.array(UsdGeom.Xformable(one).ComputeLocalToWorldTransform(0.0)).T for one in (root, prim))
+    offset = offset_in(above, place, comments, name)
 
     def values(attribute: str) -> np.ndarray:
         return np.array(prim.GetAttribute(attribute).Get(), np.float32)
@@ -207,4 +214,4 @@ def _columns(prim: Any, comments: tuple[str, ...], name: str) -> Splats:
         np.ascontiguousarray(harmonics[:, 0]),
         np.ascontiguousarray(harmonics[:, 1:]),
         comments,
-    )
+    ).moved(offset)
