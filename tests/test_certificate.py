@@ -150,7 +150,7 @@ def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
 
 @pytest.mark.parametrize("suffix", SUFFIXES[1:])
 def test_every_format_carries_it(vvgt, folder, made, tmp_path, suffix) -> None:
-    if suffix == ".usdc":
+    if suffix in (".usdc", ".usdz"):
         pytest.importorskip("pxr")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *args, "-o", tmp_path / f"out{suffix}").code == 0

@@ -33,6 +33,7 @@ ROUNDED = {
     ".sog": (4e-5, 0.02, 3e-5, 2.1e-3, 4e-3),
     ".glb": (0, 1e-6, 1e-6, 1e-6, 1e-6),
     ".usdc": (0, 1e-6, 1e-6, 1e-6, 1e-6),
+    ".usdz": (0, 1e-6, 1e-6, 1e-6, 1e-6),
 }
 suffix = pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.suffix)
 
@@ -75,7 +76,7 @@ def test_what_is_written_is_read_again(known, up, tmp_path):
     before, path = cloud(), tmp_path / f"a{known.suffix}"
     options = PlyOptions(up=up, made_for=300, rule="spark", unit_distance=2.5, unit_distance_label="given")
     path.write_bytes(encoded(known, before, options, path.name))
-    assert path.read_bytes() == encoded(known, before, options, path.name) or known.suffix == ".usdc"
+    assert path.read_bytes() == encoded(known, before, options, path.name) or known.suffix in (".usdc", ".usdz")
     gaussians, header = read_splats(path)
     found = errors(before, in_unit_frame(gaussians, header))
     assert all(a <= b for a, b in zip(found, ROUNDED[known.suffix], strict=True)), found
@@ -92,7 +93,9 @@ def test_harmonics_are_kept_each_in_its_place(known, degree):
     before = Splats(base.means, base.log_scales, base.quaternions, base.logits, base.f_dc, rest)
     after = known.read(known.write(before, "a"), "a")
     order = ((after.means[None] - before.means[:, None]) ** 2).sum(axis=2).argmin(axis=1)
-    step = {".glb": 0, ".usdc": 0, ".spz": 1 / 256 + 1e-6, ".v4.spz": 1 / 256 + 1e-6}.get(known.suffix, 1 / 31)
+    step = {".glb": 0, ".usdc": 0, ".usdz": 0, ".spz": 1 / 256 + 1e-6, ".v4.spz": 1 / 256 + 1e-6}.get(
+        known.suffix, 1 / 31
+    )
     assert abs(after.f_rest[order] - rest).max() <= step
     assert columns_of(ply_bytes(before), "a").f_rest.tobytes() == rest.tobytes()
 

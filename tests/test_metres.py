@@ -100,7 +100,7 @@ def test_other_units_and_none(unit, metre):
     gaussians, world = marks()
     points, node = gltf_points(encoded(format_of("a.glb"), gaussians, layout(PlyOptions(), volume), "a"))
     if metre is None:
-        assert set(node) == {"mesh", "rotation"}
+        assert set(node) == {"name", "mesh", "rotation"}
         assert points == pytest.approx(gaussians.means * [-1, -1, 1])
     else:
         assert points * [-1, -1, 1] / metre == pytest.approx(world, rel=1e-5)
@@ -109,7 +109,7 @@ def test_other_units_and_none(unit, metre):
 
 def test_no_comments_no_place():
     content = encoded(format_of("a.glb"), marks()[0], layout(PlyOptions(comments=False), VOLUME), "a")
-    assert set(gltf_points(content)[1]) == {"mesh", "rotation"}
+    assert set(gltf_points(content)[1]) == {"name", "mesh", "rotation"}
     assert b"-1043" not in content
     assert placed((), "a").world is None
 

@@ -93,7 +93,7 @@ def test_functions_and_labels_have_their_names(vvgt, steps):
     two = ("--tf", steps / "tf.json", "--tf", steps / "other.json")
     assert vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW).code == 0
     big = vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-size", "1")
-    assert (big.code, "--max-size with a page of several clouds: the limit is for one file" in big.error) == (2, True)
+    assert (big.code, "--max-size with one file of several clouds: the limit is for one file" in big.error) == (2, True)
     held = clouds(steps / "two.html")
     assert list(held) == ["tf", "other"]
     assert held["tf"].mean() > held["other"].mean()
@@ -129,7 +129,7 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
     for extra in ("--report", "r.json"), ("--preview", "p.png"), ("--checkpoint", "c"):
         done = vvgt("convert", "four.nii", "-o", "four.html", *extra, *how)
         assert (done.code, len(done.error.splitlines())) == (2, 1)
-        assert "with a page of several clouds" in done.error
+        assert "with one file of several clouds" in done.error
     done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
     assert (done.code, "--max-size needs .ply output" in done.error) == (2, True)
     white = {"rgb": [1, 1, 1]}

@@ -23,6 +23,7 @@ COMMANDS = {
     "series, page": ("convert", "a_*.npy", "--tf", "a.json", *SMALL, "-o", "OUT/x.html"),
     "functions": ("convert", "a_0.npy", "--tf", "a.json", "--tf", "b.json", *SMALL, "-o", "OUT/x_{}.ply"),
     "labels": ("convert", "labels.npy", "--labels", "auto", *SMALL, "--split-labels", "-o", "OUT/x_{}.ply"),
+    "labels, nodes": ("convert", "labels.npy", "--labels", "auto", *SMALL, "--split-labels", "-o", "OUT/x.usdz"),
     "picture": ("convert", "a_0.npy", *SMALL, "--preview", "OUT/x.png", "-o", "OUT/x.ply"),
     "init": ("init", "a_0.npy", "--tf", "a.json", *SMALL[:4], "-o", "OUT/x.sog"),
     "views": ("render-views", "a_0.npy", "--tf", "a.json", "--size", "32", "--views", "2", "-o", "OUT/x"),
@@ -48,7 +49,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_two_runs_leave_equal_bytes(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if name == ".usdc":
+    if name in (".usdc", ".usdz", "labels, nodes"):
         pytest.importorskip("pxr")
     monkeypatch.chdir(folder)
 

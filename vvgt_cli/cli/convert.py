@@ -63,7 +63,8 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option(
     "--split-labels", is_flag=True,
-    help="Write one file per label of a label map, named by {} in OUT.ply, and an index.",
+    help="Write one file per label of a label map, named by {} in OUT.ply, and an index; or one page (.html), or one "
+    ".glb, .usdc or .usdz with a node per label and, with --layer, per layer.",
 )  # fmt: skip
 @device_option("views are drawn and steps are taken")
 @block_options
@@ -82,12 +83,13 @@ def command(
     The result is scored on test views that it was not fitted to, and the error is printed. --target-psnr,
     --time-budget and --max-size decide which stages run. Ctrl-C ends gradient descent early and writes the result.
 
-    OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb or .usdc.
+    OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb, .usdc or .usdz.
     FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
     For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a placeholder for the number,
     such as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
-    .html without a placeholder makes one page of all frames, functions or labels.
+    .html without a placeholder makes one page of all frames, functions or labels, one in .glb, .usdc or .usdz one file
+    with a node for each function or label.
 
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
@@ -101,6 +103,7 @@ def command(
       vvgt convert four.nii -o four.html
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
+      vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
     from vvgt_cli.cli.fit import convert_request

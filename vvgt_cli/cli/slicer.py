@@ -39,7 +39,7 @@ file for viewers.</description>
 <description>Says that Slicer calls</description><default>true</default></boolean>
 <image><name>volume</name><label>Volume</label>
 <description>Volume to convert</description><channel>input</channel><index>0</index></image>
-<file fileExtensions=".html,.ply,.spz,.sog,.glb,.usdc"><name>output</name><label>Result</label>
+<file fileExtensions=".html,.ply,.spz,.sog,.glb,.usdc,.usdz"><name>output</name><label>Result</label>
 <description>Page, or file of Gaussians</description><channel>output</channel><index>1</index></file>
 </parameters>
 <parameters>

@@ -75,7 +75,7 @@ def command(
     alone.
 
     With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
-    .sog, .glb and .usdc are for other programs. The loss due to the format is printed.
+    .sog, .glb, .usdc and .usdz are for other programs. The loss due to the format is printed.
 
     Examples:
       vvgt view frog.ply

@@ -25,7 +25,8 @@ from vvgt_cli.score.record import Run
 if TYPE_CHECKING:
     from vvgt_cli.conversion.warm_start import WarmStart
 
-ONE, LIVE, LEVELS, PAGE = "one volume", "--live", "streamed levels", "a page of several clouds"
+ONE, LIVE, LEVELS, ONE_FILE = "one volume", "--live", "streamed levels", "one file of several clouds"
+LAYERS = "labels of layers"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
@@ -45,7 +46,6 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
     },
     LABELS: {
         "--tf": "the colours of labels come from --labels; remove it",
-        "--layer": "only the label map is divided; remove it",
         "--labels none": "it needs labels; remove it",
         "--dry-run": "a plan is for one file; remove it",
         "--shard": "shards are for series; remove it",
@@ -63,12 +63,15 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         ),
         "levels are cuts of one closed form, refined on the CPU; remove it",
     ),
-    PAGE: {
+    ONE_FILE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
         "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
         "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
         "--max-size": WHOLE,
     },
+}
+CANNOT[LAYERS] = {option: why for option, why in CANNOT[LABELS].items() if option not in ("--tf", "--labels none")} | {
+    "a file each": "each layer has a frame of its own; write one file, as -o out.glb (.usdc, .usdz, .html)"
 }
 
 

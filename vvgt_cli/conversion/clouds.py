@@ -12,6 +12,7 @@ import numpy as np
 
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
+    FRAMES,
     entry,
     index_of,
     index_output,
@@ -25,10 +26,15 @@ from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats.nodes import Node
+from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 
 if TYPE_CHECKING:
     from vvgt_cli.look.function import TransferFunction
+
+
+NOT_IN_NODES = ("parents", "visible", "function")  # facts that the tree says itself, and the path of a file
 
 
 @dataclass(repr=False)
@@ -92,11 +98,12 @@ class Clouds(Mapping[str, Result]):
         return f"<{len(self)} {self.kind} of {self.volume}: {', '.join(self)}>"
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = True, **how: Any) -> int:
-        """Write one page of all clouds, or a file of each with an index.
+        """Write one file of all clouds, or a file of each with an index.
 
         Args:
-            path: a page (``.html``), or a pattern with a place for the name (``{}``, for frames also ``{:04d}``);
-                without one, ``x.ply`` means ``x_{}.ply``. The index is ``x_index.json``.
+            path: a page (``.html``); unless they are frames, a file with a node of each (``.glb``, ``.usdc``,
+                ``.usdz``); or a pattern with a place for the name (``{}``, for frames also ``{:04d}``), where
+                ``x.ply`` means ``x_{}.ply``. The index is ``x_index.json``.
             overwrite: replace files that exist.
             **how: frame, up, sh_degree and comments of the files; see `Result.save`.
 
@@ -110,8 +117,13 @@ class Clouds(Mapping[str, Result]):
         name = os.fspath(path)
         if is_page(name) and not is_pattern(name):
             return self._page(name, overwrite, how)
+        known = format_of(name)
+        if not is_pattern(name) and known and known.write_nodes and self.kind != FRAMES:
+            check_outputs([Output("save", name, SUFFIXES, splats=True)], [], overwrite)
+            content = known.write_nodes(self.nodes(**how), name)
+            with atomic_write(name, overwrite) as temporary:
+                return temporary.write_bytes(content)
         if not is_pattern(name):
-            known = format_of(name)
             suffix = known.suffix if known else Path(name).suffix
             name = f"{name[: len(name) - len(suffix)]}_{{}}{suffix}"
         files = [put_name("save", name, self.kind, cloud.stem) for cloud in self.clouds]
@@ -125,6 +137,24 @@ class Clouds(Mapping[str, Result]):
             total += size
         write_index(index.path, index_of(self.kind, self.volume, rows, **self.facts), overwrite)
         return total
+
+    def nodes(self, sh_degree: int | None = None, **how: Any) -> list[Node]:
+        """Return the clouds as nodes of one file, with what is known of them unless it has no comments.
+
+        Args:
+            sh_degree: of all of them; None: that of their files, else the highest.
+            **how: frame, up and comments; see `Result.save`.
+        """
+        degree = max(cloud.gaussians.degree for cloud in self.clouds)
+        found = []
+        for cloud in self.clouds:
+            ply = cloud.layout(sh_degree=sh_degree, **how)
+            ply = replace(ply, live=None, sh_degree=degree if ply.sh_degree is None else ply.sh_degree)
+            splats = splats_of(replace(cloud.gaussians, live=None), ply)
+            facts = {key: value for key, value in cloud.facts.items() if key not in NOT_IN_NODES and ply.comments}
+            place = tuple(cloud.facts.get("parents", ())), facts, cloud.facts.get("visible", True)
+            found.append(Node(cloud.name, splats, *place))
+        return found
 
     def recolor(self, look: str | TransferFunction | None = None, **how: Any) -> Clouds:
         """Return all live clouds under another function: `Result.recolor` of each.

@@ -9,11 +9,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.batch import LEVELS, LIVE, ONE, PAGE, Batch, Functions, Item, check_options, options_in
+from vvgt_cli.conversion.batch import (
+    LAYERS,
+    LEVELS,
+    LIVE,
+    ONE,
+    ONE_FILE,
+    Batch,
+    Functions,
+    Item,
+    check_options,
+    options_in,
+)
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
 from vvgt_cli.conversion.frames import Series, is_glob_of_volumes
-from vvgt_cli.conversion.gaussian_files import is_page
+from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     FUNCTIONS,
@@ -29,6 +40,7 @@ from vvgt_cli.conversion.index import (
 )
 from vvgt_cli.conversion.labels import Labels
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
+from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.open import automatic
@@ -41,8 +53,14 @@ from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion
+    from vvgt_cli.gaussians import PlyOptions
+    from vvgt_cli.volume import UnitFrame
 
 WHOLE_RUN = Shard()
+PLACE = ("scale", "centre", "affine", "space", "length_unit", "up")  # facts of a file's place in the world
+SORTED = (
+    "{}: programs that sort Gaussians node by node (three.js, Babylon) show what a node encloses on top or not at all"
+)
 UNKNOWN = "0"  # stem of labels that are not read yet: not that of the index
 
 
@@ -156,12 +174,13 @@ class Files:
 
 
 class Memory:
-    """The sink that keeps Gaussians, scores and layouts."""
+    """The sink that keeps Gaussians, scores and layouts; all Gaussians are in the unit frame of the first volume."""
 
     def __init__(self) -> None:
         """Start without clouds."""
         self._clouds: list[Cloud] = []
         self._made: Cloud | None = None
+        self._first: tuple[UnitFrame, PlyOptions] | None = None
 
     def open(self, batch: Batch, run: Run) -> None:
         """Prepare the batch.
@@ -182,8 +201,13 @@ class Memory:
         with open_field(run, item.request) as volume:
             found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
             normals = found.normals()
+            own = volume.source.volume.unit_frame()
         run.finish()
-        self._made = Cloud(found.gaussians, found.report, found.ply, item.name, item.stem, dict(item.facts), normals)
+        gaussians, ply, self._first = found.gaussians, found.ply, self._first or (own, found.ply)
+        if own != self._first[0]:  # another layer's
+            gaussians = to_frame_of(gaussians, own, self._first[0])
+            ply = replace(ply, **{name: getattr(self._first[1], name) for name in PLACE})
+        self._made = Cloud(gaussians, found.report, ply, item.name, item.stem, dict(item.facts), normals)
         return found.report
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
@@ -222,7 +246,7 @@ def convert_files(
     request: ConvertRequest, functions: Sequence[str] = (), *, split_labels: bool = False, dry_run: bool = False,
     shard: str | None = None, console: Console | None = None,
 ) -> str | None:  # fmt: skip
-    """Convert one volume, the frames of a series, several functions or the labels of a map to files or a page.
+    """Convert one volume, the frames of a series, several functions or the labels of a map to files or one file.
 
     Args:
         request: the request; an ``output`` with a place for a number or name (``{}``) asks for several files.
@@ -242,11 +266,13 @@ def convert_files(
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "several --tf": several}
+    flags["a file each"] = numbered
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
-    kinds = [LEVELS] if is_streamed(output) else [kind, *([LIVE] if request.live else [])]
-    page = kind != ONE and is_page(output) and not numbered
-    for one in [*kinds, *([PAGE] if page else [])]:
+    named = LAYERS if kind == LABELS and request.source.layers else kind
+    kinds = [LEVELS] if is_streamed(output) else [named, *([LIVE] if request.live else [])]
+    together = kind != ONE and holds_several(output) and not numbered
+    for one in [*kinds, *([ONE_FILE] if together else [])]:
         check_options(one, used)
     if is_streamed(output):
         from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
@@ -265,21 +291,21 @@ def convert_files(
             if not is_page(output):
                 raise
     if kind == ONE:
-        kind, page = FRAMES, True
-        check_options(PAGE, used)
+        kind, together = FRAMES, True
+        check_options(ONE_FILE, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
-    request = replace(request, editor=request.editor and not page)
+    request = replace(request, editor=request.editor and not together)
     looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, looks, share, page)
-    if page:
-        _save_page(batch, request, output, console)
+    batch = _batch(kind, request, looks, share, together)
+    if together:
+        _save_one_file(batch, request, output, console)
     else:
         _run(batch, Files(request, share), console)
     return None
 
 
-def _save_page(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
-    """Convert a batch to one page.
+def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
+    """Convert a batch to one page, or one file with a node for each item.
 
     Raises:
         DataError: nothing is visible in any of it.
@@ -292,7 +318,8 @@ def _save_page(batch: Batch, request: ConvertRequest, output: str, console: Cons
         with run.stage("write") as stage:
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
-        run.console.message(contents(clouds.clouds[0].ply, output, [cloud.shown_name() for cloud in clouds.clouds]))
+        names = [cloud.shown_name() for cloud in clouds.clouds]
+        run.console.message(contents(clouds.clouds[0].ply, output, names) if is_page(output) else SORTED.format(output))
         run.finish()
 
 
@@ -317,7 +344,7 @@ def convert_to_memory(
     console, request = console or Console(), next(iter(requests.values()))
     used = options_in(request) | ({"after"} if after else set()) | ({"--split-labels"} if split_labels else set())
     kind = FUNCTIONS if several else LABELS if split_labels else ONE
-    for one in [kind, *([LIVE] if request.live else [])]:
+    for one in [LAYERS if kind == LABELS and request.source.layers else kind, *([LIVE] if request.live else [])]:
         check_options(one, used)
     path = request.source.volume
     if kind == ONE and not (isinstance(path, str) and is_glob_of_volumes(path)):

@@ -97,6 +97,12 @@ def is_page(output: str | None) -> bool:
     return known is not None and known.suffix == ".html"
 
 
+def holds_several(output: str) -> bool:
+    """Return whether an output can hold several clouds: a page, or a format with nodes."""
+    known = None if output == STDOUT else format_of(output)
+    return is_page(output) or (known is not None and known.write_nodes is not None)
+
+
 def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
     """Write several files of Gaussians as one page.
 

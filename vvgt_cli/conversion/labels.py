@@ -1,7 +1,8 @@
 """The labels of a label map as a batch (`vvgt convert --split-labels`), whose clouds add up to the whole.
 
 The whole map is converted as one scene, and each Gaussian is assigned to the label with most of it. Labels that others
-hide are also converted alone, and their hidden Gaussians added.
+hide are also converted alone, and their hidden Gaussians added; so are labels that their table switches off. Layers
+(`--layer`) are converted one by one.
 """
 
 from __future__ import annotations
@@ -9,18 +10,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.conversion.batch import Batch, Item
+from vvgt_cli.conversion.batch import UNSAFE, Batch, Item
 from vvgt_cli.conversion.convert import fit_gaussians, open_field
 from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_content
+from vvgt_cli.field.layered import AUTO, IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
@@ -30,23 +31,32 @@ from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.label_maps import counts_of
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr.layers import Layer
+from vvgt_cli.volume.label_maps import extents_of
 
 LONGEST = 80  # characters of a label's name in a file name
 
 
 @dataclass(frozen=True)
-class MapLabel:
-    """A visible label of a map, and the request that would convert it alone."""
+class Part:
+    """A label, or a layer without labels, and the request that would convert it alone."""
+
+    name: str
+    stem: str
+    request: ConvertRequest
+    facts: dict[str, Any]
+
+    def text(self) -> str:
+        """Return its name for a message."""
+        return f"layer {self.name}"
+
+
+@dataclass(frozen=True)
+class MapLabel(Part):
+    """A label of a map."""
 
     volume: Volume
     table: LabelTable
     label: Label
-    request: ConvertRequest
-    stem: str
 
     def text(self) -> str:
         """Return number and name for a message."""
@@ -54,10 +64,10 @@ class MapLabel:
 
 
 class Labels(Batch):
-    """The visible labels of a label map, converted as a whole and divided.
+    """The labels of a label map, without transparent ones, converted as a whole and divided; of layers, those of each.
 
-    They have at most ``max_gaussians`` Gaussians together. Hidden ones get a share by the labels' surfaces
-    (voxels to the power of 2/3), visible ones the rest.
+    They have at most ``max_gaussians`` Gaussians together, of which each layer gets as many. Hidden labels get a share
+    by the labels' surfaces (voxels to the power of 2/3), visible ones the rest.
     """
 
     kind = LABELS
@@ -65,10 +75,10 @@ class Labels(Batch):
     def __init__(self, request: ConvertRequest) -> None:
         """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
-        self._labels: list[MapLabel] = []
+        self._layers: list[tuple[ConvertRequest, list[Part]]] = []
 
     def prepare(self, run: Run) -> None:
-        """Read the map and its table.
+        """Read the map and its table, and those of the layers.
 
         Raises:
             DataError: see `convert`; no label is visible.
@@ -76,26 +86,30 @@ class Labels(Batch):
         source = self.request.source
         with run.stage("volume") as stage:
             self.request = request = replace(self.request, blocks=self.request.blocks or automatic(source, run.console))
-            content = _content(source, request.blocks is not None)
-            maps = layers_of(content, None, source.labels or AUTO)
-            check_labels([layer.tf for layer in maps])
-            self._labels = _visible(request, content, maps)
-            self.volume, self.facts = maps[0].volume.name, {"table": " + ".join(layer.tf.name for layer in maps)}
-            self.stems = [one.stem for one in self._labels]
-            stage.note = f"{self.volume}, {len(self._labels)} labels of {self.facts['table']}"
+            sources = [replace(source, layers=()), *(replace(one, light=source.light) for one in source.layers)]
+            budget = max(request.fit.max_gaussians // len(sources), 1)
+            tables: list[str] = []
+            for one in sources:
+                own = replace(request, source=one, fit=replace(request.fit, max_gaussians=budget))
+                content = _content(one, request.blocks is not None)
+                self._layers.append((own, _parts(own, content, len(sources) > 1, tables)))
+                self.volume = self.volume or content.volumes[0].name
+            self.facts = {"table": " + ".join(tables)}
+            found = [part for _, parts in self._layers for part in parts]
+            self.stems = [part.stem for part in found]
+            stage.note = f"{self.volume}, {len(found)} labels of {self.facts['table']}"
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """Yield an item with its Gaussians for each label that is visible."""
-        names = [one.label.name for one in self._labels]
-        for one, gaussians in zip(self._labels, _gaussians(self.request, self._labels, run), strict=True):
-            if gaussians is None:
-                run.console.message(f"skipped: {one.text()} (nothing of it is visible)")
-                continue
-            run.console.message(f"{one.text()}: {len(gaussians)} Gaussians")
-            label = one.label
-            facts = {"label": label.number, "color": label.color, "opacity": label.opacity}
-            name = label.name if names.count(label.name) == 1 else one.stem
-            yield Item(name, one.stem, one.request, facts, gaussians)
+        """Yield an item with its Gaussians for each label, and for each layer without labels."""
+        names = [part.name for _, parts in self._layers for part in parts]
+        for request, parts in self._layers:
+            for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
+                if gaussians is None:
+                    run.console.message(f"skipped: {part.text()} (nothing of it is visible)")
+                    continue
+                run.console.message(f"{part.text()}: {len(gaussians)} Gaussians")
+                name = part.name if names.count(part.name) == 1 else part.stem
+                yield Item(name, part.stem, part.request, part.facts, gaussians)
 
 
 def _content(source: SourceRequest, stored: bool) -> Content:
@@ -106,23 +120,43 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     return open_content(source.path, read)
 
 
-def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[MapLabel]:
-    """Return the visible labels, each with its own request and its share of the budget."""
-    shown = [
-        (layer.volume, layer.tf, label)
-        for layer in maps
-        if isinstance(layer.tf, LabelTable)
-        for label in layer.tf.labels
-        if label.opacity > 0
-    ]
-    numbers = [label.number for *_, label in shown]
-    found = []
-    for (volume, table, label), share in zip(shown, shares(shown, request.fit.max_gaussians), strict=True):
-        source = replace(_source(request, content, volume), labels=table.only(label.number))
-        alone = replace(request, source=source, fit=replace(request.fit, max_gaussians=share))
+def _parts(request: ConvertRequest, content: Content, layered: bool, tables: list[str]) -> list[Part]:
+    """Return the labels of a map, or a layer as a whole if it is none; the names of tables are added to ``tables``.
+
+    Raises:
+        DataError: see `convert`; of a single map, no label is visible.
+    """
+    source = request.source
+    labels = source.labels or (None if layered else AUTO)
+    if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
+        name = content.volumes[0].name
+        whole = replace(source, volume=content) if request.blocks is None else source
+        return [Part(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
+    maps = layers_of(content, None, labels, distance=source.unit_distance)
+    tables += [layer.tf.name for layer in maps]
+    if not layered:
+        check_labels([layer.tf for layer in maps])
+    shown = []
+    for layer in maps:
+        extents = extents_of(layer.volume)
+        for label in layer.tf.labels if isinstance(layer.tf, LabelTable) else ():
+            extent = extents.get(float(label.number))
+            if label.shown_opacity > 0 and extent is not None:
+                shown.append((layer, label, extent))
+    numbers = [label.number for _, label, _ in shown]
+    found: list[Part] = []
+    divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
+    for (layer, label, extent), share in zip(shown, divided, strict=True):
+        volume, table = layer.volume, layer.tf
+        assert isinstance(table, LabelTable)
+        alone = replace(_source(request, content, volume), labels=table.only(label.number))
         again = numbers.count(label.number) > 1  # of segments that overlap
         stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
-        found.append(MapLabel(volume, table, label, alone, stem))
+        facts = label.facts() | extent.measures(volume)
+        if layered:
+            facts["parents"] = (content.volumes[0].name, *label.parents)
+        one = replace(request, source=alone, fit=replace(request.fit, max_gaussians=share))
+        found.append(MapLabel(label.name, stem, one, facts, volume, table, label))
     return found
 
 
@@ -137,11 +171,12 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
+def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
     """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
-    if len(labels) == 1 or len({id(label.volume) for label in labels}) > 1:
-        return [_alone(label, console) for label in labels]  # a Gaussian would mix colours of overlapping segments
+    labels = [part for part in parts if isinstance(part, MapLabel)]
+    if len(labels) < 2 or len({id(label.volume) for label in labels}) > 1:
+        return [_alone(part, console) for part in parts]  # a Gaussian would mix colours of overlapping segments
     whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions((NONE,))))
     with open_field(run, plain) as field, run.stage("hidden"):
@@ -153,24 +188,26 @@ def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) ->
     hidden: list[list[Gaussians]] = []
     for label in labels:
         hidden.append([])
-        if not hides.meet_label(label.volume, label.label.number):
+        off = not label.label.opacity
+        if not off and not hides.meet_label(label.volume, label.label.number):
             continue
-        console.message(f"{label.text()}: converting what others hide of it")
+        console.message(f"{label.text()}: converting {'it alone: off' if off else 'what others hide of it'}")
         alone = _alone(label, console)
         if alone is not None:
-            hidden[-1].append(alone.take(hides.contain(alone)))
+            hidden[-1].append(alone if off else alone.take(hides.contain(alone)))
     console.message("all labels: converting what is visible")
     remaining = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
     seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=remaining)), console)
-    owner = assign_labels(seen, [(label.volume, label.table, label.label) for label in labels])
+    on = [k for k, label in enumerate(labels) if label.label.opacity]
+    owner = np.array(on)[assign_labels(seen, [(labels[k].volume, labels[k].table, labels[k].label) for k in on])]
     both = [concatenate([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 
-def _alone(label: MapLabel, console: Console) -> Gaussians | None:
-    """Convert a label as if it were the only one; return None where nothing is visible."""
+def _alone(part: Part, console: Console) -> Gaussians | None:
+    """Convert a label or layer as if it were the only one; return None where nothing is visible."""
     try:
-        return _fit(label.request, console)
+        return _fit(part.request, console)
     except NothingVisible:
         return None
 
@@ -184,20 +221,11 @@ def _fit(request: ConvertRequest, console: Console) -> Gaussians:
     return found
 
 
-def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:
+def shares(voxels: Sequence[int], budget: int) -> list[int]:
     """Return the number of Gaussians of each label, at least one, and otherwise at most ``budget`` together."""
-    weight = np.array([max(count, 1) for count in _voxels(shown)], np.float64) ** (2 / 3)
+    weight = np.array(voxels, np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
-
-
-def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
-    """Return the number of voxels of each label; every map is counted once."""
-    counts: dict[int, dict[float, int]] = {}
-    for volume, *_ in shown:
-        if id(volume) not in counts:
-            counts[id(volume)] = counts_of(volume)
-    return [counts[id(volume)].get(float(label.number), 0) for volume, _, label in shown]
 
 
 def file_name(label: Label) -> str:

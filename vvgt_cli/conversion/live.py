@@ -164,7 +164,8 @@ def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Ga
         except NothingVisible:  # a frame of a series in which it is empty
             run.skip(layer.volume.name, "only background")
             continue
-        some = to_box_frame(to_frame_of(to_unit_frame(some, layer.volume), layer.volume, source.volume), source.volume)
+        frames = layer.volume.unit_frame(), source.volume.unit_frame()
+        some = to_box_frame(to_frame_of(to_unit_frame(some, layer.volume), *frames), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
         assert some.live is not None
         live = np.zeros((len(some), LAYER_ID + 1), np.float32)

@@ -19,7 +19,7 @@ from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
-from vvgt_cli.volume.label_maps import counts_of
+from vvgt_cli.volume.label_maps import extents_of
 
 
 def live_labels(source: Source) -> tuple[Label, ...]:
@@ -46,7 +46,7 @@ def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
     """Return the field of a label map as one thin fog, whose labels differ in colour."""
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
-    voxels = counts_of(layer.volume)
+    voxels = {value: extent.count for value, extent in extents_of(layer.volume).items()}
     table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
     return field.with_look(field.source.with_tables([table]))
 

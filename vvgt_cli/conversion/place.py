@@ -14,7 +14,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.frames import rescale, transform, upright_matrix
 from vvgt_cli.gaussians.live import LENGTH
 from vvgt_cli.gaussians.rules import INRIA, Rule
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import UnitFrame, Volume
 from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
@@ -52,9 +52,8 @@ def to_box_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
     return gaussians if aligned else transform(gaussians, np.linalg.inv(axes))
 
 
-def to_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
-    """Transform Gaussians, and the lengths that they carry, from the unit frame of ``volume`` to that of ``other``."""
-    own, its = volume.unit_frame(), other.unit_frame()
+def to_frame_of(gaussians: Gaussians, own: UnitFrame, its: UnitFrame) -> Gaussians:
+    """Transform Gaussians, and the lengths that they carry, from the unit frame of one volume to that of another."""
     before, factor = own.scale * (np.array(own.centre) - np.array(its.centre)), its.scale / own.scale
     moved = rescale(gaussians, factor, before, np.zeros(3))
     if gaussians.live is None:

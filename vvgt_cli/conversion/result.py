@@ -106,21 +106,31 @@ class Result:
                 ".ply or another format, or 'vvgt convert VOLUME -o FOLDER/lod-meta.json'"
             )
         check_outputs([Output("save", os.fspath(path), SUFFIXES, splats=True)], [], overwrite)
+        ply, known = self.layout(frame, up, sh_degree, comments), format_of(path)
+        with atomic_write(path, overwrite) as temporary:
+            if known is None:
+                return write_ply(temporary, self.gaussians, ply, self.normals())
+            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NOTHING
+            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
+
+    def layout(
+        self, frame: str | None = None, up: str | None = None, sh_degree: int | None = None,
+        comments: bool | None = None,
+    ) -> PlyOptions:  # fmt: skip
+        """Return the layout of a file; arguments as in `save`.
+
+        Raises:
+            UsageError: a value is invalid.
+        """
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
         frame = frame or old.frame
-        ply = replace(
+        return replace(
             old,
             frame=frame,
             up=old.up if up is None and frame == old.frame else up_axis(up or AUTO, frame, space),
             sh_degree=old.sh_degree if sh_degree is None else sh_degree,
             comments=old.comments if comments is None else comments,
         )
-        known = format_of(path)
-        with atomic_write(path, overwrite) as temporary:
-            if known is None:
-                return write_ply(temporary, self.gaussians, ply, self.normals())
-            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NOTHING
-            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
 
     def recolor(
         self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,

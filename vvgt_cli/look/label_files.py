@@ -7,6 +7,8 @@
 - .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
 - DICOM SEG: segment numbers, labels and recommended CIELab colours, else distinct ones.
 - JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc".
+
+Groups of labels come from coded terms or, in JSON, from "parents" (`vvgt_cli.look.terms`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from typing import Any
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.labels import LONGEST_NAME, SOLID, Label, LabelTable, distinct
 from vvgt_cli.look.readers.fields import json_of, number, rgb, text_of
+from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, codes_of_tags, parents_of
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
 from vvgt_cli.volume.dicom.segmentation import segments as dicom_segments
 
@@ -46,7 +49,8 @@ EXPECTED = (
     'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
 _INTEGER, _DECIMAL = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
-Row = tuple[str, int, str, Any, float | None]  # place for errors, label, name, colour in [0, 1], A / 255 or None
+# place for errors, label, name, colour in [0, 1], A / 255 or None, whether it is switched on, codes
+Row = tuple[str, int, str, Any, float | None, bool, Codes]
 _SNAP = re.compile(
     r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
 )
@@ -130,10 +134,10 @@ def _lines(text: str, path: Path) -> list[Label]:
         here = f"{path}: line {n}"
         if snap := _SNAP.fullmatch(line):
             color, opacity = [int(v) / 255 for v in snap.groups()[1:4]], True
-            rows.append((here, int(snap[1]), snap[8], color, float(snap[5]) * int(snap[6])))
+            rows.append((here, int(snap[1]), snap[8], color, float(snap[5]), snap[6] == "1", ()))
         elif plain := _plain(line):
             value, name, numbers, last = plain
-            rows.append((here, int(value), name, [float(v) / 255 for v in numbers], last))
+            rows.append((here, int(value), name, [float(v) / 255 for v in numbers], last, True, ()))
         else:
             raise DataError(f"{here}: {line[:60]!r}; {EXPECTED}")
     return _labels(rows, path, text, opacity)
@@ -159,7 +163,7 @@ def _separated(text: str, path: Path) -> list[Label]:
                 raise DataError(f"{path}: row {n}: label {value[:20]!r}, colour {', '.join(color)[:40]}; {EXPECTED}")
             shown = [float(v) / 255 for v in color] or _hex(found["color"])
             last = float(found["a"]) / 255 if found["a"] else None
-            rows.append((f"{path}: row {n}", int(value), found["name"], shown, last))
+            rows.append((f"{path}: row {n}", int(value), found["name"], shown, last, True, codes_of_row(texts)))
     except csv.Error as error:
         raise DataError(f"{path}: {error}; {EXPECTED}") from None
     return _labels(rows, path, text, "color_a" in head)
@@ -176,9 +180,9 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
         warnings.warn(f"{path.name}: {len(blank)} labels have no colour; given distinct ones", stacklevel=2)
         colors = {label.number: list(label.color) for label in distinct(sorted(set(blank))).labels}
     found = []
-    for here, value, name, color, last in rows:
+    for here, value, name, color, last, shown, codes in rows:
         alpha = 0.0 if not value else SOLID if last is None else last if opacity else 1 - last
-        found.append(_label(here, value, name or f"label {value}", color or colors[value], alpha))
+        found.append(_label(here, value, name or f"label {value}", color or colors[value], alpha, shown, codes))
     return found
 
 
@@ -236,7 +240,8 @@ def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
         if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
             raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
         name = segment.get("Name", segment.get("ID", f"label {label}"))
-        found.append(_label(f"{what}: segment {index}", int(label), name, [float(c) for c in color], SOLID))
+        codes = codes_of_tags(segment.get("Tags", ""))
+        found.append(_label(f"{what}: segment {index}", int(label), name, list(map(float, color)), SOLID, codes=codes))
     return found
 
 
@@ -245,7 +250,14 @@ def _dicom(source: str) -> list[Label]:
     found = dicom_segments(source)
     colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
     return [
-        _label(source, one.number, one.name, list(one.color or colors[one.number]), SOLID if one.number else 0.0)
+        _label(
+            source,
+            one.number,
+            one.name,
+            list(one.color or colors[one.number]),
+            SOLID if one.number else 0.0,
+            codes=codes_of(one.terms),
+        )
         for one in found
     ]
 
@@ -266,7 +278,14 @@ def table_of(parsed: Any, what: str) -> LabelTable:
         color = _hex(color) or color if isinstance(color, str) else color
         opacity = number(f"{what}: label {key}: opacity", entry.get("opacity", SOLID if int(key) else 0.0))
         name = str(entry.get("name", f"label {key}"))
-        found.append(_label(f"{what}: label {key}", int(key), name, color, opacity))
+        groups, shown = entry.get("parents", []), entry.get("visible", True)
+        groups = [groups] if isinstance(groups, str) else groups
+        if not isinstance(groups, list) or not all(isinstance(one, str) and one for one in groups):
+            raise DataError(f"{what}: label {key}: parents {str(groups)[:40]!r}; expected names of groups: [..., ...]")
+        if not isinstance(shown, bool):
+            raise DataError(f"{what}: label {key}: visible {str(shown)[:40]!r}; expected true or false")
+        label = _label(f"{what}: label {key}", int(key), name, color, opacity, shown)
+        found.append(replace(label, parents=tuple(one[:LONGEST_NAME] for one in groups)) if groups else label)
     return _table(found, what)
 
 
@@ -274,7 +293,9 @@ def _is_number(text: str) -> bool:
     return re.fullmatch(r"\d+(\.\d*)?([eE][+-]?\d+)?", text) is not None
 
 
-def _label(what: str, value: int, name: str, color: Any, opacity: float) -> Label:
+def _label(
+    what: str, value: int, name: str, color: Any, opacity: float, shown: bool = True, codes: Codes = ()
+) -> Label:
     """Make a label from checked values; warn if its name is cut to `LONGEST_NAME` characters."""
     if not 0 <= opacity <= 1:
         raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
@@ -282,4 +303,6 @@ def _label(what: str, value: int, name: str, color: Any, opacity: float) -> Labe
         raise DataError(f"{what}: label {value}; expected a 32-bit number")
     if len(name) > LONGEST_NAME:
         warnings.warn(f"{what}: name of {len(name)} characters, cut to {LONGEST_NAME}: {name[:40]!r}...", stacklevel=2)
-    return Label(value, name[:LONGEST_NAME], rgb(f"{what}: colour", color), opacity)
+    name, parents = name[:LONGEST_NAME], parents_of(name, codes)
+    seen, hidden = (opacity, 0.0) if shown else (0.0, opacity)
+    return Label(value, name, rgb(f"{what}: colour", color), seen, parents, codes, hidden)

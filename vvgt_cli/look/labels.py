@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -30,12 +31,32 @@ class Label:
         name: of the structure.
         color: RGB in [0, 1].
         opacity: in [0, 1] per unit distance.
+        parents: names of the groups that it is in, from the outermost.
+        codes: what its table says of it by coded terms (`vvgt_cli.look.terms`).
+        hidden_opacity: opacity that it would have if its table did not switch it off, 0 if it does not.
     """
 
     number: int
     name: str
     color: tuple[float, float, float]
     opacity: float = SOLID
+    parents: tuple[str, ...] = ()
+    codes: tuple[tuple[str, str, str], ...] = ()
+    hidden_opacity: float = 0.0
+
+    @property
+    def shown_opacity(self) -> float:
+        """Opacity if the label is switched on."""
+        return self.opacity or self.hidden_opacity
+
+    def facts(self) -> dict[str, Any]:
+        """Return the entries of the label in an index and in files with nodes."""
+        found: dict[str, Any] = {"label": self.number, "color": self.color, "opacity": self.shown_opacity}
+        if self.parents:
+            found["parents"] = self.parents
+        if self.codes:
+            found["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
+        return found if self.opacity else found | {"visible": False}
 
 
 @dataclass(frozen=True)
@@ -124,8 +145,8 @@ class LabelTable:
         return self
 
     def only(self, number: int) -> LabelTable:
-        """Return the table with one label, the others transparent."""
-        kept = tuple(e if e.number == number else replace(e, opacity=0.0) for e in self.labels)
+        """Return the table with one label, switched on, and the others transparent."""
+        kept = tuple(replace(e, opacity=e.shown_opacity if e.number == number else 0.0) for e in self.labels)
         return replace(self, name=f"{self.name}, label {number}", labels=kept)
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.space import MILLIMETRE, metres
 from vvgt_cli.volume.stats import count_integers, slabs
 from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
@@ -15,6 +19,7 @@ from vvgt_cli.volume.types import Volume
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
 NAMED = re.compile(r"label|seg(?![a-z])|segment|atlas|parc|aseg", re.I)
 MOST = 1 << 21  # labels that are counted
+SORTED = 1 << 16  # span of a plane's values above which they are sorted, not counted
 
 
 def labels_in(volume: Volume) -> list[int]:
@@ -57,11 +62,76 @@ def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in
     return len(first) <= FEW and len(labels(volume)) <= FEW
 
 
-def counts_of(volume: Volume) -> dict[float, int]:
-    """Count the voxels of each data value, slice by slice."""
-    found: dict[float, int] = {}
-    for plane in planes(volume):
-        values, many = np.unique(plane, return_counts=True)
-        for value, n in zip(volume.slope * values.astype(np.float64) + volume.intercept, many, strict=True):
-            found[float(value)] = found.get(float(value), 0) + int(n)
+@dataclass
+class Extent:
+    """The voxels of a label.
+
+    Attributes:
+        count: their number.
+        total: (3,) float64, sum of their indices (x, y, z).
+        first, last: (3,) smallest and largest index.
+    """
+
+    count: int
+    total: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+    def measures(self, volume: Volume) -> dict[str, Any]:
+        """Return volume, centroid and bounds in the world of ``volume``.
+
+        Keys name the unit: millilitres and mm, or none if the unit of the world is not known. Bounds are two corners of
+        a box along the world's axes, around the voxels' faces.
+        """
+        affine, metre = volume.affine, metres("mm" if volume.space else volume.unit)
+        scale, ends = 1.0 if metre is None else metre / MILLIMETRE, ("", "") if metre is None else ("_ml", "_mm")
+        steps, origin = scale * affine[:3, :3], scale * affine[:3, 3]
+        corners = np.array(list(itertools.product(*zip(self.first - 0.5, self.last + 0.5, strict=True)))) @ steps.T
+        size = self.count * abs(float(np.linalg.det(steps)))
+        return {
+            "voxels": self.count,
+            f"volume{ends[0]}": size if metre is None else size / 1000,
+            f"centroid{ends[1]}": (steps @ (self.total / self.count) + origin).tolist(),
+            f"bounds{ends[1]}": [(corners.min(axis=0) + origin).tolist(), (corners.max(axis=0) + origin).tolist()],
+        }
+
+
+def extents_of(volume: Volume) -> dict[float, Extent]:
+    """Return the voxels of each data value, slice by slice; voxels that are NaN have none."""
+    found: dict[float, Extent] = {}
+    nx, ny, _ = volume.dims
+    y, x = (index.ravel() for index in np.indices((ny, nx)))
+    for z, plane in enumerate(planes(volume)):
+        values, index = _numbered(plane)
+        counts = np.bincount(index)
+        sums = [np.bincount(index, along) for along in (x, y)]
+        spans = [_spans(index, along, (len(values), size)) for along, size in ((x, nx), (y, ny))]
+        for k in np.flatnonzero(np.isfinite(values)):
+            value = float(volume.slope * float(values[k]) + volume.intercept)
+            low, high = (np.array([spans[0][end][k], spans[1][end][k], z]) for end in (0, 1))
+            total = np.array([sums[0][k], sums[1][k], z * counts[k]], np.float64)
+            one = found.get(value)
+            if one is None:
+                found[value] = Extent(int(counts[k]), total, low, high)
+                continue
+            one.count, one.total = one.count + int(counts[k]), one.total + total
+            one.first, one.last = np.minimum(one.first, low), np.maximum(one.last, high)
     return found
+
+
+def _numbered(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the different values (n,) of a plane, ascending, and which of them each of its voxels has."""
+    low = plane.min()
+    if plane.dtype.kind not in "iu" or int(plane.max()) - int(low) > SORTED:
+        values, index = np.unique(plane, return_inverse=True)
+        return values, index.ravel()
+    offset = plane.ravel().astype(np.int64) - int(low)
+    there = np.bincount(offset) > 0
+    return np.flatnonzero(there) + int(low), (np.cumsum(there) - 1)[offset]
+
+
+def _spans(index: np.ndarray, along: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest position ``along`` an axis (n,) of each ``index`` (n,), of (many, size)."""
+    there = np.zeros(shape, bool)
+    there[index, along] = True
+    return there.argmax(axis=1), shape[1] - 1 - there[:, ::-1].argmax(axis=1)

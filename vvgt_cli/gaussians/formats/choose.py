@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
+from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
@@ -39,6 +40,7 @@ class Format:
         live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, the form
             without values to show first, or None, and slices of the volume, or None; None if the format cannot store
             values.
+        write_nodes: like ``write`` for several clouds as nodes of one file; None if the format has no nodes.
     """
 
     suffix: str
@@ -47,6 +49,7 @@ class Format:
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
     live: Callable[[Gaussians, PlyOptions, str, Splats | None, Slices | None], bytes] | None = None
+    write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
 
 FORMATS = (  # the first whose ending fits is taken: a longer ending stands before a shorter one
@@ -54,8 +57,9 @@ FORMATS = (  # the first whose ending fits is taken: a longer ending stands befo
     Format(".v4.spz", gsply_files.spz_4, gsply_files.read_spz, gsply_files.zstandard),
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
     Format(".sog", sog.sog, sog.read_sog, lambda name: None),
-    Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
-    Format(".usdc", usd.usdc, usd.read_usdc, usd.library),
+    Format(".glb", gltf.glb, gltf.read_glb, lambda name: None, write_nodes=gltf.glb_of_nodes),
+    Format(".usdc", usd.usdc, usd.read_usdc, usd.library, write_nodes=usd.usdc_of_nodes),
+    Format(".usdz", usd.usdz, usd.read_usdz, usd.library, write_nodes=usd.usdz_of_nodes),
     Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))

@@ -1,28 +1,31 @@
-"""Binary glTF with KHR_gaussian_splatting: float32 attributes of a point mesh, without quantisation.
+"""Binary glTF with KHR_gaussian_splatting: float32 attributes of point meshes, without quantisation.
 
-The data are those of the `.ply`, in its axes. The node rotates them by 180 degrees about z, to glTF's +y up, and places
-them in the world in metres, where that is known.
+The data are those of the `.ply`, in its axes. The root node rotates them by 180 degrees about z, to glTF's +y up, and
+places them in the world in metres, where that is known. Several clouds are nodes below it, in groups.
 """
 
 from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import placed, same_place
-from vvgt_cli.gaussians.formats.splats import Splats, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.metres import offset_in, placed
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
+from vvgt_cli.gaussians.formats.splats import Splats, joined, logits_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.version import VERSION
 
-EXTENSION = "KHR_gaussian_splatting"
+EXTENSION, VISIBILITY = "KHR_gaussian_splatting", "KHR_node_visibility"
 _KERNEL = {
     "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance",
     "projection": "perspective",
 }  # fmt: skip
+_HIDDEN = {VISIBILITY: {"visible": False}}
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _ARRAY, _POINTS = 5126, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -30,7 +33,65 @@ _HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, (x, y, z, w)
 
 
 def glb(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.glb`."""
+    """Encode columns as a `.glb` with one node."""
+    return _file([Node("", splats)], {}, splats.comments, name)
+
+
+def glb_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode several clouds as a `.glb` with a node each, in groups, below one that places them."""
+    return _file(nodes, group_names(nodes), common_comments(nodes), name)
+
+
+def _file(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments: tuple[str, ...], name: str) -> bytes:
+    """Encode nodes; one without a name is the root itself."""
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(comments)}},
+        "extensionsUsed": [EXTENSION, *([] if all(node.visible for node in nodes) else [VISIBILITY])],
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [_root(comments, name)],
+        "meshes": [], "buffers": [], "bufferViews": [], "accessors": [],
+    }  # fmt: skip
+    arrays: list[np.ndarray] = []
+    number: dict[tuple[str, ...], int] = {(): 0}
+    for path, group in groups.items():
+        number[path] = _child(document, number[path[:-1]], {"name": group})
+    for node in nodes:
+        if not node.name:
+            document["nodes"][0]["mesh"] = _mesh(document, arrays, "", node.splats)
+            continue
+        centre, splats = node.centred()
+        own = {"mesh": _mesh(document, arrays, node.name, splats), "name": node.name, "translation": centre.tolist()}
+        own |= {"extras": dict(node.facts)} if node.facts else {}
+        _child(document, number[node.parents], own if node.visible else own | {"extensions": _HIDDEN})
+    size = sum(array.nbytes for array in arrays)
+    document["buffers"].append({"byteLength": size})
+    head = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    head += b" " * (-len(head) % 4)
+    front = struct.pack("<5I", _MAGIC, 2, 12 + 8 + len(head) + 8 + size, len(head), _JSON) + head
+    return front + struct.pack("<2I", size, _BINARY) + b"".join(array.tobytes() for array in arrays)
+
+
+def _root(comments: tuple[str, ...], name: str) -> dict[str, Any]:
+    """Return the node that places the Gaussians in the world."""
+    place = placed(comments, name)
+    node: dict[str, Any] = {"name": ROOT, "rotation": _HALF_TURN}
+    if place.world is not None:
+        node |= {"translation": place.translation.tolist(), "scale": [place.scale] * 3}
+        extras = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
+        node["extras"] = extras  # the matrix is row-major
+    return node
+
+
+def _child(document: dict[str, Any], parent: int, node: dict[str, Any]) -> int:
+    """Add a node below another, and return its number."""
+    number = len(document["nodes"])
+    document["nodes"].append(node)
+    document["nodes"][parent].setdefault("children", []).append(number)
+    return number
+
+
+def _mesh(document: dict[str, Any], arrays: list[np.ndarray], name: str, splats: Splats) -> int:
+    """Add a mesh and its arrays, and return its number."""
+    accessors = document["accessors"]
     columns = {
         "POSITION": splats.means,
         f"{EXTENSION}:ROTATION": splats.quaternions[:, [1, 2, 3, 0]],
@@ -40,40 +101,20 @@ def glb(splats: Splats, name: str) -> bytes:
     }
     for m in range(splats.f_rest.shape[1]):
         columns[_harmonic(m)] = splats.f_rest[:, m]
-    arrays = [np.ascontiguousarray(column, "<f4") for column in columns.values()]
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    start = 0
-    for array in arrays:
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _ARRAY})
+    attributes = {attribute: len(accessors) + k for k, attribute in enumerate(columns)}
+    bounds = {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
+    start = sum(array.nbytes for array in arrays)
+    for attribute, column in columns.items():
+        array = np.ascontiguousarray(column, "<f4")
         view, kind = len(accessors), _TYPES[array.shape[1]]
-        accessors.append({"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": kind})
+        accessor = {"bufferView": view, "componentType": _FLOAT, "count": len(array), "type": kind}
+        accessors.append(accessor | (bounds if attribute == "POSITION" else {}))
+        document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": _ARRAY})
+        arrays.append(array)
         start += array.nbytes
-    accessors[0] |= {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
-    attributes = {attribute: k for k, attribute in enumerate(columns)}
-    place = placed(splats.comments, name)
-    node: dict[str, Any] = {"mesh": 0, "rotation": _HALF_TURN}
-    if place.world is not None:
-        node |= {"translation": place.translation.tolist(), "scale": [place.scale] * 3}
-        extras = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
-        node["extras"] = extras  # the matrix is row-major
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
-    document = {
-        "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(splats.comments)}},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": start}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    head = json.dumps(document, separators=(",", ":")).encode()
-    head += b" " * (-len(head) % 4)
-    length = 12 + 8 + len(head) + 8 + start
-    front = struct.pack("<5I", _MAGIC, 2, length, len(head), _JSON) + head + struct.pack("<2I", start, _BINARY)
-    return front + b"".join(array.tobytes() for array in arrays)
+    document["meshes"].append(({"name": name} if name else {}) | {"primitives": [primitive]})
+    return len(document["meshes"]) - 1
 
 
 def _harmonic(m: int) -> str:
@@ -83,7 +124,7 @@ def _harmonic(m: int) -> str:
 
 
 def read_glb(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.glb` as written by `glb`: one mesh, float32.
+    """Read the columns of a `.glb` as written by `glb` or `glb_of_nodes`: float32, all nodes together.
 
     Raises:
         DataError: the file is not such a `.glb`.
@@ -92,8 +133,8 @@ def read_glb(content: bytes, name: str) -> Splats:
         return _read(content, name)
     except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
         raise DataError(
-            f"{name}: not a .glb of Gaussians ({type(error).__name__}: {error}); expected one mesh with {EXTENSION} "
-            "in float32, as vvgt writes it"
+            f"{name}: not a .glb of Gaussians ({type(error).__name__}: {error}); expected meshes with {EXTENSION} "
+            "in float32, as vvgt writes them"
         ) from None
 
 
@@ -102,7 +143,30 @@ def _read(content: bytes, name: str) -> Splats:
     if (magic, kind) != (_MAGIC, _JSON):
         raise ValueError("no JSON chunk at the beginning")
     document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    comments = tuple(str(line).replace("\n", " ") for line in document["asset"].get("extras", {}).get("comments", []))
+    found: list[Splats] = []
+    roots = document["scenes"][document.get("scene", 0)]["nodes"]
+    open_nodes: list[tuple[int, np.ndarray | None, np.ndarray]] = [(one, None, np.eye(4)) for one in reversed(roots)]
+    met = 0
+    while open_nodes:
+        met += 1
+        if met > len(document["nodes"]):
+            raise ValueError("nodes in a circle, or in several places")
+        number, root, above = open_nodes.pop()
+        node = document["nodes"][number]
+        place = above @ _matrix(node)
+        root = place if root is None else root
+        open_nodes += [(child, root, place) for child in reversed(node.get("children", []))]
+        if "mesh" in node:
+            offset = offset_in(root, place, comments, name)
+            found.append(_columns(document, binary, node["mesh"], comments).moved(offset))
+    return joined(found)
+
+
+def _columns(document: dict[str, Any], binary: bytes, mesh: int, comments: tuple[str, ...]) -> Splats:
+    """Return the Gaussians of a mesh."""
+    (primitive,) = document["meshes"][mesh]["primitives"]
+    attributes = primitive["attributes"]
 
     def column(attribute: str, width: int) -> np.ndarray:
         accessor = document["accessors"][attributes[attribute]]
@@ -113,9 +177,6 @@ def _read(content: bytes, name: str) -> Splats:
         values = np.frombuffer(binary, "<f4", accessor["count"] * width, start)
         return values.reshape(-1, width) if width > 1 else values
 
-    comments = tuple(str(line).replace("\n", " ") for line in document["asset"].get("extras", {}).get("comments", []))
-    (node,) = document["nodes"]
-    same_place(_matrix(node), comments, name)
     known = [m for m in range(15) if _harmonic(m) in attributes]
     means, count = column("POSITION", 3), len(column("POSITION", 3))
     f_rest = [column(_harmonic(m), 3) for m in known]

@@ -61,6 +61,26 @@ def placed(comments: tuple[str, ...], name: str) -> Placed:
     return Placed(metre / facts["scale"], centre, world, space, unit)
 
 
+def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], name: str) -> np.ndarray:
+    """Return how far a node is moved (3,) in the frame of the data, below a root that is where vvgt puts it.
+
+    Args:
+        root: (4, 4) matrix from the root's data to the scene.
+        place: (4, 4) matrix from the node's data to the scene.
+        comments: comments of the file.
+        name: name of the file for errors.
+
+    Raises:
+        DataError: see `same_place`; the node is turned or scaled.
+    """
+    for one in (root, np.column_stack([place[:, :3], root[:, 3]])):
+        same_place(one, comments, name)
+    if np.array_equal(root, place):
+        return np.zeros(3)
+    found: np.ndarray = (np.linalg.inv(root) @ place)[:3, 3]
+    return found
+
+
 def same_place(found: np.ndarray, comments: tuple[str, ...], name: str) -> None:
     """Check that a file places its Gaussians as vvgt wrote it, or by the half turn alone.
 

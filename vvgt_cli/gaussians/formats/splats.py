@@ -50,6 +50,10 @@ class Splats:
         """Return the permutation or subset that ``order`` selects."""
         return replace(self, **{name: getattr(self, name)[order] for name in COLUMNS})
 
+    def moved(self, offset: np.ndarray) -> Splats:
+        """Return the columns with means moved by an offset (3,)."""
+        return replace(self, means=(self.means.astype(np.float64) + offset).astype(np.float32))
+
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """Concatenate columns, with the comments of the first.

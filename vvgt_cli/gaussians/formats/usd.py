@@ -1,26 +1,32 @@
 """OpenUSD's `ParticleField3DGaussianSplat` (OpenUSD 26.3 or newer) through usd-core: float32, without quantisation.
 
-The data are those of the `.ply`, in its axes. The prim is rotated by 180 degrees about z, to the stage's +y up, and
-placed in the world in metres, where that is known.
+The data are those of the `.ply`, in its axes. The root prim is rotated by 180 degrees about z, to the stage's +y up,
+and placed in the world in metres, where that is known. Several clouds are prims below it, in groups.
 """
 
 from __future__ import annotations
 
+import io
+import struct
 import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import placed, same_place
-from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.metres import offset_in, placed
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
+from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, logits_of, opacities_of
 from vvgt_cli.volume.libraries import library_errors, need
 
 KIND = "ParticleField3DGaussianSplat"
 _SINCE = (0, 26, 3)
 _SEEN = 3.0  # standard deviations around the centres that the extent includes
 _COMMENTS = "vvgtComments"  # in the layer's custom data, one per line
+_ZIP_HEADER, _ALIGNED, _PADDING = 30, 64, 0x1986  # bytes of a local header, of a .usdz; its extra field that pads
 
 
 def library(source: str) -> Any:
@@ -38,72 +44,160 @@ def library(source: str) -> Any:
 
 def usdc(splats: Splats, name: str) -> bytes:
     """Encode columns as a `.usdc` with one prim, /Splats."""
+    return _stage([Node("", splats)], {}, splats.comments, name)
+
+
+def usdc_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode several clouds as a `.usdc` with a prim each, in groups, below /Splats, which places them."""
+    return _stage(nodes, group_names(nodes), common_comments(nodes), name)
+
+
+def usdz(splats: Splats, name: str) -> bytes:
+    """Encode columns as a `.usdz`: the `.usdc` in a package."""
+    return _package(usdc(splats, name))
+
+
+def usdz_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode several clouds as a `.usdz`: see `usdc_of_nodes`."""
+    return _package(usdc_of_nodes(nodes, name))
+
+
+def _package(content: bytes) -> bytes:
+    """Return a zip of one file, stored at a multiple of 64 bytes (usdz specification 1.3), without a date."""
+    stream, entry = io.BytesIO(), zipfile.ZipInfo("splats.usdc")
+    size = -(_ZIP_HEADER + len(entry.filename) + 4) % _ALIGNED
+    entry.extra = struct.pack("<2H", _PADDING, size) + bytes(size)
+    with zipfile.ZipFile(stream, "w") as package:
+        package.writestr(entry, content)
+    return stream.getvalue()
+
+
+def _stage(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments: tuple[str, ...], name: str) -> bytes:
+    """Encode nodes; one without a name is the root itself."""
     usd = library(name)
-    from pxr import Gf, Sdf, UsdGeom, UsdVol, Vt
+    from pxr import Gf, Sdf, UsdGeom
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.usdc"
         stage = usd.Stage.CreateNew(str(path))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        field = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path("/Splats"))
-        prim = field.GetPrim()
-        stage.SetDefaultPrim(prim)
-        stage.GetRootLayer().customLayerData = {_COMMENTS: "\n".join(splats.comments)}
-        place, xform = placed(splats.comments, name), UsdGeom.Xformable(prim)
-        if place.world is not None:
-            xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*place.translation.tolist()))
-        xform.AddRotateZOp().Set(180.0)
-        if place.world is not None:
-            xform.AddScaleOp().Set(Gf.Vec3f(place.scale))
-            world = Gf.Matrix4d(*place.world.T.ravel().tolist())  # USD uses row vectors
-            prim.SetCustomData({"space": place.space, "unit": place.unit, "worldFromScene": world})
-        scales = np.exp(splats.log_scales.astype(np.float64)).astype(np.float32)
-        harmonics = np.concatenate([splats.f_dc[:, None], splats.f_rest], axis=1)
-        reach = _SEEN * scales.max(axis=1, keepdims=True)
-        corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
-        values = {  # USD stores quaternions with w last
-            "positions": Vt.Vec3fArray.FromNumpy(_plain(splats.means)),
-            "orientations": Vt.QuatfArray.FromNumpy(_plain(splats.quaternions[:, [1, 2, 3, 0]])),
-            "scales": Vt.Vec3fArray.FromNumpy(_plain(scales)),
-            "opacities": Vt.FloatArray.FromNumpy(_plain(opacities_of(splats.logits))),
-            "radiance:sphericalHarmonicsDegree": DEGREES[splats.f_rest.shape[1]],
-            "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(_plain(harmonics.reshape(-1, 3))),
-            "extent": Vt.Vec3fArray.FromNumpy(_plain(corners)),
-        }
-        for attribute, value in values.items():
-            if not prim.GetAttribute(attribute).Set(value):
-                raise DataError(f"{name}: OpenUSD does not accept {attribute} of a {KIND}")
+        stage.GetRootLayer().customLayerData = {_COMMENTS: "\n".join(comments)}
+        kind = KIND if not nodes[0].name else "Xform"
+        prims: dict[tuple[str, ...], Any] = {(): stage.DefinePrim(Sdf.Path(f"/{ROOT}"), kind)}
+        stage.SetDefaultPrim(prims[()])
+        _place(prims[()], comments, name)
+        for group, shown in groups.items():
+            prims[group] = _below(prims[group[:-1]], shown, "Xform")
+        for node in nodes:
+            prim, splats = prims[()], node.splats
+            if node.name:
+                prim = _below(prims[node.parents], node.name, KIND)
+                centre, splats = node.centred()
+                move = UsdGeom.Xformable(prim).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+                move.Set(Gf.Vec3d(*centre.tolist()))
+            _put(prim, splats, name)
+            if node.facts:
+                prim.SetCustomData({key: _custom(value) for key, value in node.facts.items()})
+            if not node.visible:
+                UsdGeom.Imageable(prim).MakeInvisible()
         stage.GetRootLayer().Save()
         return path.read_bytes()
+
+
+def _place(prim: Any, comments: tuple[str, ...], name: str) -> None:
+    """Rotate the root by half a turn, and place it in the world, where that is known."""
+    from pxr import Gf, UsdGeom
+
+    place, xform = placed(comments, name), UsdGeom.Xformable(prim)
+    if place.world is not None:
+        xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*place.translation.tolist()))
+    xform.AddRotateZOp().Set(180.0)
+    if place.world is not None:
+        xform.AddScaleOp().Set(Gf.Vec3f(place.scale))
+        world = Gf.Matrix4d(*place.world.T.ravel().tolist())  # USD uses row vectors
+        prim.SetCustomData({"space": place.space, "unit": place.unit, "worldFromScene": world})
+
+
+def _below(parent: Any, name: str, kind: str) -> Any:
+    """Define a prim below another, with ``name`` as the name that is displayed."""
+    from pxr import Tf
+
+    identifier = Tf.MakeValidIdentifier(name)
+    while parent.GetChild(identifier):
+        identifier += "_"
+    prim = parent.GetStage().DefinePrim(parent.GetPath().AppendChild(identifier), kind)
+    prim.SetDisplayName(name)
+    return prim
+
+
+def _custom(value: Any) -> Any:
+    """Return a value as USD keeps it in custom data: three numbers as a vector, several such as an array."""
+    from pxr import Gf, Vt
+
+    if isinstance(value, Mapping):
+        return {key: _custom(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return Vt.Vec3dArray([Gf.Vec3d(*row) for row in value]) if np.ndim(value) == 2 else Gf.Vec3d(*value)
+    return value
+
+
+def _put(prim: Any, splats: Splats, name: str) -> None:
+    """Set the attributes of a prim of Gaussians."""
+    from pxr import Vt
+
+    scales = np.exp(splats.log_scales.astype(np.float64)).astype(np.float32)
+    harmonics = np.concatenate([splats.f_dc[:, None], splats.f_rest], axis=1)
+    reach = _SEEN * scales.max(axis=1, keepdims=True)
+    corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
+    values = {  # USD stores quaternions with w last
+        "positions": Vt.Vec3fArray.FromNumpy(_plain(splats.means)),
+        "orientations": Vt.QuatfArray.FromNumpy(_plain(splats.quaternions[:, [1, 2, 3, 0]])),
+        "scales": Vt.Vec3fArray.FromNumpy(_plain(scales)),
+        "opacities": Vt.FloatArray.FromNumpy(_plain(opacities_of(splats.logits))),
+        "radiance:sphericalHarmonicsDegree": DEGREES[splats.f_rest.shape[1]],
+        "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(_plain(harmonics.reshape(-1, 3))),
+        "extent": Vt.Vec3fArray.FromNumpy(_plain(corners)),
+    }
+    for attribute, value in values.items():
+        if not prim.GetAttribute(attribute).Set(value):
+            raise DataError(f"{name}: OpenUSD does not accept {attribute} of a {KIND}")
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, np.float32)
 
 
-def read_usdc(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.usdc` as written by `usdc`.
+def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
+    """Read the columns of a `.usdc` as written by `usdc` or `usdc_of_nodes`: all prims together.
 
     Raises:
         DataError: the file is not such a stage, or OpenUSD is not installed.
     """
     usd = library(name)
     with library_errors(name, f"a {KIND}"), tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "in.usdc"
+        path = Path(folder) / f"in{ending}"
         path.write_bytes(content)
-        return _read(usd.Stage.Open(str(path)), name)
+        stage = usd.Stage.Open(str(path))
+        comments = tuple(str(stage.GetRootLayer().customLayerData.get(_COMMENTS, "")).splitlines())
+        prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == KIND]
+        if not prims:
+            raise DataError(f"{name}: no prim of type {KIND}; expected one or more")
+        return joined([_columns(prim, comments, name) for prim in prims])
 
 
-def _read(stage: Any, name: str) -> Splats:
+def read_usdz(content: bytes, name: str) -> Splats:
+    """Read the columns of a `.usdz`: see `read_usdc`."""
+    return read_usdc(content, name, ".usdz")
+
+
+def _columns(prim: Any, comments: tuple[str, ...], name: str) -> Splats:
+    """Return the Gaussians of a prim."""
     from pxr import UsdGeom
 
-    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == KIND]
-    if len(prims) != 1:
-        raise DataError(f"{name}: {len(prims)} prims of type {KIND}; expected one")
-    (prim,) = prims
-    comments = tuple(str(stage.GetRootLayer().customLayerData.get(_COMMENTS, "")).splitlines())
-    same_place(np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0)).T, comments, name)
+    root = prim.GetStage().GetPrimAtPath(prim.GetPath().GetPrefixes()[0])
+    above, place = (np.array(UsdGeom.Xformable(one).ComputeLocalToWorldTransform(0.0)).T for one in (root, prim))
+    offset = offset_in(above, place, comments, name)
 
     def values(attribute: str) -> np.ndarray:
         return np.array(prim.GetAttribute(attribute).Get(), np.float32)
@@ -120,4 +214,4 @@ def _read(stage: Any, name: str) -> Splats:
         np.ascontiguousarray(harmonics[:, 0]),
         np.ascontiguousarray(harmonics[:, 1:]),
         comments,
-    )
+    ).moved(offset)

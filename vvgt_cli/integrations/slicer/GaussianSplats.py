@@ -52,7 +52,7 @@ class GaussianSplatsWidget(ScriptedLoadableModuleWidget):
         self.steps = qt.QCheckBox("all time steps of its sequence")
         self.output = ctk.ctkPathLineEdit()
         self.output.filters = ctk.ctkPathLineEdit.Files | ctk.ctkPathLineEdit.Writable
-        self.output.nameFilters = ["Page (*.html)", "Gaussian splats (*.ply *.spz *.sog *.glb *.usdc)"]
+        self.output.nameFilters = ["Page (*.html)", "Gaussian splats (*.ply *.spz *.sog *.glb *.usdc *.usdz)"]
         self.more = qt.QLineEdit()
         self.more.placeholderText = "further options, such as --max-gaussians 50000 --up none"
         for label, widget in (("Volume", self.volume), ("", self.steps), ("Segmentation", self.segmentation),

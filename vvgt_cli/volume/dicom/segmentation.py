@@ -18,7 +18,7 @@ from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
 EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"
@@ -32,11 +32,14 @@ class Segment:
         number: its voxels' value.
         name: its label.
         color: RGB in [0, 1]; None where the file says none.
+        terms: (scheme, value, meaning) of category, type, type modifier, region and region modifier, "" where it says
+            none.
     """
 
     number: int
     name: str
     color: tuple[float, float, float] | None
+    terms: tuple[tuple[str, str, str], ...]
 
 
 def is_segmentation(header: Any) -> bool:
@@ -86,8 +89,23 @@ def segments(source: str) -> list[Segment]:
                 color = (red / 255, green / 255, blue / 255)
             else:
                 color = _palette_color(header, number)
-            found.append(Segment(number, str(one.get("SegmentLabel", f"segment {number}")), color))
+            found.append(Segment(number, str(one.get("SegmentLabel", f"segment {number}")), color, _terms(one)))
     return found
+
+
+def _terms(segment: Any) -> tuple[tuple[str, str, str], ...]:
+    """Return `Segment.terms` of an item of SegmentSequence (PS3.3, C.8.20.4)."""
+
+    def first(item: Any, keyword: str) -> Any:
+        return next(iter(item.get(f"{keyword}Sequence") or ()), {})
+
+    kind, region = first(segment, "SegmentedPropertyTypeCode"), first(segment, "AnatomicRegion")
+    items = (
+        first(segment, "SegmentedPropertyCategoryCode"), kind, first(kind, "SegmentedPropertyTypeModifierCode"),
+        region, first(region, "AnatomicRegionModifier"),
+    )  # fmt: skip
+    fields = ("CodingSchemeDesignator", "CodeValue", "CodeMeaning")
+    return tuple(triple(str(item.get(field, "")) for field in fields) for item in items)
 
 
 def _palette_color(header: Any, number: int) -> tuple[float, float, float] | None:

@@ -1,0 +1,260 @@
+"""Labels and layers as nodes of one file: the tree, measures in the world, and the Gaussians of the whole."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from vvgt_cli.conversion.label_assignment import HiddenCells
+from vvgt_cli.gaussians import in_unit_frame
+from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.formats.gltf import glb_of_nodes
+from vvgt_cli.gaussians.formats.nodes import Node
+from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.look.label_files import read_labels
+from vvgt_cli.look.terms import codes_of_tags
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.label_maps import extents_of
+
+SMALL = ("--max-gaussians", 500, "--size", 64, "--steps", 0, "--light", "none", "--split-labels")
+# as FreeSurfer's volumes lie: i to the left, j down, k forwards; 2 mm, off centre
+AFFINE = np.array([[-2.0, 0, 0, 30], [0, 0, 2, -20], [0, -2, 0, 40], [0, 0, 0, 1]])
+LUT = """#No. Label Name: R G B A
+0 Unknown 0 0 0 0
+17 Left-Hippocampus 220 216 20 0
+53 Right-Hippocampus 220 60 20 0
+1028 ctx-lh-superiorfrontal 20 220 160 0
+16 Brain-Stem 119 159 176 0
+"""
+CENTRES = {17: (-12.0, 0.0, 12.0), 53: (16.0, 2.0, 12.0), 1028: (-12.0, 4.0, 32.0), 16: (4.0, -8.0, 22.0)}  # mm, RAS
+
+
+@pytest.fixture
+def atlas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Four boxes of 3 x 5 x 3 voxels, none of which hides another, with their table."""
+    values = np.zeros((28, 28, 28), np.int16)
+    back = np.linalg.inv(AFFINE)
+    for number, centre in CENTRES.items():
+        i, j, k = (back[:3, :3] @ centre + back[:3, 3]).round().astype(int)
+        values[i - 1 : i + 2, j - 2 : j + 3, k - 1 : k + 2] = number
+    nib.save(nib.Nifti1Image(values, AFFINE), tmp_path / "aseg.nii")
+    (tmp_path / "lut.txt").write_text(LUT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def document(path: Path) -> dict:
+    content = path.read_bytes()
+    return json.loads(content[20 : 20 + struct.unpack_from("<I", content, 12)[0]])
+
+
+def tree(path: Path) -> dict[str, tuple[tuple[str, ...], dict]]:
+    """Path and node of each node with a mesh, by name."""
+    nodes, found = document(path)["nodes"], {}
+
+    def visit(number: int, above: tuple[str, ...]) -> None:
+        node = nodes[number]
+        if "mesh" in node:
+            found[node["name"]] = above, node
+        for child in node.get("children", ()):
+            visit(child, (*above, node["name"]))
+
+    visit(0, ())
+    return found
+
+
+def middle(path: Path, node: dict) -> np.ndarray:
+    """Middle (3,) mm, in the scanner's space, of the box of a node's centres, by the formulas of glTF."""
+    whole = document(path)
+    root = whole["nodes"][0]
+    box = whole["accessors"][whole["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"]]
+    data = (np.array(box["min"]) + box["max"]) / 2 + node["translation"]
+    scene = data * [-1, -1, 1] * root["scale"] + root["translation"]  # half a turn about z
+    world = np.reshape(root["extras"]["worldFromScene"], (4, 4))
+    return world[:3, :3] @ scene + world[:3, 3]
+
+
+def test_a_node_of_each_label_where_it_is_in_the_world(vvgt, atlas) -> None:
+    done = vvgt("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "-o", "a.glb")
+    assert done.code == 0, done.err
+    nodes = tree(atlas / "a.glb")
+    assert {name: above for name, (above, _) in nodes.items()} == {
+        "Left-Hippocampus": ("Splats", "Left"),
+        "Right-Hippocampus": ("Splats", "Right"),
+        "ctx-lh-superiorfrontal": ("Splats", "Left", "Left cortex"),
+        "Brain-Stem": ("Splats",),
+    }
+    for _, node in nodes.values():
+        facts = node["extras"]
+        centre = CENTRES[facts["label"]]
+        assert facts["centroid_mm"] == pytest.approx(centre)
+        assert facts["volume_ml"] == pytest.approx(45 * 8 / 1000)
+        half = np.array([3.0, 3, 5])  # mm: i, k and j run along x, y and z
+        assert np.array(facts["bounds_mm"]) == pytest.approx(np.array([centre - half, centre + half]))
+        assert np.abs(middle(atlas / "a.glb", node) - centre).max() < 2  # where the Gaussians are: neither side swapped
+
+
+@pytest.mark.parametrize("ending", [".glb", ".usdc", ".usdz"])
+@pytest.mark.parametrize("blocks", [(), ("--blocks", "16")], ids=["memory", "blocks"])
+def test_the_nodes_together_are_the_file_without_nodes(vvgt, atlas, monkeypatch, ending, blocks) -> None:
+    if ending != ".glb":
+        pytest.importorskip("pxr")
+    monkeypatch.setattr(HiddenCells, "meet_label", lambda *_: False)  # a few voxels inside are hidden by others
+    line = ("convert", "aseg.nii", "--labels", "lut.txt", *blocks)
+    assert vvgt(*line, *SMALL, "-o", f"a{ending}").code == 0
+    assert vvgt(*line, *SMALL[:-1], "-o", "b.ply").code == 0
+    (ours, header), (whole, alone) = read_splats(f"a{ending}"), read_splats("b.ply")
+    assert header.facts()["affine"] == alone.facts()["affine"]
+    columns = [np.column_stack([one.means, one.quaternions, one.colors, one.log_scales]) for one in (ours, whole)]
+    ours_first, whole_first = (rows[np.lexsort(rows.T)] for rows in columns)
+    np.testing.assert_allclose(ours_first, whole_first, atol=1e-5)
+
+
+def test_usd_has_the_same_tree_and_measures(vvgt, atlas) -> None:
+    usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    table = json.loads("{}")
+    for number, name in ((17, "Hippo campus"), (53, "Hippo-campus"), (1028, "Cortex"), (16, "Brain-Stem")):
+        table[str(number)] = {
+            "name": name,
+            "color": [0.5, 0.6, 0.7],
+            "parents": ["Brain", "Depth"],
+            "visible": number != 53,
+        }
+    (atlas / "t.json").write_text(json.dumps(table))
+    for ending in (".usdc", ".usdz", ".glb"):
+        done = vvgt("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", f"a{ending}")
+        assert done.code == 0, done.err
+    for ending in (".usdc", ".usdz"):
+        stage = usd.Stage.Open(f"a{ending}")
+        prims = {prim.GetDisplayName(): prim for prim in stage.Traverse()}
+        assert str(prims["Hippo campus"].GetPath()) == "/Splats/Brain/Depth/Hippo_campus"
+        assert str(prims["Hippo-campus"].GetPath()) == "/Splats/Brain/Depth/Hippo_campus_"
+        shown = {
+            name: geom.Imageable(prim).ComputeVisibility()
+            for name, prim in prims.items()
+            if prim.GetAttribute("positions")
+        }
+        assert shown == {
+            "Hippo campus": "inherited", "Hippo-campus": "invisible", "Cortex": "inherited", "Brain-Stem": "inherited"
+        }  # fmt: skip
+        geom.Imageable(prims["Brain"]).MakeInvisible()
+        assert geom.Imageable(prims["Cortex"]).ComputeVisibility() == "invisible"
+        facts = prims["Brain-Stem"].GetCustomData()
+        assert tuple(facts["centroid_mm"]) == pytest.approx(CENTRES[16])
+        assert (facts["volume_ml"], np.array(facts["bounds_mm"]).shape) == (pytest.approx(0.36), (2, 3))
+    off = [name for name, (_, node) in tree(atlas / "a.glb").items() if "extensions" in node]
+    assert off == ["Hippo-campus"]
+    assert document(atlas / "a.glb")["extensionsUsed"] == ["KHR_gaussian_splatting", "KHR_node_visibility"]
+
+
+def test_layers_are_nodes_in_one_frame(vvgt, atlas) -> None:
+    """A scalar ball of other extent and grid, under the atlas."""
+    grid = np.indices((12, 12, 12)) - 5.5
+    ball = np.where((grid**2).sum(axis=0) < 16, 300, -1000).astype(np.int16)
+    nib.save(nib.Nifti1Image(ball, np.diag([8.0, 8, 8, 1])), "ct.nii")
+    layer = ("--layer", "aseg.nii,labels=lut.txt")
+    line = ("convert", "ct.nii", "--tf", "ct-bone", *layer, *SMALL)
+    done = vvgt(*line, "-o", "both.glb")
+    assert done.code == 0, done.err
+    nodes = tree(atlas / "both.glb")
+    assert nodes["ct"][0] == ("Splats",)
+    assert nodes["ctx-lh-superiorfrontal"][0] == ("Splats", "aseg", "Left", "Left cortex")
+    for name, centre in (("ct", (44, 44, 44)), ("Left-Hippocampus", CENTRES[17]), ("Right-Hippocampus", CENTRES[53])):
+        assert np.abs(middle(atlas / "both.glb", nodes[name][1]) - centre).max() < 4, name
+    each = vvgt(*line, "-o", "x_{}.glb")
+    assert (each.code, "each layer has a frame of its own" in each.error) == (2, True)
+    assert vvgt(*line, "-o", "both.html").code == 0
+
+
+def test_functions_are_nodes_without_paths(vvgt, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ball = np.exp(-4 * (np.stack(np.meshgrid(*[np.linspace(-1, 1, 16)] * 3)) ** 2).sum(axis=0)).astype(np.float32)
+    np.save("ball.npy", ball)
+    for name, opacity in (("bone", 0.6), ("skin", 0.2)):
+        points = [{"x": 0.1, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 1, "opacity": opacity, "rgb": [1, 1, 0]}]
+        Path(f"{name}.json").write_text(json.dumps({"points": points}))
+    line = ("convert", "ball.npy", "--tf", tmp_path / "bone.json", "--tf", tmp_path / "skin.json", *SMALL[:6])
+    assert vvgt(*line, "-o", "x.glb").code == 0
+    assert list(tree(tmp_path / "x.glb")) == ["bone", "skin"]
+    assert str(tmp_path).encode() not in (tmp_path / "x.glb").read_bytes()
+    refused = vvgt(*line, "-o", "y.glb", "--preview", "y.png")
+    assert "--preview with one file of several clouds" in refused.error
+
+
+def test_no_comments_no_measures(vvgt, atlas) -> None:
+    assert vvgt("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "--no-comments", "-o", "a.glb").code == 0
+    assert [node for _, node in tree(atlas / "a.glb").values() if "extras" in node] == []
+
+
+def test_slicers_terms_are_groups(tmp_path) -> None:
+    def entry(*codes: str) -> str:
+        return f"Status:done|TerminologyEntry:context~{'~'.join(codes[:3])}~regions~{'~'.join(codes[3:])}"
+
+    structure, changed, kidney = "SCT^123037004^Anatomical Structure", "SCT^49755003^Altered", "SCT^64033007^Kidney"
+    segments = [
+        ("Liver", entry(structure, "SCT^10200004^Liver", "^^", "^^", "^^"), ("Anatomical Structure",)),
+        ("left kidney", entry(structure, kidney, "SCT^7771000^Left", "^^", "^^"), ("Anatomical Structure", "Kidney")),
+        ("tumour", entry(changed, "SCT^4147007^Mass", "^^", "SCT^10200004^Liver", "^^"), ("Altered", "Liver", "Mass")),
+        ("Left-thing", "Segmentation.Status:inprogress", ("Left",)),
+        ("odd", "TerminologyEntry:context~a~b", ()),
+    ]
+    lines = ["NRRD0004"]
+    for k, (name, tags, _) in enumerate(segments):
+        lines += [f"Segment{k}_LabelValue:={k + 1}", f"Segment{k}_Name:={name}", f"Segment{k}_Color:=1 0 0"]
+        lines += [f"Segment{k}_Tags:={tags}"]
+    (tmp_path / "s.seg.nrrd").write_text("\n".join(lines) + "\n\n")
+    labels = read_labels(str(tmp_path / "s.seg.nrrd")).labels
+    assert [label.parents for label in labels] == [parents for *_, parents in segments]
+    assert dict((part, code) for part, code, _ in codes_of_tags(segments[1][1]))["type_modifier"] == "SCT:7771000"
+    columns = ",".join(
+        f"{part}_{field}" for part in ("Category", "Type", "TypeModifier", "Region", "RegionModifier")
+        for field in ("CodingScheme", "CodeValue", "CodeMeaning")
+    )  # fmt: skip
+    row = "3,left kidney,10,20,30,255,SCT,123037004,Anatomical Structure,SCT,64033007,Kidney,SCT,7771000,Left,,,,,,"
+    (tmp_path / "s.csv").write_text(f"LabelValue,Name,Color_R,Color_G,Color_B,Color_A,{columns}\n{row}\n")
+    (label,) = read_labels(str(tmp_path / "s.csv")).labels
+    assert (label.parents, label.codes) == (labels[1].parents, labels[1].codes)
+
+
+def test_a_label_that_itk_snap_switches_off_is_there_switched_off(vvgt, atlas) -> None:
+    rows = [f'{number} 10 20 30 0.5 {int(number != 16)} 1 "part {number}"' for number in sorted(CENTRES)]
+    (atlas / "t.label").write_text("\n".join(rows) + "\n")
+    line = ("convert", "aseg.nii", "--labels", "t.label", *SMALL)
+    assert vvgt(*line, "-o", "a_{}.spz").code == 0
+    index = {row["label"]: row for row in json.loads((atlas / "a_index.json").read_text())["files"]}
+    assert index[16]["visible"] is False
+    assert index[16]["opacity"] == 0.5
+    assert index[53]["centroid_mm"] == pytest.approx(CENTRES[53])
+    assert "visible" not in index[53]
+    gaussians, header = read_splats(str(atlas / index[16]["file"]))
+    assert len(in_unit_frame(gaussians, header)) > 10
+
+
+@pytest.mark.parametrize(("kind", "wide"), [(np.uint8, 1), (np.int32, 100_000), (np.float32, 1)])
+def test_extents_are_those_of_every_voxel(kind, wide) -> None:
+    values = (np.random.default_rng(3).integers(0, 4, (5, 6, 7)) * wide).astype(kind)
+    volume = Volume(values, (0.5, 1.0, 2.0), (10.0, 0, 0), (0, 1, 0, 1, 0, 0, 0, 0, 1), slope=2.0, unit="um")
+    found = extents_of(volume)
+    assert sorted(found) == sorted({2.0 * value for value in values.ravel().tolist()})
+    for number in np.unique(values):
+        index = np.argwhere(values == number)[:, ::-1]
+        world = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+        facts = found[2.0 * number].measures(volume)
+        assert facts["voxels"] == len(index)
+        assert facts["centroid_mm"] == pytest.approx(world.mean(axis=0) / 1000)
+        assert facts["volume_ml"] == pytest.approx(len(index) * 1e-12)
+        assert facts["bounds_mm"][0] == pytest.approx((world.min(axis=0) - [0.5, 0.25, 1]) / 1000)
+
+
+def test_groups_have_names_that_no_node_has() -> None:
+    zeros = [np.zeros(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4), (1,), (1, 3), (1, 0, 3))]
+    one = Splats(*zeros)
+    nodes = [Node("Liver", one), Node("cyst", one, ("Liver",)), Node("vein", one, ("Blood", "Liver"))]
+    size = struct.unpack_from("<I", content := glb_of_nodes(nodes, "a"), 12)[0]
+    names = [node["name"] for node in json.loads(content[20 : 20 + size])["nodes"]]
+    assert names == ["Splats", "Liver group", "Blood", "Liver group group", "Liver", "cyst", "vein"]
