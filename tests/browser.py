@@ -45,8 +45,10 @@ def packages() -> Path:
     return cache
 
 
-def shoot(viewer: str, file: Path, cameras: Sequence[Camera | None], size: int, folder: Path) -> list[np.ndarray]:
-    """Pictures (size, size, 3) of ``file`` over black by a page of `tests/viewers`.
+def shoot(
+    viewer: str, file: Path, cameras: Sequence[Camera | None], size: int, folder: Path, options: str = ""
+) -> list[np.ndarray]:
+    """Pictures (size, size, 3) of ``file`` over black by a page of `tests/viewers`, opened with ``options``.
 
     A camera of None: from z = 3 of the viewer's own axes, y up.
 
@@ -59,6 +61,7 @@ def shoot(viewer: str, file: Path, cameras: Sequence[Camera | None], size: int, 
         "size": size,
         "cameras": [camera and _pose(camera) for camera in cameras],
         "out": [str(path) for path in outputs],
+        "options": options,
     }
     jobs = folder / f"{viewer}-{file.stem}-{size}.json"
     jobs.write_text(json.dumps({"browser": browser(), "jobs": [job]}))

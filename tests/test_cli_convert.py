@@ -182,7 +182,7 @@ def test_evaluate_scores_every_condition(converted, vvgt, monkeypatch):
     assert document["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=0.5)
     assert document["transfer_function"]["unit_distance"] == report["transfer_function"]["unit_distance"]
     conditions = document["conditions"]
-    assert len(conditions) == 5 * 5  # rules; 48, 400, 800, 2160 px and close up
+    assert len(conditions) == 8 * 5  # rules; 48, 400, 800, 2160 px and close up
     assert [condition["psnr"] for condition in conditions] == sorted(condition["psnr"] for condition in conditions)
     assert {condition["field_of_view"] for condition in conditions} == {10, 40}
     page = (ROOT / "docs" / "report.md").read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,10 @@ def test_rules_differ_as_they_say():
     assert mass["spark"] == pytest.approx(area * (1 - np.exp(-4)), rel=3e-3)
     assert mass["playcanvas"] == pytest.approx(area * (1 + (wide - 1) / 4) * shifted, rel=1e-2)  # and cut below 1/255
     assert mass["viser"] == pytest.approx(area * wide * (1 - 0.01 / 0.5), rel=3e-3)
+    assert mass["three"] == pytest.approx(area * (1 - np.exp(-2)), rel=3e-3)
+    assert mass["babylon"] == pytest.approx(area * (1 + (wide - 1) / 4) * (1 - np.exp(-4)), rel=3e-3)
+    square = math.erf(2) ** 2  # of the mass, to two standard deviations of exp(-2 x^2) on both sides
+    assert mass["cesium"] == pytest.approx(area * (1 + (wide - 1) / 16) * square, rel=3e-3)
 
 
 def test_small_splats_are_left_out_where_viewers_do():

@@ -18,7 +18,8 @@ from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import project
 
 RULES = pytest.importorskip("vvgt_cli.gaussians.rules").RULES
-RULE = {"supersplat": "playcanvas", "spark": "spark"}  # page: rule
+RULE = {"supersplat": "playcanvas", "spark": "spark", "three": "three", "babylon": "babylon"}  # page: rule
+OPTIONS = {"three": "stored"}  # of the page
 STEPS = {"supersplat": 255, "spark": 254}  # both keep a scale as one of so many over 21 e-folds from exp(-12)
 SIZE = 540
 BLOCK = 24  # px, where splats are blended one by one
@@ -86,16 +87,18 @@ def lone_picture(gaussians: Gaussians, camera: Camera, rule_name: str) -> np.nda
 @pytest.mark.parametrize("viewer", RULE)
 def test_lone_splats_are_drawn_by_the_rule(viewer: str, tmp_path: Path) -> None:
     camera = front()
-    gaussians = lone_splats(camera, STEPS[viewer])
+    gaussians = lone_splats(camera, STEPS.get(viewer, 255))
     write_ply(tmp_path / "lone.ply", gaussians)
-    shot = shoot(viewer, tmp_path / "lone.ply", [camera], SIZE, tmp_path)[0]
+    shot = shoot(viewer, tmp_path / "lone.ply", [camera], SIZE, tmp_path, OPTIONS.get(viewer, ""))[0]
     formula = lone_picture(gaussians, camera, RULE[viewer])
     ours = render(gaussians, camera, rule=RULE[viewer])[..., :3]
     scores = {name: psnr(lone_picture(gaussians, camera, name), shot) for name in RULES}
     away = abs(formula - shot).max(axis=2)
     print(f"{viewer}: {scores}, ours {psnr(ours, shot):.2f}, largest difference {away.max() * 255:.2f}/255")
-    assert away.max() < np.exp(-4) + 1 / 255  # a pixel at a splat's reach, met from the other side
-    assert (away > 2 / 255).mean() < 1e-4  # everywhere else 8 bits a channel
+    assert (
+        away.max() < np.exp(-RULES[RULE[viewer]].reach) + 1 / 255
+    )  # a pixel at a splat's reach, met from the other side
+    assert (away > 2 / 255).mean() < 1e-3  # everywhere else 8 bits a channel, and half floats
     assert psnr(ours, shot) > 55
     assert psnr(ours, formula) > 65
     assert all(score < scores[RULE[viewer]] - 6 for name, score in scores.items() if name != RULE[viewer])
@@ -138,7 +141,8 @@ def test_harmonics_are_seen_from_their_side(viewer: str, tmp_path: Path) -> None
     odd = np.repeat([-1, 1, -1], [3, 5, 7])[:, None].astype(np.float32)
     behind, plain = replace(back, harmonics=back.harmonics * odd), replace(back, harmonics=None)
     cameras = [default_views("test", size=SIZE)[i] for i in (0, 4, 9)]
-    for camera, shot in zip(cameras, shoot(viewer, tmp_path / "glossy.ply", cameras, SIZE, tmp_path), strict=True):
+    shots = shoot(viewer, tmp_path / "glossy.ply", cameras, SIZE, tmp_path, OPTIONS.get(viewer, ""))
+    for camera, shot in zip(cameras, shots, strict=True):
         ours, other, flat = (
             psnr(np.clip(render(g, camera, rule=RULE[viewer])[..., :3], 0, 1), shot) for g in (back, behind, plain)
         )
@@ -179,15 +183,25 @@ def fog(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 @pytest.mark.parametrize("viewer", RULE)
 def test_converted_volume_looks_as_scored(viewer: str, body: Shown, tmp_path: Path) -> None:
-    shot = shoot(viewer, body.file, [body.camera], 1080, tmp_path)[0]
+    shot = shoot(viewer, body.file, [body.camera], 1080, tmp_path, OPTIONS.get(viewer, ""))[0]
     ours = render(read_ply(body.file)[0], body.camera, rule=RULE[viewer])[..., :3]
     seen, said, same = psnr(body.volume, shot), psnr(body.volume, ours), psnr(ours, shot)
     print(f"{viewer}: {seen:.2f} dB against the volume, {said:.2f} by our drawing; {same:.2f} between the two")
     assert abs(seen - said) < 1
-    assert same > 40
+    assert same > 45
 
 
-@pytest.mark.parametrize("viewer", RULE)
+def test_three_encodes_what_it_has_blended(body: Shown, tmp_path: Path) -> None:
+    """Its default: colours are taken for linear light, and are too bright once they are encoded for the screen."""
+    shot = shoot("three", body.file, [body.camera], 1080, tmp_path)[0]
+    blended = np.clip(render(read_ply(body.file)[0], body.camera, rule="three")[..., :3], 0, 1)
+    encoded = np.where(blended > 0.0031308, 1.055 * np.maximum(blended, 1e-9) ** (1 / 2.4) - 0.055, 12.92 * blended)
+    print(f"{psnr(encoded, shot):.2f} dB, {psnr(body.volume, shot):.2f} against the volume")
+    assert psnr(encoded, shot) > 45
+    assert psnr(body.volume, shot) < 25
+
+
+@pytest.mark.parametrize("viewer", STEPS)
 def test_fog_differs_by_eight_bits_a_blend(viewer: str, fog: Shown, tmp_path: Path) -> None:
     """Hundreds of faint layers: browsers round after each. The rule with that rounding is what they show."""
     shot = shoot(viewer, fog.file, [fog.camera], 1080, tmp_path)[0]
@@ -233,9 +247,17 @@ def blended(gaussians: Gaussians, camera: Camera, viewer: str, row: int, column:
     return out
 
 
-@pytest.mark.parametrize(("ending", "viewer"), [(".spz", "spark"), (".sog", "spark"), (".sog", "supersplat")])
+@pytest.mark.parametrize(
+    ("ending", "viewer"),
+    [
+        *((ending, viewer) for ending in (".spz", ".sog") for viewer in ("spark", "babylon")),
+        *((ending, "three") for ending in (".spz", ".v4.spz", ".glb")),
+        (".sog", "supersplat"),
+        (".glb", "babylon"),
+    ],
+)
 def test_viewers_read_what_is_packed(ending: str, viewer: str, body: Shown, tmp_path: Path) -> None:
-    """They decode by themselves: Spark without gsply, which writes .spz for us."""
+    """They decode by themselves: without gsply, which writes .spz for us."""
     path = tmp_path / f"body{ending}"
     path.write_bytes(encoded(format_of(path), read_ply(body.file)[0], PlyOptions(), path.name))
     plain, packed = (shoot(viewer, file, [body.camera], SIZE, tmp_path)[0] for file in (body.file, path))

@@ -34,7 +34,8 @@ fit_options = group(
     ),
 )  # fmt: skip
 
-RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.gaussians.rules.RULES`; a test compares
+# `vvgt_cli.gaussians.rules.RULES`; a test compares
+RULES = ("inria", "compensated", "spark", "playcanvas", "viser", "three", "babylon", "cesium")
 
 
 def rule_option(help: str, default: str | None = None) -> Callable[[Any], Any]:

@@ -65,6 +65,7 @@ class Rule:
 
 # WebGL blends every splat whatever is in front of it. 0.999 stands for no clamp: 8 bits per channel show no difference.
 WEBGL: dict[str, Any] = {"max_alpha": 0.999, "min_transmittance": 0.0}
+# Cesium's unit is a quarter pixel, its splat a square to p = 4 along its axes: as much is left of a circle to 4.68.
 # PlayCanvas' shaders use half pixels: in pixels its variance of 0.3 is a quarter of that, its length of 2 half.
 HALF_PIXELS: dict[str, Any] = {"dilation": DILATION / 4, "min_variance": 0.125}
 INRIA = Rule("inria", "Inria's renderer, gsplat, nerfstudio, OpenSplat")
@@ -76,6 +77,9 @@ RULES = {
         Rule("spark", "Spark (three.js)", compensate=True, reach=4.0, min_alpha=0.5 / 255, **WEBGL),
         Rule("playcanvas", "SuperSplat, PlayCanvas", reach=4.0, shifted=True, **HALF_PIXELS, **WEBGL),
         Rule("viser", "viser", reach=4.0, min_alpha=0.01, **WEBGL),
+        Rule("three", "three.js", compensate=True, reach=2.0, min_alpha=0.0, **WEBGL),
+        Rule("babylon", "Babylon.js", dilation=DILATION / 4, reach=4.0, min_alpha=0.0, **WEBGL),
+        Rule("cesium", "CesiumJS", DILATION / 16, reach=4.68, min_alpha=0.0, min_variance=0.125, **WEBGL),
     )
 }
 
