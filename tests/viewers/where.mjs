@@ -17,6 +17,7 @@ page.setDefaultTimeout(300000);
 const asked = [], broken = [];
 await page.route(/^(https?|wss?):/, (route) => { asked.push(route.request().url()); return route.abort(); });
 page.on('pageerror', (error) => broken.push(String(error)));
+page.on('console', (line) => { if (line.type() === 'error') broken.push(line.text()); });
 
 async function open(url) {
   if (page.url() !== 'about:blank') await page.goto('about:blank');
@@ -38,7 +39,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #notice, .listed { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
   refused: async (url) => {
