@@ -84,13 +84,13 @@ export function editor(apply, layer, key, history) {
     const group = find('g');
     while (group.childElementCount > nodes.length) group.lastChild.remove();
     while (group.childElementCount < nodes.length) {
-      const node = element('g', { tabindex: 0, role: 'slider', 'aria-valuemin': lo, 'aria-valuemax': hi });
+      const node = element('g', { tabindex: 0, role: 'slider', 'aria-valuemin': 0, 'aria-valuemax': 1 });
       node.append(element('circle', { r: 12, fill: 'transparent' }), element('circle', { r: 4.5, class: 'dot' }));  // the first to be hit
       group.append(node);
     }
     nodes.forEach(({ x, y, rgb }, k) => {
       group.children[k].lastChild.setAttribute('fill', hex(rgb));
-      const is = { transform: `translate(${across(x)},${height(y)})`, class: k === chosen ? 'node chosen' : 'node', 'aria-label': `node ${k + 1}`, 'aria-valuenow': x, 'aria-valuetext': text(nodes[k]) };
+      const is = { transform: `translate(${across(x)},${height(y)})`, class: k === chosen ? 'node chosen' : 'node', 'aria-label': `node ${k + 1}`, 'aria-valuenow': ((x - lo) / span).toFixed(4), 'aria-valuetext': text(nodes[k]) };
       for (const [name, is_] of Object.entries(is)) group.children[k].setAttribute(name, is_);
     });
     find('input[type=color]').value = hex(nodes[chosen].rgb);
