@@ -242,6 +242,8 @@ def convert_files(
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "several --tf": several}
+    if is_page(output):
+        flags |= {"--no-slices": not request.slices, "--no-live": not (request.editor or request.live)}
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     kinds = [LEVELS] if is_streamed(output) else [kind, *([LIVE] if request.live else [])]
