@@ -81,3 +81,26 @@ def test_a_page_that_is_far_from_its_volume_says_so_until_it_is_closed(person: P
     person("eval", "document.querySelector('#notice button').focus()")
     person("press", "Enter")
     assert person("eval", seen) == ""
+
+
+def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, pages: dict[str, str]) -> None:
+    person("open", pages["slices"])
+    if person.touch:
+        person("eval", "document.querySelector('#live .fold').click()")
+    nodes = "window.vvgt.live.nodes().map(({ x }) => x)"
+    box = "document.querySelector('#live .function svg').getBoundingClientRect()"
+    before = np.array(person("eval", nodes))
+    left, top, wide = person("eval", f"(({{ left, top, width }}) => [left, top, width])({box})")
+    x, y = left + 6 + 0.75 * (wide - 12), top + 60
+    person("drag", x, y, x + (wide - 12) / 10, y)
+    shifted = np.array(person("eval", nodes))
+    np.testing.assert_allclose(shifted, before + np.ptp(before) / 10, atol=0.5)
+    person("drag", x, y, x, y - 40)
+    wider = np.array(person("eval", nodes))
+    middle = (shifted[0] + shifted[-1]) / 2
+    np.testing.assert_allclose(wider - middle, (shifted - middle) * np.exp(40 / 60), atol=1.5)
+    person("press", "Control+z")
+    np.testing.assert_allclose(person("eval", nodes), shifted)
+    person("eval", "document.querySelector('#live .node').focus()")
+    person("press", "PageDown")
+    np.testing.assert_allclose(person("eval", nodes), shifted - np.ptp(before) / 50)
