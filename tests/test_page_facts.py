@@ -202,11 +202,15 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
 def test_the_quality_is_that_of_the_certificate(tmp_path: Path) -> None:
     given = Certificate("v", None, "0", 400, "inria", 41.234, 3)
 
-    def error(certificate: Certificate) -> Any:
-        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get("quality")
+    def error(certificate: Certificate, fact: str = "quality") -> Any:
+        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get(fact)
 
     assert error(given) == "41.2 dB PSNR on test views of 400 px (higher is better)"
     assert error(replace(given, live_psnr=33.33)) == "33.3 dB PSNR on test views of 400 px (higher is better)"
+    assert [error(replace(given, live_psnr=dB), "far") for dB in (None, 28.0)] == ["", ""]
+    assert "27.9 dB" in error(replace(given, live_psnr=27.94), "far")
+    assert "without --live" in error(replace(given, live_psnr=27.94), "far")
+    assert "more Gaussians" in error(replace(given, psnr=27.94), "far")
     splats = splats_of(one(), PlyOptions(certificate=given))
     broken = tuple(line.replace("41.234", '"41"') for line in splats.comments)
     assert world_of(replace(splats, comments=broken), tmp_path)["facts"].get("quality") is None

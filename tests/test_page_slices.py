@@ -110,7 +110,7 @@ def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monk
         np.rint(data).astype(kind) if whole else kept, volume.spacing, volume.origin, TURNED, value_unit="K",
         slope=slope, intercept=intercept,
     )  # fmt: skip
-    [facts], [content] = slices_of([(volume, None)])
+    [facts], [content], _ = slices_of([(volume, None)])
     found = unpacked(content, facts)
     assert facts["bits"] == (8 if kind is np.uint8 else 16)
     from_world = np.linalg.lstsq(np.c_[place.reshape(-1, 3), np.ones(place.size // 3)], data.ravel())[0]
@@ -124,7 +124,7 @@ def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monk
 
 def test_a_volume_of_few_voxels_is_exact():
     data = np.random.default_rng(2).integers(-1024, 3000, (5, 6, 7)).astype(np.int16)
-    [facts], [content] = slices_of([(Volume(data, hounsfield=True, space="LPS"), None)])
+    [facts], [content], _ = slices_of([(Volume(data, hounsfield=True, space="LPS"), None)])
     np.testing.assert_array_equal(unpacked(content, facts), data)
     assert (facts["step"], facts["unit"]) == (1, "HU")
     flat = slices_of([(Volume(np.full((2, 2, 2), 7, np.int16)), None)])
@@ -134,7 +134,7 @@ def test_a_volume_of_few_voxels_is_exact():
 def test_huge_ranges_fit_into_16_bits():
     data = np.random.default_rng(3).normal(size=(20, 20, 20))
     data[0, 0, 0], data[5, 5, 5] = -1e9, 1e9
-    [facts], [content] = slices_of([(Volume(data), None)])
+    [facts], [content], _ = slices_of([(Volume(data), None)])
     assert np.abs(unpacked(content, facts) - data).max() <= 0.5001 * facts["step"] < 2e4
 
 
@@ -150,7 +150,7 @@ def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
     data = np.zeros((8, 8, 8), np.uint16)
     data[3:5], data[5:7], data[7:] = 7, 300, 9  # 9 is not in the table
     table = LabelTable("t", (Label(0, "air", (0, 0, 0), 0.0), Label(7, "<b>", (1, 0, 0)), Label(300, "c", (0, 1, 0))))
-    [facts], [content] = slices_of([(Volume(data), table)])
+    [facts], [content], _ = slices_of([(Volume(data), table)])
     assert [one["name"] for one in facts["labels"]] == ["<b>", "c"]
     assert (facts["dims"], facts["bits"]) == ([4, 4, 4], 8)
     np.testing.assert_array_equal(unpacked(content, facts)[:, 0, 0], [-1, 0, 1, -1])
@@ -192,6 +192,29 @@ def test_pages_hold_what_the_conversion_shows_in_memory_and_in_blocks(vvgt, scan
     assert facts["affine"][3] == -3  # where it was
     none = vvgt("convert", scan / "scan.nii.gz", "--no-slices", "-o", page, *HOW)
     assert (none.code, held(page), "slices" in none.err) == (0, [], False)
+
+
+@pytest.mark.parametrize("form", [(), ("--live",), ("--no-live",)])
+def test_a_page_within_its_size_has_coarser_slices_before_fewer_gaussians(vvgt, tmp_path, form):
+    noise = np.random.default_rng(0).integers(0, 4096, (64, 64, 64)).astype(np.int16)  # hardly to be packed
+    noise[:, :, 32:] = 0
+    np.save(tmp_path / "noise.npy", noise)
+    page, how = tmp_path / "page.html", ("--max-gaussians", "300", "--size", "32", "--overwrite")
+    given = ("convert", tmp_path / "noise.npy", *form, *how, *(() if "--live" in form else ("--steps", "0")))
+    sizes, grids, counts = [], [], []
+    for limit in ("9MB", "1.1MB", "1MB"):
+        done = vvgt(*given, "--max-size", limit, "-o", page)
+        assert done.code == 0, done.err
+        sizes.append(page.stat().st_size)
+        grids.append(held(page)[0][0]["dims"])
+        counts.append(re.findall(r"page\.html: (\d+) Gaussians", done.err)[-1])
+    assert grids[0] == [64, 64, 64]
+    assert grids[0] > grids[1] > grids[2]
+    assert 0.9e6 < sizes[1] <= 1.1e6
+    assert sizes[2] <= 1e6
+    assert counts[0] == counts[1]
+    least = vvgt(*given, "--max-size", "900kB", "-o", page)
+    assert (least.code, "no Gaussian fits; expected 0.98" in least.error) == (2, True)
 
 
 def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan):

@@ -49,6 +49,8 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     assert max(noted["moved"]) < 2e-3  # it may still glide
     assert (noted["cut"], noted["uncut"], noted["changed"]) == ("preview", noted["better"], "preview")
     assert noted["refused"] == "not now"
+    assert noted["slices"] == [24, 24, 24]
+    assert b'id="slices-0"' in (tmp_path / "blob-24.html").read_bytes()
     assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]
     function = json.loads((tmp_path / "tf.json").read_text())
     assert [point["x"] for point in function["points"]] != [point["x"] for point in SHELL["points"]]

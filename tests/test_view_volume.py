@@ -420,7 +420,7 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
     for without in ("--no-live", "--no-slices"):
         left = vvgt("view", tmp_path / "run_*.npy", without, "-o", tmp_path / "a.html")
-        assert (left.code, "no function editor and no slices" in left.error) == (2, True)
+        assert (left.code, f"{without} with a page of several clouds" in left.error) == (2, True)
     wrong = vvgt("view", tmp_path / "run_*.npy", "--crop", "30:,:,:")
     assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []

@@ -67,6 +67,9 @@ const save = async (label) => {
 const noted = {};
 await page.goto(job.url);
 await until('window.vvgt !== undefined');
+await page.evaluate('window.vvgt.where.slices.toggle()');
+noted.slices = await page.evaluate('window.vvgt.where.slices.state.base.dims');
+await page.evaluate('window.vvgt.where.slices.toggle()');
 noted.began = await shown();
 if (await page.evaluate(() => document.querySelector('#live').classList.contains('folded'))) await page.click('#live .fold');
 await page.mouse.move(width / 2, height * 0.75);  // turn the camera

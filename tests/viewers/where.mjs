@@ -1,7 +1,8 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
 // Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
-// (the page), bare FILE (without what lies over the picture); save SELECTOR FILE (what a click downloads).
+// (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads).
+import fs from 'node:fs';
 import path from 'node:path';
 import readline from 'node:readline';
 import { createRequire } from 'node:module';
@@ -17,6 +18,7 @@ page.setDefaultTimeout(300000);
 const asked = [], broken = [];
 await page.route(/^(https?|wss?):/, (route) => { asked.push(route.request().url()); return route.abort(); });
 page.on('pageerror', (error) => broken.push(String(error)));
+page.on('console', (line) => { if (line.type() === 'error') broken.push(line.text()); });
 
 async function open(url) {
   if (page.url() !== 'about:blank') await page.goto('about:blank');
@@ -38,7 +40,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #notice, .listed { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
   refused: async (url) => {
@@ -73,6 +75,32 @@ const steps = {
     const style = await page.addStyleTag({ content: HIDE });
     await page.screenshot({ path: file });
     await style.evaluate((element) => element.remove());
+  },
+  axe: async () => {
+    await page.evaluate(fs.readFileSync(path.join(modules, 'node_modules', 'axe-core', 'axe.min.js'), 'utf8'));
+    const { violations } = await page.evaluate('axe.run()');
+    return violations.filter(({ impact }) => ['serious', 'critical'].includes(impact)).flatMap(({ id, nodes }) => nodes.map(({ target, failureSummary }) => `${id}: ${target}: ${failureSummary}`));
+  },
+  tabs: async () => {
+    await page.evaluate(() => {
+      const focusable = [...document.querySelectorAll('a[href], button, input, select, summary, [tabindex="0"]')];
+      window.missed = new Set(focusable.filter((e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled));
+      document.activeElement.blur();
+    });
+    const unseen = [];
+    for (let n = 0; n < 300; n++) {
+      await page.keyboard.press('Tab');
+      const found = await page.evaluate(() => {
+        const now = document.activeElement, { outlineStyle, boxShadow } = getComputedStyle(now), name = now.getAttribute('aria-label') ?? now.title ?? now.tagName;
+        const marked = [...now.querySelectorAll('circle')].some((circle) => getComputedStyle(circle).stroke === 'rgb(68, 170, 255)');
+        if (now === document.body || !window.missed.has(now)) return null;  // all round
+        window.missed.delete(now);
+        return { name, seen: now.matches(':focus-visible') && (outlineStyle !== 'none' || boxShadow !== 'none' || marked) };
+      });
+      if (!found) break;
+      if (!found.seen) unseen.push(found.name);
+    }
+    return { unseen, missed: await page.evaluate(() => [...window.missed].map((e) => `${e.tagName} ${e.getAttribute('aria-label') ?? e.title}`)) };
   },
   save: async (selector, file) => {
     const [download] = await Promise.all([page.waitForEvent('download'), steps.click(selector)]);

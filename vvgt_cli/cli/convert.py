@@ -109,11 +109,14 @@ def command(
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert_batch import convert_files
     from vvgt_cli.conversion.gaussian_files import is_page
+    from vvgt_cli.errors import UsageError
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
     line = command_line(click.get_current_context(), ASIDE, folders=False)
     request = convert_request(volume, **options)
+    if not is_page(request.output) and not (slices and live is not False):
+        raise UsageError(f"--no-live and --no-slices are for a page; got -o {request.output}; expected -o OUT.html")
     editor = live is None and is_page(request.output)
     request = replace(
         request, blocks=block_options_of(blocks), live=bool(live), editor=editor, slices=slices,

@@ -57,7 +57,8 @@ limit_options = group(
     ),
     max_megabytes=click.option(
         "--max-size", "max_megabytes", type=Measure("file size", MEGABYTES), metavar="MB",
-        help="Maximum file size in 10^6 bytes, also as 5MB or 800kB; reduces the number of Gaussians.",
+        help="Maximum file size in 10^6 bytes, also as 5MB or 800kB, of a .ply or a page; coarsens slices, then "
+        "reduces the number of Gaussians.",
     ),
 )  # fmt: skip
 

@@ -23,6 +23,7 @@ from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
 from vvgt_cli.gaussians.formats.page_live import Extras, live_page_data, parse_light
+from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
@@ -34,6 +35,7 @@ from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import triple
 
 JSON, BYTES, HTML = "application/json", "application/octet-stream", "text/html; charset=utf-8"
+SLICES = "slices.json"
 SCRIPT = '<script src="viewer.js"></script>'
 NODES = 4096  # of a function that a page sends
 
@@ -72,9 +74,9 @@ class Cloud:
         """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str, live: Cloud | None = None) -> Resource:
+    def file(self, suffix: str, live: Cloud | None = None, slices: Slices | None = None) -> Resource:
         """Return the file to save, in the format of an ending; ``live`` is the form for the editor of a page."""
-        extras = Extras(None if live is None or not live.live else (live.gaussians, live.options))
+        extras = Extras(None if live is None or not live.live else (live.gaussians, live.options), slices)
         if (other := format_of(f"x.{suffix}")) is not None:
             name = f"{self.name}.{suffix}"
             return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, extras))
@@ -215,7 +217,8 @@ def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
 
     Args:
         cloud: what it shows, live if possible.
-        converts: whether the volume can be converted for a function, which needs a single layer.
+        converts: whether there is a volume, which has slices, and which can be converted for a function if it has a
+            single layer.
 
     Raises:
         DataError: a library that pages of live Gaussians need is missing.
@@ -228,8 +231,9 @@ def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
         held = base64.b64encode(planes).decode("ascii")
         elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
-        converts = converts and len(facts["layers"]) == 1
-        more = {"live": facts, "server": {"converts": converts, "name": cloud.name}}
+        more = {"live": facts, "server": {"converts": converts and len(facts["layers"]) == 1, "name": cloud.name}}
+    if converts:
+        more["slices"] = {"from": SLICES}
     text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
     return {"": text.encode("utf-8"), name: file}
 
@@ -250,6 +254,8 @@ class PageController:
         self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
         self.first: Callable[[], Cloud] | None = None
+        self.read_slices: Callable[[], Slices | None] = lambda: None
+        self._reading = threading.Lock()
         self.better: bytes | None = None
         self.converter: Converter | None = None
         self.ready = threading.Event()  # the volume has been read, or cannot be
@@ -257,9 +263,10 @@ class PageController:
         self.waited_for = False  # by a page, for the first one
         self.state: dict[str, Any] = {"number": 0, "state": "first", "said": "starting"}
 
-    def await_volume(self, converter: Converter) -> None:
-        """Start the live form of a volume; pages opened meanwhile wait for it."""
-        self.converter = converter
+    def await_volume(self, converter: Converter, slices: Callable[[], Slices | None]) -> None:
+        """Start the live form of a volume; pages opened meanwhile wait for it. Its slices are read when asked for."""
+        self.converter, self.read_slices = converter, cache(slices)
+        self.resources[SLICES] = Resource(JSON, self._slices_json)
         text = waiting_page(self.name, SCRIPT).encode("utf-8")
         self.resources[""] = Resource(HTML, lambda: text)
         self.resources["state"] = Resource(JSON, self._state_json)
@@ -288,6 +295,18 @@ class PageController:
     def _state_json(self) -> bytes:
         self.waited_for = self.waited_for or not self.shown.is_set()
         return json.dumps(self.state).encode()
+
+    def slices(self) -> Slices | None:
+        """Return the slices of the volume, read by one request at a time; None without a volume or for colours."""
+        with self._reading:
+            return self.read_slices()
+
+    def _slices_json(self) -> bytes:
+        found = self.slices()
+        if found is None:
+            raise DataError("slices: the volume has colours; expected values or labels")
+        contents = {key: base64.b64encode(content).decode("ascii") for key, content in found.held.items()}
+        return json.dumps({"facts": found.facts, "contents": contents}).encode()
 
     def function(self, sent: Any) -> Resource:
         """Convert the volume for a function or labels that the page sends; None ends the running conversion.
@@ -336,13 +355,14 @@ class PageController:
             cloud = cloud.with_labels(sent["labels"], sent.get("light"))
         if sent.get("layers") is not None and cloud.live:
             cloud = cloud.with_layers(sent["layers"], sent.get("light"))
+        slices = self.slices() if sent["file"] == "html" else None
         if number is None or better is None:
-            return cloud.file(sent["file"])
+            return cloud.file(sent["file"], slices=slices)
         conversion = Cloud.of(better, self.name)
         if not {"function", "labels"} & set(sent):
-            return conversion.file(sent["file"])
+            return conversion.file(sent["file"], slices=slices)
         options = replace(cloud.options, certificate=conversion.options.certificate)
-        return conversion.file(sent["file"], replace(cloud, options=options))
+        return conversion.file(sent["file"], replace(cloud, options=options), slices)
 
     def on_message(self, number: int, message: Message) -> None:
         """Handle a message of the converter, on its thread."""

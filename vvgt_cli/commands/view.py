@@ -27,6 +27,7 @@ from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
 from vvgt_cli.gaussians.formats.choose import NOTHING
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
 from vvgt_cli.gaussians.formats.page_live import Extras
+from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, claimed
@@ -119,12 +120,10 @@ def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce
     if request.output is not None:
         if not is_page(request.output):
             raise UsageError(f"-o {request.output}: holds one frame; expected a page (.html), or --time N")
-        if not (request.live and request.slices):
-            raise UsageError(
-                f"-o {request.output}: the page of a series has no function editor and no slices; omit --no-live and "
-                "--no-slices"
-            )
-        whole = ConvertRequest(source, request.output, overwrite=request.overwrite, title=request.title)
+        whole = ConvertRequest(
+            source, request.output, overwrite=request.overwrite, title=request.title, editor=request.live,
+            slices=request.slices,
+        )  # fmt: skip
         convert_files(whole, console=run.console)
         return
     with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
@@ -248,7 +247,8 @@ def _serve(
         url = stack.enter_context(served(site, request.port))
         if not resources.get(""):
             source = replace(request.source, volume=files[0])
-            controller.await_volume(stack.enter_context(Converter(source, controller.name, controller.on_message)))
+            converter = stack.enter_context(Converter(source, controller.name, controller.on_message))
+            controller.await_volume(converter, partial(slices_in, source))
             controller.ready.wait(SOON)
         if controller.error is None:
             announce(url)
@@ -272,6 +272,15 @@ def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
     text = page(clouds[0][0], columns_of(first, clouds[0][1]), frames, SCRIPT)
     resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
     return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
+
+
+def slices_in(request: SourceRequest) -> Slices | None:
+    """Return the slices of a volume, which is read again, in blocks if it is large; None if it has colours."""
+    from vvgt_cli.conversion.convert import open_field
+    from vvgt_cli.conversion.request import ConvertRequest
+
+    with open_field(Run(Console(quiet=True), ConversionReport("view")), ConvertRequest(request), ()) as field:
+        return field.source.slices()
 
 
 def display() -> bool:

@@ -201,7 +201,7 @@ def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = T
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
     degree = degree_of(request, field.source)
-    fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
+    fit = replace(fit, max_gaussians=min(fit.max_gaussians, request.budget(degree)))
     workload = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
@@ -366,7 +366,8 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     if conversion.ply.certificate is not None or not written:
         file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
         page = is_page(request.output) and request.ply.comments
-        extras = conversion.extras(request.editor, request.slices, run) if page else NOTHING
+        limit = None if request.limits.max_megabytes is None else 1e6 * request.limits.max_megabytes
+        extras = conversion.extras(request.editor, request.slices, run, limit) if page else NOTHING
         write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, extras=extras)
     if format_of(request.output):
         source = conversion.field.source

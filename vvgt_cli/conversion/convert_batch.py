@@ -267,6 +267,8 @@ def convert_files(
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "several --tf": several}
     flags["a file each"] = numbered
+    if is_page(output):
+        flags |= {"--no-slices": not request.slices, "--no-live": not (request.editor or request.live)}
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind

@@ -13,6 +13,8 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats.page_file import page_bytes
+from vvgt_cli.gaussians.formats.page_slices import SMALLEST as SMALLEST_SLICES
 from vvgt_cli.gaussians.outputs import STDOUT, Output
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
@@ -72,18 +74,17 @@ class Limits:
         if self.max_megabytes is not None and not 0 < self.max_megabytes < math.inf:
             raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
 
-    def gaussians(self, most: int, sh_degree: int) -> int:
-        """Return the number of Gaussians that budget and file size allow.
+    def gaussians(self, most: int, header: float, each: float) -> int:
+        """Return the number of Gaussians that budget and file size allow, of so many bytes each, after a header.
 
         Raises:
             UsageError: not even one fits.
         """
         if self.max_megabytes is None:
             return most
-        header, one = file_bytes(0, sh_degree), file_bytes(1, sh_degree)
-        fit = int((self.max_megabytes * 1e6 - header) // (one - header))
+        fit = int((self.max_megabytes * 1e6 - header) // each)
         if fit < 1:
-            least = one / 1e6
+            least = (header + each) / 1e6
             raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more")
         return min(most, fit)
 
@@ -136,15 +137,26 @@ class ConvertRequest:
     title: str | None = None
     blocks: BlockOptions | None = None
 
-    def budget(self) -> int:
-        """Return the number of Gaussians that the limits allow.
+    def budget(self, degree: int | None = None) -> int:
+        """Return the number of Gaussians that the limits allow; slices of a page get what these leave.
+
+        Args:
+            degree: of the harmonics; None: the degree that was asked for.
 
         Raises:
-            UsageError: not even one fits, or the size limit is not for a `.ply`.
+            UsageError: not even one fits, or the size limit is neither for a `.ply` nor for a page.
         """
-        if self.limits.max_megabytes is not None and self.output and format_of(self.output):
-            raise UsageError(f"--max-size needs .ply output; got -o {self.output}; try --max-gaussians instead")
-        return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree or 0)
+        degree, known = (self.ply.sh_degree or 0) if degree is None else degree, format_of(self.output or "")
+        if known is not None and known.suffix == ".html":
+            header, each = page_bytes(degree, self.live or self.editor, not self.live)
+            header += SMALLEST_SLICES if self.slices else 0
+        elif known is not None and self.limits.max_megabytes is not None:
+            raise UsageError(
+                f"--max-size needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"
+            )
+        else:
+            header, each = file_bytes(0, degree), file_bytes(1, degree) - file_bytes(0, degree)
+        return self.limits.gaussians(self.fit.max_gaussians, header, each)
 
     @property
     def scored_whole(self) -> bool:

@@ -160,13 +160,14 @@ class Result:
         found = apply_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
-    def extras(self, live: bool, slices: bool, run: Run | None = None) -> Extras:
+    def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
         """Return further contents of a page, as far as there is a volume.
 
         Args:
             live: with Gaussians that carry values under the same look.
             slices: with slices.
             run: times the stages.
+            limit: bytes of the page, which its slices must leave room for.
         """
         return NOTHING
 
@@ -217,7 +218,7 @@ class Conversion(Result):
     field: Field
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
 
-    def extras(self, live: bool, slices: bool, run: Run | None = None) -> Extras:
+    def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
         """Implement `Result.extras`, with a message if there is no live form."""
         run, form = run or Run(Console(quiet=True), ConversionReport("init")), None
         if live and self.make_live is not None:
@@ -225,8 +226,16 @@ class Conversion(Result):
         if not slices:
             return Extras(form)
         with run.stage("slices") as stage:
-            stage.note = str(self._slices or "none: the volume has colours")
-        return Extras(form, self._slices)
+            found = self._slices if limit is None else self.field.source.slices(limit - self._page_bytes(form))
+            why = "the volume has colours" if limit is None else "the volume has colours, or --max-size is too small"
+            stage.note = str(found or f"none: {why}")
+        return Extras(form, found)
+
+    def _page_bytes(self, form: LiveForm | None) -> int:
+        """Return the bytes of the page without slices."""
+        page = format_of("x.html")
+        assert page is not None
+        return len(encoded(page, self.gaussians, self.ply, "", Extras(form)))
 
     @cached_property
     def _slices(self) -> Slices | None:

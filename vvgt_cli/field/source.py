@@ -182,15 +182,19 @@ class Source:
                 "field (try --labels none to read label numbers as values)"
             )
 
-    def slices(self) -> Slices | None:
-        """Return the grids of all layers for a page, read part by part; None if all layers have colours."""
+    def slices(self, room: float | None = None) -> Slices | None:
+        """Return the grids of all layers for a page, read part by part; None if all layers have colours.
+
+        ``room``: bytes that they may take there.
+        """
         from vvgt_cli.gaussians.formats.page_slices import slices_of
 
         return slices_of(
             [
                 None if layer.colors else (layer.volume, layer.tf if isinstance(layer.tf, LabelTable) else None)
                 for layer in self.layers
-            ]
+            ],
+            room,
         )
 
     def with_function(self, tf: TransferFunction) -> Source:

@@ -111,7 +111,7 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     Raises:
         NothingVisible, DataError: see `write_merged`.
     """
-    budget = request.limits.gaussians(request.fit.max_gaussians, degree_of(request, field.source))
+    budget = request.budget(degree_of(request, field.source))
     request = replace(request, fit=replace(request.fit, max_gaussians=budget))
     run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
     make_blocks(run, request, field)

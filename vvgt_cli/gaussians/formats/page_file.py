@@ -40,8 +40,23 @@ _TITLE = re.compile(r"vvgt title (\".*\")$")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
 _FAR = 99  # percentile of distances from the middle that counts as the radius of a cloud
+TEXTS = 100_000  # most bytes of titles, names, functions and histograms
 _SEEN = -3.0  # smallest opacity logit of a Gaussian that counts as visible
 _DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
+
+
+def page_bytes(degree: int, live: bool, converted: bool) -> tuple[float, float]:
+    """Return the most bytes of a page without Gaussians and slices, and of each Gaussian.
+
+    Args:
+        degree: of the harmonics of the conversion.
+        live: it holds Gaussians that carry values.
+        converted: it holds the conversion.
+    """
+    header = sum(len(asset(name)) for name in ("page.html", "page.css", "inflate.js")) + TEXTS
+    packed, harmonics = 16 + 72 / 256, {0: 0, 1: 9, 2: 24, 3: 45}[degree]  # of a .compressed.ply: chunks of 256
+    each = live * (packed + 11) + converted * (packed + harmonics)
+    return header + (len(asset(PROGRAM)) + 2 * 4096) * 4 / 3, each * 4 / 3  # base64; headers and what gzip adds
 
 
 def asset(name: str) -> bytes:

@@ -8,6 +8,7 @@ A value is ``lo + step * (code - missing)``, unknown where ``code < missing``; a
 from __future__ import annotations
 
 import gzip
+import json
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,6 +20,9 @@ from vvgt_cli.volume.averaged import averaged, coarser, sampled
 from vvgt_cli.volume.types import Volume
 
 MOST = 1 << 22  # cells of all grids of a page
+FEWEST = 1 << 15  # where there is less room, none
+SMALLEST = FEWEST * 2 * 4 / 3 + 4096  # bytes that those take on a page at most
+CLOSER = 0.95  # of the room: grids that did not fit are made for this share of it
 LEVELS = 4096  # steps of the range of most values
 MOST_OF = (0.1, 99.9)  # percentiles that bound most values
 CODES = 1 << 16
@@ -31,10 +35,17 @@ class Slices(NamedTuple):
     Attributes:
         facts: of each layer shown.
         contents: of each, the packed codes.
+        limited: they are coarser for want of room.
     """
 
     facts: tuple[dict[str, Any], ...]
     contents: tuple[bytes, ...]
+    limited: bool = False
+
+    @property
+    def size(self) -> float:
+        """Bytes on a page."""
+        return len(json.dumps(self.facts)) + sum(map(len, self.contents)) * 4 / 3
 
     @property
     def labels(self) -> int:
@@ -54,22 +65,37 @@ class Slices(NamedTuple):
     def __str__(self) -> str:
         """Describe the grids for whoever sends the page."""
         grids = [" x ".join(map(str, one["dims"])) for one in self.facts]
-        return f"slices of the volume ({', '.join(grids)} voxels)"
+        return f"slices of the volume ({', '.join(grids)} voxels{', coarser for --max-size' if self.limited else ''})"
 
 
-def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None]) -> Slices | None:
+def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None], room: float | None = None) -> Slices | None:
     """Return the grids of layers, read part by part.
 
     Args:
         layers: of each its volume, and the table of a label map; None for one with colours, which has no grid.
+        room: bytes that they may take on a page.
 
     Returns:
-        None if no layer has a grid.
+        None if no layer has a grid, or there is no room for `FEWEST` cells.
     """
+    most, found = MOST, _grids(layers, MOST)
+    while found is not None and room is not None and found.size > room:
+        if most <= FEWEST:
+            return None
+        cells = sum(math.prod(one["dims"]) for one in found.facts)
+        most = max(int(cells * min(CLOSER * max(room, 0) / found.size, CLOSER)), FEWEST)
+        found = _grids(layers, most, limited=True)
+    return found
+
+
+def _grids(
+    layers: Sequence[tuple[Volume, LabelTable | None] | None], most: int, limited: bool = False
+) -> Slices | None:  # fmt: skip
+    """Return the grids of layers, of at most so many cells together, as `slices_of` does."""
     shown = [(number, *layer) for number, layer in enumerate(layers) if layer is not None]
     facts, contents = [], []
     for number, volume, table in shown:
-        dims = coarser(volume, MOST // len(shown))
+        dims = coarser(volume, most // len(shown))
         own, codes = _values(volume, dims) if table is None else _labels(table, volume, dims)
         stretch = np.array(volume.dims) / dims
         affine = volume.affine[:3] @ np.vstack([np.diag([*stretch, 1.0])[:3], [0, 0, 0, 1.0]])
@@ -82,7 +108,7 @@ def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None]) -> Slic
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
-    return Slices(tuple(facts), tuple(contents)) if facts else None
+    return Slices(tuple(facts), tuple(contents), limited) if facts else None
 
 
 def _values(volume: Volume, dims: tuple[int, int, int]) -> tuple[dict[str, Any], np.ndarray]:

@@ -27,3 +27,16 @@ export function fill(list, rows) {
     return [term, text];
   }));
 }
+
+// A line over the picture that can be closed: {root, say(text), close}
+export function notice() {
+  const root = Object.assign(document.createElement('aside'), { id: 'notice', hidden: true, innerHTML: '<p></p><button aria-label="close the notice" title="close (Esc)">✕</button>' });
+  root.setAttribute('aria-label', 'quality');
+  let closed = false;
+  const say = (text) => {
+    root.firstChild.textContent = text;
+    root.hidden = closed || !text;
+  }, close = () => { closed = true; say(''); };
+  root.lastChild.addEventListener('click', close);
+  return { root, say, close };
+}

@@ -5,8 +5,9 @@ import { element } from './svg.mjs';
 
 const WIDE = 276, HIGH = 92, NEAR = matchMedia('(pointer: coarse)').matches ? 22 : 16, TWICE = 350;  // px; milliseconds between the taps that add a node
 const MANY = 14, CLOSE = 0.03;  // nodes that are all offered, and how far fewer of them may be from the function
-const EDITED = 'edited';
-const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one">
+const EDITED = 'edited', NONE = -1, ALL = -2;  // what is dragged, if no node
+const WIDER = 60;  // px of a drag upwards after which all is e times as wide
+const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one; drag beside the nodes to shift and widen the whole">
 <defs><linearGradient></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
 <div><select aria-label="function" title="function"></select><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>
@@ -84,13 +85,13 @@ export function editor(apply, layer, key, history) {
     const group = find('g');
     while (group.childElementCount > nodes.length) group.lastChild.remove();
     while (group.childElementCount < nodes.length) {
-      const node = element('g', { tabindex: 0, role: 'slider', 'aria-valuemin': lo, 'aria-valuemax': hi });
+      const node = element('g', { tabindex: 0, role: 'slider', 'aria-valuemin': 0, 'aria-valuemax': 1 });
       node.append(element('circle', { r: 12, fill: 'transparent' }), element('circle', { r: 4.5, class: 'dot' }));  // the first to be hit
       group.append(node);
     }
     nodes.forEach(({ x, y, rgb }, k) => {
       group.children[k].lastChild.setAttribute('fill', hex(rgb));
-      const is = { transform: `translate(${across(x)},${height(y)})`, class: k === chosen ? 'node chosen' : 'node', 'aria-label': `node ${k + 1}`, 'aria-valuenow': x, 'aria-valuetext': text(nodes[k]) };
+      const is = { transform: `translate(${across(x)},${height(y)})`, class: k === chosen ? 'node chosen' : 'node', 'aria-label': `node ${k + 1}`, 'aria-valuenow': Math.min(Math.max((x - lo) / span, 0), 1).toFixed(4), 'aria-valuetext': text(nodes[k]) };
       for (const [name, is_] of Object.entries(is)) group.children[k].setAttribute(name, is_);
     });
     find('input[type=color]').value = hex(nodes[chosen].rgb);
@@ -116,6 +117,13 @@ export function editor(apply, layer, key, history) {
     change(nodes.map((node, j) => (j === k ? { ...node, ...at } : node)));
   }
 
+  // the whole function of a state, shifted by a value and so many times as wide about its middle
+  function moveAll(from, shift, times) {
+    const middle = (from.nodes[0].x + from.nodes.at(-1).x) / 2, moved = (nodes) => nodes?.map((node) => ({ ...node, x: middle + (node.x - middle) * times + shift }));
+    now = { ...now, nodes: moved(from.nodes), exact: moved(from.exact) ?? null };
+    show();
+  }
+
   function add(x, y) {
     history.keep();
     const after = now.nodes.findIndex((n) => n.x > x), k = after < 0 ? now.nodes.length : after;
@@ -135,9 +143,9 @@ export function editor(apply, layer, key, history) {
   };
   const nearest = ([px, py]) => {
     const away = now.nodes.map(({ x, y }) => Math.hypot(across(x) - px, height(y) - py)), least = Math.min(...away);
-    return least < NEAR ? away.indexOf(least) : -1;
+    return least < NEAR ? away.indexOf(least) : NONE;
   };
-  let dragged = -1, moved = false, tap = { time: -1, at: [0, 0] };
+  let dragged = NONE, moved = false, grabbed = now, tap = { time: -1, at: [0, 0] };
   svg.addEventListener('pointerdown', (event) => {
     if (event.button) return;
     event.preventDefault();
@@ -149,20 +157,24 @@ export function editor(apply, layer, key, history) {
       find('g').children[k].focus({ focusVisible: false });
     } else if (event.timeStamp - tap.time < TWICE && Math.hypot(at[0] - tap.at[0], at[1] - tap.at[1]) < NEAR) {
       add(value(at[0]), opacity(at[1]));
+    } else {
+      [dragged, moved, grabbed] = [ALL, false, now];
+      svg.setPointerCapture(event.pointerId);
     }
     tap = { time: event.timeStamp, at };
   });
   svg.addEventListener('pointermove', (event) => {
-    if (dragged < 0) return;
+    if (dragged === NONE) return;
     const [px, py] = place(event);
     if (!moved) {
       if (Math.hypot(px - tap.at[0], py - tap.at[1]) < 2) return;
       history.keep();
       moved = true;
     }
-    move(dragged, value(px), opacity(py));
+    if (dragged === ALL) moveAll(grabbed, ((px - tap.at[0]) * span) / (WIDE - 12), Math.exp((tap.at[1] - py) / WIDER));
+    else move(dragged, value(px), opacity(py));
   });
-  for (const name of ['pointerup', 'pointercancel']) svg.addEventListener(name, () => { dragged = -1; });
+  for (const name of ['pointerup', 'pointercancel']) svg.addEventListener(name, () => { dragged = NONE; });
   svg.addEventListener('contextmenu', (event) => {
     event.preventDefault();
     const k = nearest(place(event));
@@ -176,6 +188,10 @@ export function editor(apply, layer, key, history) {
     if (moves[event.key]) {
       history.keep();
       move(now.chosen, ...moves[event.key]);
+    } else if (event.key === 'PageUp' || event.key === 'PageDown') {
+      const up = event.key === 'PageUp' ? 1 : -1;
+      history.keep();
+      moveAll(now, event.shiftKey ? 0 : (up * span) / 50, event.shiftKey ? 1.05 ** up : 1);
     } else if (event.key === 'Delete' || event.key === 'Backspace') {
       remove(now.chosen);
     } else return;

@@ -9,6 +9,16 @@ const HTML = `<header><b>slices</b><select class="grid" aria-label="volume" titl
 <label>W <input class="window" type="number" step="any" min="0"></label><label>L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
 const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="0">';
 
+// facts of the grids; those of a server are fetched, and held by elements as in a file
+async function held(slices) {
+  if (!slices.from) return slices;
+  const answer = await fetch(slices.from);
+  if (!answer.ok) throw new Error('vvgt view has none');
+  const { facts, contents } = await answer.json();
+  for (const [id, textContent] of Object.entries(contents)) document.body.append(Object.assign(document.createElement('script'), { type: 'application/octet-stream', id, textContent }));
+  return facts;
+}
+
 // world(): of where.mjs; cuts: the picture has a cut; rows(layer): colours and opacities of its labels as they are shown, or null; moved(place): of the cross, picked(place): by a click
 export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   const root = Object.assign(document.createElement('section'), { id: 'slices', hidden: true, innerHTML: HTML });
@@ -180,7 +190,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     if (grids) return;
     grids = [];
     said.textContent = 'loading';
-    for (const facts of scene.slices) grids.push(await gridOf(facts));
+    for (const facts of await held(scene.slices)) grids.push(await gridOf(facts));
     labels = grids.filter((grid) => grid.labels);
     const valued = grids.filter((grid) => !grid.labels), bases = valued.length ? valued : labels.slice(0, 1), list = find('.grid');
     list.replaceChildren(...bases.map(({ title }, k) => new Option(title || `layer ${k}`)));

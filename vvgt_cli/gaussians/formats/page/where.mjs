@@ -1,5 +1,5 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
-import { rowsOf } from './about.mjs';
+import { notice, rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
 import { facesOf } from './face.mjs';
@@ -35,7 +35,8 @@ export function where(viewer, scene, live, show) {
   box.setAttribute('aria-label', 'view');
   const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []);
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
-  document.body.append(box, help.root, about.root, places);
+  const poor = notice();
+  document.body.append(poor.root, box, help.root, about.root, places);
   places.setAttribute('role', 'status');
   let data, world, facts, drawn = '', stamp = 0, told = '';
   const state = {};
@@ -69,6 +70,7 @@ export function where(viewer, scene, live, show) {
       made.setAttribute('aria-label', `${made.textContent}: ${title}`);
     });
     live?.cut.name(world.letters);
+    poor.say(facts.far);
     about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live, converted: scene.converted }));
   }
 
@@ -126,7 +128,7 @@ export function where(viewer, scene, live, show) {
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
   const act = Object.fromEntries(buttons.filter(({ key }) => key).map(({ key, press }) => [key, press]));
-  listen(lens, { ...act, '?': help.toggle }, () => ruler.measure(false), again);
+  listen(lens, { ...act, '?': help.toggle }, () => { poor.close(); ruler.measure(false); }, again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
   addEventListener('hashchange', () => restore(parts).then(again));

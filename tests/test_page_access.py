@@ -1,0 +1,106 @@
+# ruff: noqa: F811
+"""Pages by keyboard and for screen readers: axe-core and the Tab key in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_page_where import DESK, PHONE, Person, marked  # noqa: F401
+
+from vvgt_cli.cli.main import run
+
+pytestmark = pytest.mark.long
+PAGES = ("slices", "series", "labels", "fixed")
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory, marked: str) -> dict[str, str]:
+    """Addresses of a live page with slices, of a series, of labels, and of Gaussians alone."""
+    nib = pytest.importorskip("nibabel")
+    folder = tmp_path_factory.mktemp("pages")
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 16)], indexing="ij"))
+    frames = [1e-6 + np.exp(-6 * ((grid - shift) ** 2).sum(axis=0)) for shift in (-0.2, 0.2)]
+    nib.save(nib.Nifti1Image(np.stack(frames, -1).astype(np.float32), np.eye(4)), folder / "series.nii")
+    nib.save(nib.Nifti1Image((frames[0] > 0.5).astype(np.uint8), np.eye(4)), folder / "labels.nii")
+    quick = ["--max-gaussians", "1000", "--quiet"]
+    given = {
+        "series": ["series.nii", "--live"], "labels": ["labels.nii", "--labels", "auto", "--live"],
+        "fixed": ["labels.nii", "--no-live", "--no-slices", "--steps", "0"],
+    }  # fmt: skip
+    for name, (file, *options) in given.items():
+        assert run(["convert", str(folder / file), *options, *quick, "-o", str(folder / f"{name}.html")]) == 0
+    return {"slices": marked} | {name: (folder / f"{name}.html").as_uri() for name in given}
+
+
+@pytest.fixture(scope="module", params=[pytest.param(DESK, id="desk"), pytest.param(PHONE, id="phone")])
+def person(request: pytest.FixtureRequest) -> Iterator[Person]:
+    someone = Person(request.param)
+    yield someone
+    someone.process.communicate(timeout=60)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_serious_finding_and_no_trap(name: str, person: Person, pages: dict[str, str]) -> None:
+    person("open", pages[name])
+    if name == "slices":
+        person("press", "s")
+    if person.touch:
+        person("eval", "document.querySelector('#live.folded .fold')?.click()")
+    person("eval", "document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    person("press", "i")
+    person("settled")
+    assert person("axe") == []
+    assert person("tabs") == {"unseen": [], "missed": []}
+
+
+def test_a_page_that_is_far_from_its_volume_says_so_until_it_is_closed(person: Person, pages: dict[str, str]) -> None:
+    seen = "(({ hidden, textContent }) => (hidden ? '' : textContent))(document.querySelector('#notice'))"
+    person("open", pages["slices"])
+    assert person("eval", seen) == ""
+    far = Path(pages["slices"].removeprefix("file://")).with_name("far.html")
+    assert (
+        run(
+            [
+                "convert",
+                str(far.with_name("marked.nii.gz")),
+                "--live",
+                "--max-gaussians",
+                "60",
+                "--quiet",
+                "-o",
+                str(far),
+            ]
+        )
+        == 0
+    )
+    person("open", far.as_uri())
+    assert " dB" in person("eval", seen)
+    person("eval", "document.querySelector('#notice button').focus()")
+    person("press", "Enter")
+    assert person("eval", seen) == ""
+
+
+def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, pages: dict[str, str]) -> None:
+    person("open", pages["slices"])
+    if person.touch:
+        person("eval", "document.querySelector('#live .fold').click()")
+    nodes = "window.vvgt.live.nodes().map(({ x }) => x)"
+    box = "document.querySelector('#live .function svg').getBoundingClientRect()"
+    before = np.array(person("eval", nodes))
+    left, top, wide = person("eval", f"(({{ left, top, width }}) => [left, top, width])({box})")
+    x, y = left + 6 + 0.75 * (wide - 12), top + 60
+    person("drag", x, y, x + (wide - 12) / 10, y)
+    shifted = np.array(person("eval", nodes))
+    np.testing.assert_allclose(shifted, before + np.ptp(before) / 10, atol=0.5)
+    person("drag", x, y, x, y - 40)
+    wider = np.array(person("eval", nodes))
+    middle = (shifted[0] + shifted[-1]) / 2
+    np.testing.assert_allclose(wider - middle, (shifted - middle) * np.exp(40 / 60), atol=1.5)
+    person("press", "Control+z")
+    np.testing.assert_allclose(person("eval", nodes), shifted)
+    person("eval", "document.querySelector('#live .node').focus()")
+    person("press", "PageDown")
+    np.testing.assert_allclose(person("eval", nodes), shifted - np.ptp(before) / 50)
