@@ -31,7 +31,6 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.gaussians.formats.page_live import LiveForm
-    from vvgt_cli.gaussians.formats.page_slices import Slices
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
@@ -207,20 +206,24 @@ class Conversion(Result):
     field: Field
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
 
+    @cached_property
+    def _made(self) -> dict[str, Any]:
+        """Contents of a page, by name, that have been made."""
+        return {}
+
     def extras(self, live: bool, slices: bool, run: Run | None = None) -> Extras:
         """Implement `Result.extras`, with a message if there is no live form."""
-        run, form = run or Run(Console(quiet=True), ConversionReport("init")), None
-        if live and self.make_live is not None:
-            form = self.make_live(run, self.field, self.ply)
-        if not slices:
-            return Extras(form)
-        with run.stage("slices") as stage:
-            stage.note = str(self._slices or "none: the volume has colours")
-        return Extras(form, self._slices)
-
-    @cached_property
-    def _slices(self) -> Slices | None:
-        return self.field.source.slices()
+        run = run or Run(Console(quiet=True), ConversionReport("init"))
+        if live and self.make_live is not None and "live" not in self._made:
+            self._made["live"] = self.make_live(run, self.field, self.ply)
+        if slices and "slices" not in self._made:
+            with run.stage("slices") as stage:
+                self._made["slices"] = self.field.source.slices()
+                stage.note = str(self._made["slices"] or "none: the volume has colours")
+        form = self._made.get("live") if live else None
+        if form is not None:
+            form = form[0], replace(form[1], certificate=self.ply.certificate)
+        return Extras(form, self._made.get("slices") if slices else None)
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""
