@@ -54,7 +54,9 @@ def example() -> tuple[Gaussians, PlyOptions]:
         rng.normal(size=1000), rng.uniform(0.1, 0.9, (1000, 3)),
     )  # fmt: skip
     volume = Volume(np.zeros((20, 20, 20), np.uint8), (0.5, 0.5, 0.5), (-40.0, 20.0, 90.0), space="RAS")
-    certificate = Certificate("head", "ab" * 32, "0123456789ab", 1080, "compensated", 40.0, 3, texture=(0.5, 0.4))
+    certificate = Certificate(
+        "head", "ab" * 32, "0123456789ab", 1080, "compensated", 40.0, 3, 160000, texture=(0.5, 0.4)
+    )
     options = PlyOptions(unit_distance=0.5, made_for=1080, rule="compensated", certificate=certificate)
     return gaussians, with_place(options, volume)
 

@@ -27,8 +27,8 @@ from vvgt_cli.volume.stored import Stored
 DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
     volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
-    conditions=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5,
-    command="vvgt convert head.nrrd --tf 'a b.json'",
+    pixels=160000, conditions=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46),
+    position_error=1e-5, command="vvgt convert head.nrrd --tf 'a b.json'",
 )  # fmt: skip
 SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
 RAW = ("--dims", *map(str, DIMS), "--dtype", "uint8")
@@ -105,7 +105,8 @@ def test_a_certificate_that_is_none_is_one_line(text) -> None:
 def test_a_conversion_certifies_its_file(made) -> None:
     found = read_ply(made)[1].certificate
     assert found is not None
-    assert (found.volume, found.size, found.rule, found.views) == ("volume, 20 x 18 x 22", 64, "inria", 3)
+    assert (found.volume, found.size, found.rule) == ("volume, 20 x 18 x 22", 64, "inria")
+    assert (found.views, found.pixels) == (3, 64**2)
     assert found.psnr > 20
     assert len(found.conditions) == 16
     assert found.conditions[0][1] == min(dB for _, dB in found.conditions)
@@ -280,25 +281,25 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     (tmp_path / "solid.json").write_text(json.dumps({"points": points}))
     solid = (folder / "ball.raw", *RAW, "--tf", tmp_path / "solid.json", "--max-gaussians", "1500", "--steps", "4")
     assert (
-        vvgt("convert", *solid, "--size", "160", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json").code == 0
+        vvgt("convert", *solid, "--size", "256", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json").code == 0
     )
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
-    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(160)
-    assert [(c.width, c.height) for c in cameras] == [(80, 80)]
-    found = score_texture(source.scene(), boxed, 160, header.rule, cameras=cameras)
+    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(256)
+    assert [(c.width, c.height) for c in cameras] == [(85, 85)]
+    found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4
     assert header.certificate.texture == pytest.approx((found.ours, found.reference), abs=1e-3)
     told = json.loads((tmp_path / "r.json").read_text())["texture"]
     assert told["blocks"] == found.blocks
     assert f"texture {header.certificate.texture[0]:g}" in vvgt("info", tmp_path / "out.ply").out.decode()
-    blocks = vvgt("convert", *solid, "--size", "160", "--blocks", "16", "-o", tmp_path / "blocks.ply")
+    blocks = vvgt("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
     assert blocks.code == 0
     assert read_ply(tmp_path / "blocks.ply")[1].certificate.texture[1] == pytest.approx(found.reference, abs=0.01)
     small = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *small, "--size", "48", "-o", tmp_path / "small.ply").code == 0
-    assert read_ply(tmp_path / "small.ply")[1].certificate.texture is None  # 24 px: no block of 32
+    assert read_ply(tmp_path / "small.ply")[1].certificate.texture is None  # 16 px: no block of 32
 
 
 @pytest.mark.parametrize(("name", "more"), [("out.ply", ()), ("out.spz", ()), ("out.ply", ("--live",))])
@@ -337,3 +338,31 @@ def test_what_cannot_be_written_twice_or_has_no_certificate_is_written_once(
     assert there == [once == "comments"]
     assert "certificate " not in result.err
     assert result.err.count("\nwrite ") == 1
+
+
+def test_a_page_is_whole_before_it_is_scored(vvgt, folder, tmp_path, monkeypatch) -> None:
+    page, seen = tmp_path / "out.html", []
+    monkeypatch.setattr(TestViews, "run", lambda *args: seen.append(page.read_text("utf-8")))
+    command = ("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", page)
+    result = vvgt(*command)
+    assert result.code == 0, result.err
+    for held in ("slices-0", "splats-0", "live-0"):
+        assert f'id="{held}"' in seen[0], held
+    assert result.err.count("\nslices") == result.err.count("\nvalues") == 1
+
+
+def test_no_view_is_rendered_twice_to_be_scored(vvgt, folder, tmp_path, monkeypatch) -> None:
+    import vvgt_cli.dvr
+    from vvgt_cli.field.field import Picture
+
+    rendered, render_view = [], vvgt_cli.dvr.render_view
+
+    def counted(scene, camera, settings=None, blocks=None):
+        if isinstance(scene, vvgt_cli.dvr.Scene) and camera.width >= 512:
+            rendered.append(Picture(camera, settings, blocks).key)
+        return render_view(scene, camera, settings, blocks)
+
+    monkeypatch.setattr("vvgt_cli.dvr.render_view", counted)
+    how = ("--tf", folder / "tf.json", "--max-gaussians", "300", "--size", "512", "--live")
+    assert vvgt("convert", folder / "ball.raw", *RAW, *how, "-o", tmp_path / "out.ply").code == 0
+    assert len(rendered) == len(set(rendered)) == 4  # three test views, one on the next larger screen

@@ -56,9 +56,10 @@ def steps_of(found):
 
 def ending(edge=48.0, judge=0.06, check=0.06, size=48):
     """Seconds of three test views, the conditions, texture and the file."""
-    near = (size // 2) ** 2  # pixels
+    near = (size // 3) ** 2  # pixels
+    views = 2 if spread_blocks(size, size) is None else 1  # one of the conditions' is a test view
     texture = judge * near / edge**2 + 0.05 * near / 400**2
-    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * check + 0.15 + 0.155 + texture + 0.1
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + views * check + 0.15 + 0.155 + texture + 0.1
 
 
 def drawn(size, enough):

@@ -200,7 +200,7 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
 
 
 def test_the_quality_is_that_of_the_certificate(tmp_path: Path) -> None:
-    given = Certificate("v", None, "0", 400, "inria", 41.234, 3)
+    given = Certificate("v", None, "0", 400, "inria", 41.234, 3, 160000)
 
     def error(certificate: Certificate, fact: str = "quality") -> Any:
         return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get(fact)

@@ -33,6 +33,12 @@ class Blocks:
         wide = chosen.reshape(rows, across).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
         return np.ascontiguousarray(wide[: self.height, : self.width])  # as kernels are compiled for
 
+    def image(self, colors: np.ndarray) -> np.ndarray:
+        """Return the picture (h, w, c) float32 with the ``colors`` (n, c) of the pixels of `mask`, zero elsewhere."""
+        found = np.zeros((self.height, self.width, colors.shape[1]), np.float32)
+        found[self.mask()] = colors
+        return found
+
     def pick(self, image: np.ndarray) -> np.ndarray:
         """Stack the blocks of an image (h, w, c) vertically, (16 n, 16, c)."""
         across = -(-self.width // BLOCK)

@@ -14,7 +14,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
-from vvgt_cli.score.views import score_test_views
+from vvgt_cli.score.views import score_test_views, test_view_pixels
 
 WITHIN = 0.1  # dB that the file format may cost
 
@@ -45,6 +45,7 @@ def with_certificate(
         rule=fit.rule,
         psnr=round(preview_psnr(scores), 2),
         views=len(PREVIEW_VIEWS),
+        pixels=test_view_pixels(fit.size),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
         texture=_rounded_texture(run.report.texture),

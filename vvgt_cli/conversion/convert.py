@@ -346,15 +346,25 @@ def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) ->
 
 def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
     """Return a function that writes the file before its scores are known; None where it is written once."""
-    output = request.output
-    if output is None or request.writes < 2:
+    if request.writes < 2:
         return None
 
     def write(found: Conversion) -> None:
-        more = "; complete; scoring next"
-        write_gaussians(run, output, found.gaussians, found.ply, request.overwrite, found.normals(), more=more)
+        _write_file(run, request, found, more="; complete; scoring next")
 
     return write
+
+
+def _write_file(run: Run, request: ConvertRequest, found: Conversion, again: bool = False, more: str = "") -> None:
+    """Write the file, a page with all its contents, or ``again`` with its certificate; ``more`` ends the message."""
+    assert request.output is not None
+    page = is_page(request.output) and request.ply.comments
+    limit = None if request.limits.max_megabytes is None else 1e6 * request.limits.max_megabytes
+    extras = found.extras(request.editor, request.slices, run, limit) if page else NOTHING
+    write_gaussians(
+        run, request.output, found.gaussians, found.ply, request.overwrite or again, found.normals(),
+        "certificate" if again else "write", more, extras,
+    )  # fmt: skip
 
 
 def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: bool = False) -> ConversionReport:
@@ -364,11 +374,7 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     report = run.report
     assert request.output is not None
     if conversion.ply.certificate is not None or not written:
-        file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
-        page = is_page(request.output) and request.ply.comments
-        limit = None if request.limits.max_megabytes is None else 1e6 * request.limits.max_megabytes
-        extras = conversion.extras(request.editor, request.slices, run, limit) if page else NOTHING
-        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage, extras=extras)
+        _write_file(run, request, conversion, again=written)
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

@@ -27,7 +27,7 @@ class RememberedViews:
     def __init__(self, largest: int, views: ViewRenderer | None = None) -> None:
         """Start with an empty cache."""
         self.largest, self.views = largest, views
-        self._kept: dict[bytes, tuple[Camera, np.ndarray, np.ndarray]] = {}  # camera, picture, (rows, columns) bool
+        self._kept: dict[str, tuple[Camera, np.ndarray, np.ndarray]] = {}  # camera, picture, (rows, columns) bool
 
     def expect(self, pictures: Sequence[Picture]) -> None:
         """Implement `ViewRenderer.expect`."""
@@ -91,9 +91,5 @@ class RememberedViews:
         return np.where(view.blocks.mask()[..., None], whole, np.float32(0))
 
 
-def _key(view: Picture) -> bytes:
-    camera = view.camera
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
-    return b"".join(
-        (camera.rotation.tobytes(), camera.translation.tobytes(), lens.tobytes(), repr(view.settings).encode())
-    )
+def _key(view: Picture) -> str:
+    return view._replace(blocks=None).key

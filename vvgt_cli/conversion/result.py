@@ -31,11 +31,11 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.gaussians.formats.page_live import LiveForm
-    from vvgt_cli.gaussians.formats.page_slices import Slices
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
 FROM_THE_SIDE = 4  # test view of pictures by default
+CERTIFICATES = 4096  # bytes of a page that are enough for those of the conversion and of the live form
 
 
 @dataclass(repr=False)
@@ -218,28 +218,34 @@ class Conversion(Result):
     field: Field
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
 
+    @cached_property
+    def _made(self) -> dict[str, Any]:
+        """Contents of a page, by name, that have been made."""
+        return {}
+
     def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
         """Implement `Result.extras`, with a message if there is no live form."""
-        run, form = run or Run(Console(quiet=True), ConversionReport("init")), None
-        if live and self.make_live is not None:
-            form = self.make_live(run, self.field, self.ply)
-        if not slices:
-            return Extras(form)
-        with run.stage("slices") as stage:
-            found = self._slices if limit is None else self.field.source.slices(limit - self._page_bytes(form))
-            why = "the volume has colours" if limit is None else "the volume has colours, or --max-size is too small"
-            stage.note = str(found or f"none: {why}")
-        return Extras(form, found)
+        run = run or Run(Console(quiet=True), ConversionReport("init"))
+        if live and self.make_live is not None and "live" not in self._made:
+            self._made["live"] = self.make_live(run, self.field, self.ply)
+        form, name = self._made.get("live") if live else None, f"slices within {limit}"
+        if slices and name not in self._made:
+            with run.stage("slices") as stage:
+                room = None if limit is None else limit - self._page_bytes(form)
+                found = self._made[name] = self.field.source.slices(room)
+                why = (
+                    "the volume has colours" if limit is None else "the volume has colours, or --max-size is too small"
+                )
+                stage.note = str(found or f"none: {why}")
+        if form is not None:
+            form = form[0], replace(form[1], certificate=self.ply.certificate)
+        return Extras(form, self._made[name] if slices else None)
 
     def _page_bytes(self, form: LiveForm | None) -> int:
-        """Return the bytes of the page without slices."""
+        """Return the bytes of the page with a certificate, but without slices."""
         page = format_of("x.html")
         assert page is not None
-        return len(encoded(page, self.gaussians, self.ply, "", Extras(form)))
-
-    @cached_property
-    def _slices(self) -> Slices | None:
-        return self.field.source.slices()
+        return len(encoded(page, self.gaussians, self.ply, "", Extras(form))) + CERTIFICATES
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""

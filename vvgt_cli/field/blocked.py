@@ -194,25 +194,21 @@ class Blocked:
     def expect(self, pictures: Sequence[Picture]) -> None:
         """Implement `ViewRenderer.expect`."""
         for picture in pictures:
-            self.pictures.setdefault(_key(picture), (picture, None))
+            self.pictures.setdefault(picture.key, (picture, None))
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
         """Implement `ViewRenderer.view`; the first request renders all expected pictures."""
         view = Picture(camera, settings, blocks)
         self.expect([view])
-        if self.pictures[_key(view)][1] is None:
+        if self.pictures[view.key][1] is None:
             self._render_pending()
-        picked = self.pictures[_key(view)][1]
-        assert picked is not None
-        if blocks is None:
-            return picked
-        image = np.zeros((camera.height, camera.width, 4), np.float32)
-        image[blocks.mask()] = picked
-        return image
+        found = self.pictures[view.key][1]
+        assert found is not None
+        return found if blocks is None else blocks.image(found)
 
     def forget(self, picture: Picture) -> None:
         """Implement `ViewRenderer.forget`."""
-        self.pictures.pop(_key(picture), None)
+        self.pictures.pop(picture.key, None)
 
     def _pending(self) -> list[Drawing]:
         """Return the pictures that are expected but not rendered."""
@@ -327,13 +323,6 @@ class Blocked:
     def digest(self) -> str | None:
         """Implement `Field.digest`."""
         return self._digest
-
-
-def _key(view: Picture) -> str:
-    camera, blocks = view.camera, view.blocks
-    lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    numbers = None if blocks is None else blocks.numbers
-    return digest(camera.rotation, camera.translation, lens, view.settings, numbers)
 
 
 def _gathered(task: CellBlocks) -> Cells:

@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.device import on_device
-from vvgt_cli.field.digests import values_digest
+from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
@@ -31,6 +31,14 @@ class Picture(NamedTuple):
     camera: Camera
     settings: RenderSettings
     blocks: Blocks | None = None
+
+    @property
+    def key(self) -> str:
+        """Return the digest of what it shows."""
+        camera = self.camera
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        numbers = None if self.blocks is None else self.blocks.numbers
+        return digest(camera.rotation, camera.translation, lens, self.settings, numbers)
 
 
 class ViewRenderer(Protocol):
@@ -104,6 +112,7 @@ class Resident:
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
     device: str = "cpu"
     report: Callable[[str], None] = print
+    _drawn: dict[str, np.ndarray] = field(default_factory=dict)  # pixels of pictures' blocks, by `Picture.key`
 
     def __post_init__(self) -> None:
         """Use the field itself as the renderer if none is given."""
@@ -138,10 +147,18 @@ class Resident:
         """Implement `ViewRenderer.view`."""
         from vvgt_cli.dvr import render_view
 
-        return render_view(self.scene, camera, settings, blocks)
+        if blocks is None:
+            return render_view(self.scene, camera, settings)
+        key = Picture(camera, settings, blocks).key
+        if key in self._drawn:
+            return blocks.image(self._drawn[key])
+        image = render_view(self.scene, camera, settings, blocks)
+        self._drawn[key] = image[blocks.mask()]
+        return image
 
     def forget(self, picture: Picture) -> None:
-        """Do nothing: no picture is cached."""
+        """Implement `ViewRenderer.forget`."""
+        self._drawn.pop(picture.key, None)
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """Implement `Field.normals`."""

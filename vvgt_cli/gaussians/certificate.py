@@ -22,6 +22,7 @@ class Certificate:
         rule: name of the rule of `vvgt_cli.gaussians.rules` that the scores used.
         psnr: mean PSNR in dB of the first scored views against the volume.
         views: number of these views.
+        pixels: number of pixels that were scored of each.
         live_psnr: PSNR in dB of a live file recoloured with its own function; None for other files.
         conditions: name and PSNR in dB of each viewing condition that was scored, worst first.
         texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
@@ -38,6 +39,7 @@ class Certificate:
     rule: str
     psnr: float
     views: int
+    pixels: int
     live_psnr: float | None = None
     conditions: tuple[tuple[str, float], ...] = ()
     texture: tuple[float, float] | None = None
@@ -70,9 +72,9 @@ class Certificate:
         texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
         kinds = {
             "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
-            "live_psnr": float, "position_error": float, "command": str,
+            "pixels": int, "live_psnr": float, "position_error": float, "command": str,
         }  # fmt: skip
-        if not {"volume", "look", "size", "rule", "psnr", "views"} <= set(found) <= set(kinds):
+        if not {"volume", "look", "size", "rule", "psnr", "views", "pixels"} <= set(found) <= set(kinds):
             raise ValueError(text)
         known: dict[str, Any] = {"sha256": None, "texture": texture}
         for key, value in found.items():

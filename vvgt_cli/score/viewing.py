@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
 CLOSE = 10.0  # degrees: a quarter of the default field of view
 NEAR = 14.0  # degrees, for texture: faces fill the picture, and cells are some pixels wide
+TEXTURED = 3  # a conversion measures texture in the middle of a near view, one part in so many of its edge
 VIEWS = (0, 4, 9)  # test views: above, side, below
 SIDE = (4,)  # one view is enough to find the worst condition
 PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of scores without a report: above, side, below
@@ -165,11 +166,11 @@ def near_cameras(size: int) -> list[Camera]:
 
 
 def texture_cameras(size: int) -> list[Camera]:
-    """Return the cameras of a conversion's texture: the middle half of the close view from the side."""
+    """Return the cameras of a conversion's texture: the middle of the close view from the side."""
     found = []
     for i in SIDE:
         whole = zoomed(default_views("test", size=size)[i], NEAR)
-        edge = size // 2
+        edge = size // TEXTURED
         offset = (size - edge) // 2
         found.append(replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge))
     return found

@@ -34,6 +34,12 @@ def scored_views(
     return found
 
 
+def test_view_pixels(size: int) -> int:
+    """Return the number of pixels by which the errors of a test view of ``size`` px are measured."""
+    blocks = spread_blocks(size, size)
+    return size**2 if blocks is None else int(blocks.mask().sum())
+
+
 def score_test_views(
     scene: Scene | Viewed,
     gaussians: Gaussians,

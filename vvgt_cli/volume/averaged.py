@@ -91,9 +91,13 @@ def _span(whole: int, count: int, lo: int, length: int) -> tuple[int, np.ndarray
 def _integrated(values: np.ndarray, edges: Sequence[np.ndarray]) -> np.ndarray:
     """Integrate values (z, y, x), constant within voxels, between edges along each axis."""
     for axis, ends in enumerate(edges):
-        before = np.minimum(ends.astype(np.int64), values.shape[axis] - 1)
-        share = (ends - before).reshape([-1 if k == axis else 1 for k in range(3)])
-        until = np.insert(np.cumsum(values, axis), 0, 0.0, axis)
-        below = until.take(before, axis)
-        values = np.diff(below + share * (until.take(before + 1, axis) - below), axis=axis)
+        lo, hi, last = ends[:-1], ends[1:], values.shape[axis] - 1
+        first = lo.astype(np.int64)
+        sums = np.zeros(tuple(len(lo) if k == axis else n for k, n in enumerate(values.shape)))
+        for voxel in (first + k for k in range(int((np.ceil(hi) - first).max(initial=0)))):
+            share = (np.minimum(hi, voxel + 1) - np.maximum(lo, voxel)).clip(0)
+            part = values.take(np.minimum(voxel, last), axis)
+            part *= share.reshape([-1 if k == axis else 1 for k in range(3)])
+            sums += part
+        values = sums
     return values

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
-from vvgt_cli.cameras.blocks import FEW
+from vvgt_cli.cameras.blocks import ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
@@ -13,6 +13,7 @@ from vvgt_cli.field.workload import Workload
 from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
+    TEXTURED,
     condition_pictures,
     condition_views,
     score_conditions,
@@ -24,7 +25,7 @@ from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_view
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones, extra seconds per 400 x 400 px
 TEXTURE = 0.05  # extra seconds per 400 x 400 px
-CONDITIONS = 2, 0.15, 0.155  # check views, and extra seconds: fixed, per 100,000 Gaussians
+CONDITIONS = 0.15, 0.155  # extra seconds: fixed, per 100,000 Gaussians
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,14 @@ class TestViews(Stage):
             stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.size} px"
 
 
+def _places(size: int) -> list[tuple[tuple[int, float], int]]:
+    """Return size and field of view of the conditions, with the blocks scored: those of the test view where it has any.
+
+    Fields keep the pictures of blocks, so that the test view is not rendered again.
+    """
+    return list(zip(screens(size), (ENOUGH if spread_blocks(size, size) else FEW, FEW), strict=True))
+
+
 @dataclass(frozen=True)
 class ViewingConditions(Stage):
     """Scores by every rule at the target size and above, and of texture on smooth areas; skipped where time is up."""
@@ -84,17 +93,16 @@ class ViewingConditions(Stage):
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels and Gaussians."""
-        near = (workload.size // 2) ** 2
-        splats = CONDITIONS[1] + CONDITIONS[2] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
-        return Cost(
-            CONDITIONS[0] * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats
-        )
+        near = (workload.size // TEXTURED) ** 2
+        splats = CONDITIONS[0] + CONDITIONS[1] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
+        views = sum(enough == FEW for _, enough in _places(workload.size))
+        return Cost(views * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = condition_pictures(screens(fit.size), SIDE, FEW)
+        wanted = [one for place, enough in _places(fit.size) for one in condition_pictures([place], SIDE, enough)]
         conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
         return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
@@ -108,7 +116,10 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = condition_views(work.field.views, screens(fit.size), settings, views=SIDE, enough=FEW)
+            seen = (
+                view for place, enough in _places(fit.size)
+                for view in condition_views(work.field.views, [place], settings, views=SIDE, enough=enough)
+            )  # fmt: skip
             conditions = score_conditions(made, seen)
             run.report.conditions = [asdict(condition) for condition in conditions]
             near, views = texture_cameras(fit.size), work.field.views
