@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_live import HI, LO, RAMP, cloud, statistics
 
+import vvgt_cli as vvgt_library
 from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cli.main import run
 from vvgt_cli.commands import render_values
@@ -217,6 +218,7 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
             ((labels,), 1, "carry labels"),
             ((tmp_path / "map.npy", "--labels", "auto"), 2, "no single value"),
             ((live, "--background", 1, 1, 1), 2, "opaque"),
+            *([((live, "--tf", "viridis"), 2, "omit function")] if rule == "mip" else []),
         ):
             done = vvgt("render", *arguments, "--rule", rule, "--size", 32, "-o", out)
             assert (done.code, text in done.error, len(done.error.splitlines())) == (code, True, 1), done.err
@@ -224,3 +226,12 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
     assert (done.code, "mip or xray" in done.error) == (2, True)
     assert not out.exists()
     assert vvgt("render", live, "--rule", "mip", "--orbit", 3, "--size", 32, "-o", tmp_path / "a.gif").code == 0
+
+
+def test_a_live_result_draws_them() -> None:
+    result = vvgt_library.convert("example:blob:16", goal={"max_gaussians": 300, "size": 48}, live=True)
+    mip, xray = (result.render(size=SIZE, rule=rule) for rule in ("mip", "xray"))
+    assert mip.shape == xray.shape == (SIZE, SIZE, 4)
+    assert mip[SIZE // 2, SIZE // 2, 0] > 0.7 > xray[0, 0, 0]
+    with pytest.raises(vvgt_library.DataError, match="carry no values"):
+        result.recolor("magma").render(size=SIZE, rule="mip")

@@ -18,7 +18,7 @@ import pytest
 from tests.live_stream import from_bytes
 from tests.test_live import COLORS, GRAIN, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.commands.render_values import NO_GRAIN
+from vvgt_cli.conversion.grey import NO_GRAIN
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.live import BYTES, ROW

@@ -17,6 +17,7 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands import render_values
 from vvgt_cli.commands.views_in_blocks import draw_in_blocks
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
+from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -36,7 +37,6 @@ from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
-Draw = Callable[[Camera], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class RenderRequest:
         camera: view-set file, or None.
         orbit: number of views on a circle around the up axis, or None; not both. A single picture needs neither.
         size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
-        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `render_values.NAMES`, which also show a
+        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `vvgt_cli.conversion.grey.NAMES`, also for a
             volume; None: the Gaussians' file's.
         exr: write EXR too.
         background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
@@ -124,7 +124,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     console = console or Console()
     run = Run(console, ConversionReport("render"))
     cameras = request.cameras()
-    if request.rule in render_values.NAMES and request.background is not None:
+    if request.rule in NAMES and request.background is not None:
         raise UsageError(f"--background: pictures of --rule {request.rule} are opaque; omit it")
     if request.movie and request.exr:
         raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
@@ -152,11 +152,11 @@ def _gaussians(run: Run, request: RenderRequest, name: str) -> tuple[Draw, list[
     """Return the renderer of Gaussians, the views in their file's orientation, and the name of the rule."""
     from vvgt_cli.splat import render
 
-    if request.rule in render_values.NAMES:
+    if request.rule in NAMES:
         with run.stage("read") as stage:
             gaussians, header = open_gaussians(name)
             stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-        draw = render_values.draw_gaussians(name, gaussians, header, request.rule, request.function)
+        draw = draw_gaussians(name, gaussians, header, request.rule, request.function)
         run.compile(GREY)
         return draw, request.cameras(header.made_for, header.up), request.rule
     with run.stage("read") as stage:
@@ -175,13 +175,13 @@ def _volume(
 
     settings, options = RenderSettings(), request.blocks or automatic(asked, run.console)
     if options is not None:
-        needs = FieldNeeds(1, cameras[0].height, values=request.rule == render_values.XRAY)
+        needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
         found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
         source = _upright(found.source)
-        if request.rule == render_values.MIP:
+        if request.rule == MIP:
             run.compile(GREATEST, source.kernel_type())
             return render_in_box(render_values.mip_of(found), source.volume.axes), "MIP in blocks"
-        if request.rule == render_values.XRAY:
+        if request.rule == XRAY:
             found = found.with_look(render_values.as_xray(source))
             source = found.source
         run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
@@ -190,10 +190,10 @@ def _volume(
     with run.stage("read") as stage:
         source = _upright(load(asked))
         stage.note = describe_source(source)
-    if request.rule == render_values.MIP:
+    if request.rule == MIP:
         run.compile(GREATEST, source.kernel_type())
         return render_in_box(render_values.mip_of(source), source.volume.axes), "MIP"
-    if request.rule == render_values.XRAY:
+    if request.rule == XRAY:
         source = render_values.as_xray(source)
     run.compile(source.kernels(RAYCAST), source.kernel_type())
     scene = source.scene()

@@ -1,66 +1,26 @@
-"""Pictures of values in grey: MIP and X-ray of live Gaussians, and of a volume by the ray caster."""
+"""MIP and X-ray of a volume by the ray caster; of live Gaussians: `vvgt_cli.conversion.grey`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.conversion.recolored import FunctionRequest, resolve_look
-from vvgt_cli.errors import DataError
+from vvgt_cli.conversion.grey import Draw, grey
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.rays import HALO
 from vvgt_cli.field.reader import Box, Scalars
 from vvgt_cli.field.source import Source
-from vvgt_cli.gaussians import Gaussians, PlyHeader
-from vvgt_cli.gaussians.live import Table
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.volume import Statistics
 
-MIP, XRAY = "mip", "xray"
-NAMES = MIP, XRAY
 RAYS = 2  # along a pixel's edge
 STEP = 0.25  # voxels between samples
-NO_GRAIN = 1e-6  # part of a voxel over which values cover the background: an X-ray adds up extinction
-Draw = Callable[[Camera], np.ndarray]
 Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
-
-
-def grey(values: np.ndarray) -> np.ndarray:
-    """Return values (h, w) as an opaque picture (h, w, 4) float32."""
-    picture = np.ones((*values.shape, 4), np.float32)
-    picture[..., :3] = values[..., None]
-    return picture
-
-
-def draw_gaussians(
-    name: str, gaussians: Gaussians, header: PlyHeader, rule: str, function: FunctionRequest | None
-) -> Draw:
-    """Return the function that draws live Gaussians.
-
-    Raises:
-        DataError: Gaussians that carry no values, labels, or several layers; see also `resolve_look`.
-    """
-    from vvgt_cli.splat.grey import mip, xray
-
-    facts = header.live
-    if facts is None or facts.others or facts.labels:
-        what = "carry no values" if facts is None else "carry labels" if facts.labels else "are of several layers"
-        raise DataError(
-            f"{name}: --rule {rule}: its Gaussians {what}; expected a file that 'vvgt convert --live' makes of one "
-            "volume of values"
-        )
-    if rule == MIP:
-        return lambda camera: grey(mip(gaussians, camera, facts.lo, facts.hi))
-    tf, _ = resolve_look(name, header, function or FunctionRequest())
-    assert isinstance(tf, TransferFunction)
-    distance = exposed_distance(tf, facts.statistics(), 2.0)
-    table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain * NO_GRAIN)
-    return lambda camera: grey(xray(gaussians, table, camera))
 
 
 def as_xray(source: Source) -> Source:
