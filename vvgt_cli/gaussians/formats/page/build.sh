@@ -12,7 +12,7 @@ if ! cmp -s "$here/package.json" "$cache/installed.json"; then
   cp "$here/package.json" "$cache/installed.json"
 fi
 # our own controls and keys instead of the viewer's; its camera, which its handle does not lead to; no double-click of its
-# own; no glide where less motion is asked for
+# own; no glide where less motion is asked for; no pictures of a headset's controllers, which it would fetch from elsewhere
 viewer=$cache/node_modules/@playcanvas/supersplat-viewer/dist
 python3 - "$viewer" <<'PY'
 import sys
@@ -25,6 +25,8 @@ for old, new in (
     ("        seek: (time) =>", "        cameraManager: () => viewer.cameraManager,\n        seek: (time) =>"),
     ("        this.camera.copy(resetCamera);", "        this.resetCamera = resetCamera;\n        this.camera.copy(resetCamera);"),
     ("    async _pickSceneTarget(offsetX, offsetY) {", "    async _pickSceneTarget(offsetX, offsetY) {\n        return null;"),
+    ("    parent.script.create(XrControllers);", ""),
+    ("import { XrControllers } from 'playcanvas/scripts/esm/xr/xr-controllers.mjs';", ""),
     ("DAMPING = 0.95;", "DAMPING = matchMedia('(prefers-reduced-motion: reduce)').matches ? 0 : 0.95;"),
 ):
     if old not in text:

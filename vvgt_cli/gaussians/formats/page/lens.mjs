@@ -5,7 +5,7 @@ const DEGREES = Math.PI / 180;
 const of = (v) => [v.x, v.y, v.z], vec = (a) => new Vec3(...a);
 export const plus = (a, b, s = 1) => a.map((x, i) => x + s * b[i]), dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// {pose, set, toward, orbit, move, project, ray, perPixel, flat, middle}; places are in the viewer's axes, pixels are of CSS
+// {rig: what carries the camera, pose, set, toward, orbit, move, project, ray, perPixel, flat, middle}; places are in the viewer's axes, pixels are of CSS
 export function lensOf(viewer) {
   const { app } = viewer, canvas = app.graphicsDevice.canvas, entity = app.root.findComponent('camera').entity, { camera } = entity;
   const rig = viewer.cameraManager();
@@ -31,7 +31,7 @@ export function lensOf(viewer) {
   });
 
   const lens = {
-    canvas, basis, eye,
+    canvas, basis, eye, rig: entity.parent,
     get flat() { return flat; },
     set flat(now) {
       flat = now;

@@ -17,6 +17,7 @@ import { slicesOf } from './slices.mjs';
 import { element } from './svg.mjs';
 
 const LEFT = 12;  // px
+const AWAY = 2, UP = 1.3;  // m in a headset, to the middle of the body, whose longest edge is 2 m: away, and above the floor
 const icon = (path) => `<svg viewBox="0 0 18 18" aria-hidden="true"><path d="${path}"/></svg>`;
 const ICONS = {
   perspective: icon('M2 15L6 4h6l4 11Z'), orthographic: icon('M3.5 3.5h11v11h-11Z'), measure: icon('M2.5 12.5l10-10 3 3-10 10ZM6 9l1.5 1.5M9 6l1.5 1.5'),
@@ -113,6 +114,11 @@ export function where(viewer, scene, live, show) {
     viewer.events.on(`canStart${kind}:changed`, offer);
     offer();
   }
+  // in a headset the body stands before the eyes, not on the floor
+  app.xr?.on('start', () => {
+    const { target, yaw } = lens.pose(), away = AWAY * (scene.enlarged ?? 1), turn = (yaw * Math.PI) / 180;
+    lens.rig.setPosition(target[0] + away * Math.sin(turn), target[1] - UP, target[2] + away * Math.cos(turn));
+  });
   help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
   about.of(button('about', 'about this file', 'i', about.toggle));
   help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed, sliced: slices }));
