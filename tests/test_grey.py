@@ -186,7 +186,7 @@ def test_a_live_file_is_near_the_volume_in_memory_and_in_blocks(rule: str, least
     near = psnr(pictures[1][..., :3], pictures[0][..., :3])
     print(f"{rule}: {near:.2f} dB")
     assert near > least
-    assert np.abs(pictures[1] - pictures[2]).max() < 0.02
+    assert np.abs(pictures[1] - pictures[2]).max() < (0.005 if rule == "mip" else 0.02)
     assert (pictures[0][..., 3] == 1).all()
     assert pictures[1].std() > 0.05
 
