@@ -101,17 +101,17 @@ def test_the_folder_of_a_job_is_its_own(tmp_path: Path, monkeypatch: pytest.Monk
         path.mkdir()
         (path / "mine.txt").write_text("mine")
     with pytest.raises(RuntimeError, match="is not of vvgt"):
-        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None, command.Kept())
     assert (folder / "mine.txt").exists()
     (folder / "mine.txt").rename(folder / "look.json")  # of a job that was killed
-    job = paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+    job = paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None, command.Kept())
     assert job.words == []
     job.end()
     with pytest.raises(RuntimeError, match="No such file or directory"):
-        paraview_job.Job(str(tmp_path / "none" / "a.ply"), OPTIONS, None)
+        paraview_job.Job(str(tmp_path / "none" / "a.ply"), OPTIONS, None, command.Kept())
     monkeypatch.setattr(paraview_job, "look", lambda *_: 1 / 0)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None)
+        paraview_job.Job(str(tmp_path / "a.ply"), OPTIONS, None, command.Kept())
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply.parts"]
 
 

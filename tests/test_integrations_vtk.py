@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingVolumeOpenGL2  # noqa: F401  # registers what the classes below become
@@ -23,6 +25,7 @@ from vvgt_cli.integrations.vtk_scene import drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.function import SPACES
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.memory import volume_in_memory
 
@@ -253,3 +256,23 @@ def test_the_command_is_found_by_variable_and_path(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RuntimeError, match="not in PATH; install it"):
         command.run(["convert"])
+
+
+def test_a_kept_process_runs_commands_one_after_another(monkeypatch, capsys):
+    """Each with its own messages and error, also after the process was killed."""
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    kept = command.Kept()
+    kept.run(["--version"])
+    first = kept.process
+    with pytest.raises(RuntimeError, match=r"^no such file"):
+        kept.run(["info", "no such file"])
+    kept.run(["--version"])
+    assert first is not None
+    assert kept.process is first
+    first.kill()
+    first.wait()
+    kept.run(["--version"])
+    assert capsys.readouterr().out == 3 * f"vvgt {VERSION}\n"
+    kept.close()
+    assert first is not kept.process
+    assert kept.process.returncode == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import json
 import os
 import signal
 import sys
@@ -18,6 +19,7 @@ import click
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
+from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
 from vvgt_cli.version import VERSION
 
@@ -193,12 +195,26 @@ def _status(error: BaseException) -> int:
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
 
 
+def _several() -> int:
+    """Run commands, each a line of standard input (a JSON list of words); tell of the status of each.
+
+    For programs that run many (vvgt_cli/integrations/command.py), and are spared the start of each.
+    """
+    status = 0
+    for line in sys.stdin:
+        status = run(json.loads(line))
+        print(f"{ENDED}{status}", file=sys.stderr, flush=True)
+        if received:
+            break
+    return status
+
+
 def main() -> None:
     """Run the `vvgt` command and exit."""
     open_streams()
     end_on_signals()
     warnings.showwarning = _note
-    sys.exit(run())
+    sys.exit(_several() if sys.argv[1:] == ["--commands"] else run())
 
 
 if __name__ == "__main__":

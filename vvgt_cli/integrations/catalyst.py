@@ -23,7 +23,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
-    from vvgt_cli.integrations.command import tell
+    from vvgt_cli.integrations.command import Kept, tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
     sys.path.remove(ROOT)
@@ -45,7 +45,7 @@ def _settings() -> tuple[str, int, dict[str, Any]] | None:
     return name, every, {"Gaussians": count, "Steps": 0, "Live": 0, "Light": 0, "Function": function}
 
 
-SETTINGS = _settings()
+SETTINGS, VVGT = _settings(), Kept()
 
 
 def catalyst_execute(info: Any) -> None:
@@ -56,7 +56,7 @@ def catalyst_execute(info: Any) -> None:
     source = producer.SMProxy.GetClientSideObject()
     name, job = SETTINGS[0].format(info.timestep), None
     try:
-        job = Job(name, SETTINGS[2], source)
+        job = Job(name, SETTINGS[2], source, VVGT)
         job.save(source.GetOutputDataObject(0), info.time)
         job.convert()
     except (RuntimeError, OSError, ValueError, KeyError) as error:  # the simulation goes on

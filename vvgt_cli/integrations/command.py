@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 FOREIGN = ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH")  # of a program's own Python: ours does not start with them
 ERROR = "vvgt: error: "
+ENDED = "vvgt: ended: "  # a status, as vvgt_cli/cli/main.py says of each of several commands
 
 
 def command() -> list[str]:
@@ -37,18 +40,55 @@ def run(arguments: Sequence[str], say: Callable[[str], object] = print) -> None:
     Raises:
         RuntimeError: it is not found, or it failed: its error.
     """
+    with _start(arguments, subprocess.DEVNULL) as process:
+        _listen(process, say)
+
+
+class Kept:
+    """A process of ``vvgt`` that runs commands one after another, and so starts once; it ends with this one."""
+
+    def __init__(self) -> None:
+        """Start nothing yet."""
+        self.process: subprocess.Popen[str] | None = None
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Run a command as `run` does, in a new process where the last one has ended."""
+        if self.process is None or self.process.poll() is not None:
+            self.process = _start(["--commands"], subprocess.PIPE)
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):  # it has just ended: what it said follows
+            self.process.stdin.write(json.dumps(arguments) + "\n")
+            self.process.stdin.flush()
+        _listen(self.process, print)
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.communicate()
+
+
+def _start(arguments: Sequence[str], source: int) -> subprocess.Popen[str]:
     kept = {key: value for key, value in os.environ.items() if key not in FOREIGN}
-    with subprocess.Popen(
-        [*command(), *arguments], env=kept, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace",
-    ) as process:  # fmt: skip
-        last = ""
-        for line in process.stdout or ():
-            last = line.strip()
-            if not last.startswith(ERROR):
-                say(last)
-    if process.returncode:
-        raise RuntimeError(last.removeprefix(ERROR) or f"vvgt ended with status {process.returncode}")
+    return subprocess.Popen(
+        [*command(), *arguments], env=kept, stdin=source, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, encoding="utf-8", errors="replace",
+    )  # fmt: skip
+
+
+def _listen(process: subprocess.Popen[str], say: Callable[[str], object]) -> None:
+    """Pass messages on until the process ends, or its command, by a line `ENDED`; raise the error of either."""
+    last = ""
+    for line in process.stdout or ():
+        if line.startswith(ENDED):
+            status = int(line.removeprefix(ENDED))
+            break
+        last = line.strip()
+        if not last.startswith(ERROR):
+            say(last)
+    else:
+        status = process.wait()
+    if status:
+        raise RuntimeError(last.removeprefix(ERROR) or f"vvgt ended with status {status}")
 
 
 def tell(text: str, failed: bool = False) -> None:

@@ -12,7 +12,7 @@ import os
 import shutil
 from typing import Any
 
-from vvgt_cli.integrations.command import run, tell
+from vvgt_cli.integrations.command import Kept, tell
 from vvgt_cli.integrations.paraview_ranks import Ranks, failure
 from vvgt_cli.integrations.paraview_view import look
 from vvgt_cli.integrations.vtk_files import index_of, series_of, voxels_of, write
@@ -28,16 +28,17 @@ class Job:
         name: the file.
         options: of the plugin.
         source: vtkAlgorithm whose output is written, and whose look in the active view is taken.
+        vvgt: runs the commands.
 
     Raises:
         RuntimeError: this rank or another has failed; nothing is left behind.
     """
 
-    def __init__(self, name: str, options: dict[str, Any], source: Any) -> None:
+    def __init__(self, name: str, options: dict[str, Any], source: Any, vvgt: Kept) -> None:
         """Take the look, by the first rank for all."""
         from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
-        self.ranks = Ranks()
+        self.ranks, self.vvgt = Ranks(), vvgt
         self.count, self.rank, self.meet = self.ranks.count, self.ranks.rank, self.ranks.meet
         self.name, self.options, self.saved = os.path.abspath(name), options, list[tuple[str, float]]()
         above, base = os.path.split(self.name)
@@ -119,7 +120,7 @@ class Job:
         if len(self.saved) > 1:
             source, target = self._path("series.pvd"), self.name if ending.endswith("html") else name
             self.meet(failure(self._write, "series.pvd", series_of(self.saved)) if self.rank == 0 else "")
-        self.meet(failure(run, ["convert", source, "-o", target, *limits]) if self.rank == 0 else "")
+        self.meet(failure(self.vvgt.run, ["convert", source, "-o", target, *limits]) if self.rank == 0 else "")
 
     def _shares(self, path: str, words: list[str], target: str) -> None:
         """Compute this rank's share of the closed form, in passes that need each other's results; merge them."""
@@ -127,8 +128,8 @@ class Job:
         edge = 2 ** max(4, min(8, int(math.log2(self.voxels / (BLOCKS * self.count)) / 3)))
         share = ["--shard", f"{self.rank + 1}/{self.count}", "--blocks", str(edge), "--quiet"]
         for _ in range(2 if "--tf" in words else 3):
-            self.meet(failure(run, ["init", path, "-o", blocks, *words, *share]))
-        self.meet(failure(run, ["merge", blocks, "-o", target, "--overwrite"]) if self.rank == 0 else "")
+            self.meet(failure(self.vvgt.run, ["init", path, "-o", blocks, *words, *share]))
+        self.meet(failure(self.vvgt.run, ["merge", blocks, "-o", target, "--overwrite"]) if self.rank == 0 else "")
 
     def end(self) -> None:
         """Remove the folder that this job made."""

@@ -22,7 +22,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
-    from vvgt_cli.integrations.command import tell
+    from vvgt_cli.integrations.command import Kept, tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
     sys.path.remove(ROOT)
@@ -51,6 +51,7 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
         self.name, self.step = "", 0
         self.times: list[float] = []
         self.job: Job | None = None
+        self.vvgt = Kept()
 
     @smproperty.stringvector(name="FileName", panel_visibility="never")
     @smdomain.filelist()
@@ -129,7 +130,7 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
         try:
             if self.step == 0:
                 self.job = None
-                self.job = Job(self.name, self.options, self.GetInputAlgorithm(0, 0))
+                self.job = Job(self.name, self.options, self.GetInputAlgorithm(0, 0), self.vvgt)
             assert self.job is not None
             data = vtkDataObject.GetData(inputs[0].GetInformationObject(0))
             self.job.save(data, self.times[self.step] if self.times else 0.0)
@@ -144,4 +145,5 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
         self.step = 0
         if self.job is not None:
             self.job.end()
+        self.vvgt.close()
         return 1
