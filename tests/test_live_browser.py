@@ -194,3 +194,22 @@ def test_layers_are_changed_one_at_a_time(pair: Path, tmp_path: Path) -> None:
         shot = after(live, actions if window == DESK else [{"click": "#live .fold"}, *actions], tmp_path, window)
         print(f"{window}: the label of the third off: {psnr(wanted, shot):.2f} dB, not {psnr(own, shot):.2f}")
         assert psnr(wanted, shot) > max(32, psnr(own, shot) + 5)
+
+
+def test_mip_and_x_ray_are_those_of_the_command(tmp_path: Path) -> None:
+    """Chosen in the panel and by their key; undone, the look is back."""
+    live = tmp_path / "live.ply"
+    source = ["convert", "example:marschner-lobb:32", "--live", "--tf", "viridis", "--max-gaussians", "8000"]
+    assert run([*source, "--size", "300", "--quiet", "-o", str(live)]) == 0
+    whole = after(live, [], tmp_path)
+    for number, (name, rule) in enumerate((("MIP", "mip"), ("X-ray", "xray")), 1):
+        out = tmp_path / f"{rule}.png"
+        assert run(["render", str(live), "--rule", rule, "--size", str(SIZE), "--quiet", "-o", str(out)]) == 0
+        wanted = read_png(out)[..., :3]
+        chosen = after(live, [{"select": "#live .kind", "text": name}], tmp_path)
+        pressed = after(live, [{"key": "k"}] * number, tmp_path)
+        print(f"{name}: {psnr(wanted, chosen):.2f} dB")
+        assert psnr(wanted, chosen) > 40
+        assert psnr(chosen, pressed) > 60
+        assert psnr(whole, chosen) < 20
+    assert psnr(whole, after(live, [{"key": "k"}, {"key": "Control+z"}], tmp_path)) > 45

@@ -18,6 +18,7 @@ import pytest
 from tests.live_stream import from_bytes
 from tests.test_live import COLORS, GRAIN, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.conversion.grey import NO_GRAIN
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.live import BYTES, ROW
@@ -28,6 +29,7 @@ from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.live import Looks, Table, apply_look, baked
 from vvgt_cli.gaussians.live_facts import LABEL_ROW
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.tables import exposed_distance
 
 STEP = TransferFunction("step", PiecewiseOpacity(np.array([0.0, 20, 20, 60]), np.array([0.0, 0.1, 0.8, 0.3])), COLORS)
 LAB = TransferFunction("lab", RAMP.opacity_nodes, ColorMap(COLORS.x, COLORS.rgb, space="Lab"))
@@ -131,6 +133,26 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
     texels = np.fromfile(tmp_path / "texels", np.float32).reshape(2, *wanted.shape[1::-1], 4)
     np.testing.assert_allclose(texels[0], wanted[..., :4].transpose(1, 0, 2), atol=2e-4 * wanted[..., 3].max())
     np.testing.assert_allclose(texels[1, ..., :2], wanted[..., 4:].transpose(1, 0, 2), atol=2e-3 * wanted[..., 3].max())
+
+
+@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
+def test_the_pages_program_exposes_an_x_ray_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
+    if not shutil.which("node"):
+        pytest.skip("node is not on the path")
+    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
+    program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
+    (tmp_path / "run.mjs").write_text(
+        f"import {{ exposed, sumsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
+        f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n"
+        "const found = exposed(live.nodes, live);\n"
+        "fs.writeFileSync('sums', sumsOf(live.nodes, found));\nconsole.log(found.unit_distance);\n"
+    )
+    done = subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120, capture_output=True)
+    distance = exposed_distance(tf, facts(tf).statistics(), 2.0)
+    assert float(done.stdout) == pytest.approx(distance, rel=1e-6)
+    wanted = Table.of_function(tf, LO, HI, distance, NO_GRAIN * facts(tf).grain).sums
+    sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
+    np.testing.assert_allclose(sums[..., 3:], wanted[..., 3:], atol=2e-3 * wanted[..., 3].max())
 
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])

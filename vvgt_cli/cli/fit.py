@@ -38,10 +38,10 @@ fit_options = group(
 RULES = ("inria", "compensated", "spark", "playcanvas", "viser", "three", "babylon", "cesium")
 
 
-def rule_option(help: str, default: str | None = None) -> Callable[[Any], Any]:
-    """Return the option ``--rule``."""
+def rule_option(help: str, default: str | None = None, more: tuple[str, ...] = ()) -> Callable[[Any], Any]:
+    """Return the option ``--rule``, which takes the rules and the names of ``more``."""
     return click.option(
-        "--rule", type=click.Choice(RULES), default=default, show_default=default is not None, help=help
+        "--rule", type=click.Choice([*RULES, *more]), default=default, show_default=default is not None, help=help
     )
 
 

@@ -41,7 +41,11 @@ if TYPE_CHECKING:
 )
 @tf_options
 @light_options
-@rule_option("Viewer to imitate when drawing Gaussians. Default: the one recorded in the file, or inria.")
+@rule_option(
+    "Viewer to imitate when drawing Gaussians; mip and xray show the values of a volume or a live file in grey. "
+    "Default: the one recorded in the file, or inria.",
+    more=("mip", "xray"),
+)
 @placed_read_options
 @block_options
 @overwrite_option
@@ -68,7 +72,9 @@ def command(
     or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. The up axis is the one
     recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels: FOLDER#1
     is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown under any
-    function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name.
+    function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name. Of a volume of values,
+    and of its live .ply, --rule mip shows the greatest value along each ray, from black for the least value of the
+    volume to white for the greatest, and --rule xray the sum of extinction under the function, both opaque and unlit.
 
     Examples:
       vvgt render head.nrrd --tf ct-bone --size 800 -o head.png
@@ -91,8 +97,8 @@ def command(
             raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
         tf, tf_range, distance, labels, layers = optics.values()
         function = function_of(tf, tf_range, distance, labels, light, layers)
-    elif rule is not None:
-        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume: omit it")
+    elif rule not in (None, "mip", "xray"):
+        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray: omit it")
     else:
         given = source_request(file, read, optics, light)
     render_file(

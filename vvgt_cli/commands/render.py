@@ -14,8 +14,10 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.commands import render_values
 from vvgt_cli.commands.views_in_blocks import draw_in_blocks
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
+from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -28,14 +30,13 @@ from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.images.movies import RATE, SUFFIXES, movie_ready, write_movie
-from vvgt_cli.jit.ahead import DRAW, RAYCAST, for_blocks, for_degree
+from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
-Draw = Callable[[Camera], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class RenderRequest:
         camera: view-set file, or None.
         orbit: number of views on a circle around the up axis, or None; not both. A single picture needs neither.
         size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
-        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by; None: the file's.
+        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `vvgt_cli.conversion.grey.NAMES`, also for a
+            volume; None: the Gaussians' file's.
         exr: write EXR too.
         background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
         overwrite: replace images that exist.
@@ -122,6 +124,8 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     console = console or Console()
     run = Run(console, ConversionReport("render"))
     cameras = request.cameras()
+    if request.rule in NAMES and request.background is not None:
+        raise UsageError(f"--background: pictures of --rule {request.rule} are opaque; omit it")
     if request.movie and request.exr:
         raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
     if request.movie or request.single:
@@ -148,6 +152,13 @@ def _gaussians(run: Run, request: RenderRequest, name: str) -> tuple[Draw, list[
     """Return the renderer of Gaussians, the views in their file's orientation, and the name of the rule."""
     from vvgt_cli.splat import render
 
+    if request.rule in NAMES:
+        with run.stage("read") as stage:
+            gaussians, header = open_gaussians(name)
+            stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
+        draw = draw_gaussians(name, gaussians, header, request.rule, request.function)
+        run.compile(GREY)
+        return draw, request.cameras(header.made_for, header.up), request.rule
     with run.stage("read") as stage:
         seen, gaussians, header = _opened(request, name)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
@@ -164,17 +175,30 @@ def _volume(
 
     settings, options = RenderSettings(), request.blocks or automatic(asked, run.console)
     if options is not None:
-        needs = FieldNeeds(1, cameras[0].height)
+        needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
         found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
         source = _upright(found.source)
+        if request.rule == MIP:
+            run.compile(GREATEST, source.kernel_type())
+            return render_in_box(render_values.mip_of(found), source.volume.axes), "MIP in blocks"
+        if request.rule == XRAY:
+            found = found.with_look(render_values.as_xray(source))
+            source = found.source
         run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
-        return draw_in_blocks(found, settings, cameras), "ray casting in blocks"
+        draw = draw_in_blocks(found, settings, cameras)
+        return (render_values.absorbed(draw) if request.rule else draw), "ray casting in blocks"
     with run.stage("read") as stage:
         source = _upright(load(asked))
         stage.note = describe_source(source)
+    if request.rule == MIP:
+        run.compile(GREATEST, source.kernel_type())
+        return render_in_box(render_values.mip_of(source), source.volume.axes), "MIP"
+    if request.rule == XRAY:
+        source = render_values.as_xray(source)
     run.compile(source.kernels(RAYCAST), source.kernel_type())
     scene = source.scene()
-    return render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes), "ray casting"
+    draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
+    return (render_values.absorbed(draw) if request.rule else draw), "ray casting"
 
 
 def _upright(source: Source) -> Source:

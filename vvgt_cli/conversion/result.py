@@ -191,18 +191,22 @@ class Result:
         Args:
             camera: a camera in the unit frame; None: a test view from the side.
             size: pixels along the edge where no camera is given; None: the size that the Gaussians are made for.
-            rule: one of `vvgt_cli.gaussians.rules`; None: that of the Gaussians.
+            rule: one of `vvgt_cli.gaussians.rules`, or of a live result "mip" or "xray"; None: that of the Gaussians.
 
         Returns:
             (h, w, 4) float32, premultiplied RGBA.
 
         Raises:
             UsageError: the rule is unknown.
+            DataError: a MIP or X-ray of Gaussians without values.
         """
+        from vvgt_cli.conversion.grey import NAMES, draw_gaussians
         from vvgt_cli.splat import render
 
         if camera is None:
             camera = default_views("test", size=size or self.ply.made_for or SIZE)[FROM_THE_SIDE]
+        if rule in NAMES:
+            return draw_gaussians("result", self.gaussians, self.ply, rule)(camera)
         return render(self.gaussians, camera, rule_of(rule or self.ply.rule or INRIA))
 
 

@@ -35,7 +35,7 @@ from vvgt_cli.dvr.kernel import (
     texel_at,
     values_met,
 )
-from vvgt_cli.dvr.layout import LIT, LIT_GRID, Light, Optics, Texels, Voxels
+from vvgt_cli.dvr.layout import LIT, LIT_GRID, TUPLES, Light, Optics, Texels, Voxels
 from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, lane, zeros4
@@ -305,6 +305,31 @@ def _segments(
         _pixel_segments(
             voxels, optics, texels, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip
+
+
+@parallel_kernel("Voxels Optics f8:2 f8:1 f8:1 f8:2 f8:1 f8 f4:2", TUPLES, fastmath=FLAGS, error_model="numpy")
+def greatest(
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, faces: np.ndarray, begin: np.ndarray, eye: np.ndarray,
+    basis: np.ndarray, lens: np.ndarray, step: float, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Raise ``out`` (h, w) float32 to the greatest table coordinate that a block shows along each pixel's ray.
+
+    ``optics`` has one bin, so that coordinates are in [0, 1]; values are taken at the middles of the segments; other
+    arguments as of `_segments`.
+    """
+    run, p = stack_run(), (eye[0], eye[1], eye[2])
+    x, y, z = eye[0] - begin[0], eye[1] - begin[1], eye[2] - begin[2]
+    for row in iterations(thread, out.shape[0]):
+        for column in range(out.shape[1]):
+            (dx, dy, dz), t0, dt, i, last = _ray(faces, p, basis, lens, step, column + 0.5, row + 0.5)
+            most = out[row, column]
+            while i < last and most < 1.0:
+                t = t0 + (i + 0.5) * dt
+                sample_run(voxels, x + t * dx, y + t * dy, z + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
+                for n in range(min(RUN, last - i)):
+                    most = max(most, run[n])
+                i += RUN
+            out[row, column] = most
 
 
 VIEW, BLOCK = "f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3", "f8:2 f8:1 f8:1 f8:2 f8:1 f8 i8:2 f8:2 f4:3"

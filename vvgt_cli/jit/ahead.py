@@ -29,6 +29,8 @@ DRAW = (
     "vvgt_cli.splat.kernel:project",
     "vvgt_cli.splat.kernel:stable_order",
 )
+GREY = (*(name for name in DRAW if not name.endswith(":blend")), "vvgt_cli.splat.grey:accumulate")
+GREATEST = ("vvgt_cli.dvr.march:greatest",)
 CELLS = (
     MARCH,
     ADD_CELLS,
@@ -76,6 +78,8 @@ EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
 ALL = (
     *CONVERT,
+    *GREATEST,
+    GREY[-1],
     RENDER_LIT,
     *SHADE,
     *SHADOWS,

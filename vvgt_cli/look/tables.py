@@ -7,8 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import TransferFunctionLike
+from vvgt_cli.volume.stats import Statistics
 
+EXPOSED = 16  # values within a bin of the histogram
 MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536
 BESIDE = 4.0  # times the nodes' range that is tabulated on each side: a segment that enters it there begins outside
@@ -20,6 +23,27 @@ def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
     """Return ``tau = -ln(1 - a) / d``, a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
     result: np.ndarray = -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
     return result
+
+
+def exposed_distance(tf: TransferFunctionLike, statistics: Statistics, edge: float) -> float:
+    """Return the unit distance of an X-ray: a ray as long as ``edge`` through the volume's mean keeps 1/e.
+
+    So an X-ray depends neither on the function's unit distance nor on how opaque the whole of it is.
+
+    Args:
+        tf: function on data values.
+        statistics: of the volume.
+        edge: longest edge of its box; the result is in the same unit.
+
+    Raises:
+        DataError: the function shows nothing.
+    """
+    low, wide = statistics.edges[:-1, None], np.diff(statistics.edges)[:, None]
+    parts = (np.arange(EXPOSED) + 0.5) / EXPOSED
+    mean = extinction(tf.opacity(low + wide * parts), 1.0).mean(axis=1) @ statistics.histogram
+    if not mean > 0:
+        raise DataError("X-ray: the function is transparent at every value of the volume; try another function")
+    return float(edge * mean / statistics.histogram.sum())
 
 
 class Optics(NamedTuple):

@@ -12,6 +12,7 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
     ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['double click', 'turn about that place']] : []),
     ['arrow keys', 'turn; with Shift: move'], ['+ −', 'nearer, farther'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
+    ...(live?.next ? [['K', 'the look, MIP, X-ray']] : []),
     ...(live ? [['Ctrl+Z', 'undo']] : []),
     ...(sliced ? [['in a slice', 'drag for window (across) and level (up), click to move the cross, wheel or arrow keys to step']] : []),
     ...(values ? [['function', 'drag a node or use the arrow keys; double click adds one, Delete removes it. Drag beside the nodes, or Page Up and Down: shift the whole (across), widen it (up, or with Shift)']] : []),

@@ -8,6 +8,8 @@ uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the no
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
 uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
+uniform float vvgtKind;  // 0 the look, 1 MIP, 2 X-ray: see grey.mjs
+uniform vec2 vvgtSpread;  // widest spread of the table as a share of the range of values, and the bend of its columns
 vec4 vvgtColor, vvgtRotation, vvgtFace;  // vvgtFace: of what lies at a cut its direction, and how much of the light is that of the face
 vec3 vvgtScale;
 
@@ -94,19 +96,24 @@ void modifySplatCenter(inout vec3 center) {
     sums = mix(texelFetch(vvgtTable, ivec2(at, near), 0), texelFetch(vvgtTable, ivec2(at, near + 1), 0), f);
     z = mix(texelFetch(vvgtTable, ivec2(at, near + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, near + 1 + spreads), 0).xy, f);
   }
+  bool mip = vvgtKind == 1.0;
+  if (mip) {  // as it is, under any function
+    sums = vec4(1.0);
+    z = vec2(0.0, 1.0);
+  }
   float whole = max(sums.a, 1e-12), first = z.x / whole, variance = max(z.y / whole - first * first, 0.0);
   float tau = whole * clamp((vvgtOpaque.w - abs(first)) / (vvgtOpaque.w - vvgtOpaque.z), 0.0, 1.0);
   mat3 turn = quatToMat3(getRotation());
   vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;
   along /= max(length(along), 1e-30);
-  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), fog = exp(-tau * edge), r = min(length(gradient), 1.0), facing = r * r;
+  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), fog = mip ? 1.0 : exp(-tau * edge), r = min(length(gradient), 1.0), facing = r * r;
   float thin = sqrt(max(1.0 - facing * (1.0 - variance), vvgtFacts.z * vvgtFacts.z) * (1.0 - (1.0 - fog) * facing * (1.0 - vvgtOpaque.x)));
   mat3 axes = mat3(matrix_model) * mat3(turn[0] * scale.x, turn[1] * scale.y, turn[2] * scale.z);
   vec3 arm = axes * along;
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
-  vec3 place = center;
-  float mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
+  vec3 place = center, joint = axes * along;
+  float stays = vvgtCutAll(center, axes), mass = tau * edge * edge * edge * stays;
   vec3 color = vvgtLit(sums.rgb / whole, mat3(matrix_model) * ((vec3(loadVvgtAxis().xyz) - 128.0) / 127.0), place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
@@ -120,6 +127,16 @@ void modifySplatCenter(inout vec3 center) {
   float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
   vec3 squares = vvgtScale * vvgtScale * (1.0 - (1.0 - fog) * (1.0 - vvgtOpaque.x) * (1.0 - facing) * vec3(lessThanEqual(vvgtScale, vec3(shortest))));
   vvgtScale = sqrt(squares);
+  if (mip) {  // the value, and how it changes along the Gaussian's own axes
+    float spread = r * vvgtSpread.x * pow(float(a.y) / 255.0, vvgtSpread.y);
+    vvgtColor = vec4(2.0 + 8.0 * spread * (joint * unit) / vvgtScale, stays > 0.0 ? float(at) / 255.0 : 0.0);
+    return;
+  }
+  if (vvgtKind == 2.0) {  // the logarithm of its mass
+    vvgtColor = vec4(log2(max(whole * edge * edge * edge * stays, 1e-15)) / 12.0 + 4.0, 0.0, 0.0, stays > 0.0 ? 1.0 : 0.0);
+    vvgtScale = sqrt(squares);
+    return;
+  }
   vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }
 void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {

@@ -1,9 +1,10 @@
 // Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
 import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, PROJECTION_ORTHOGRAPHIC, Texture } from 'playcanvas';
 import { Damaged } from './damage.mjs';
+import { drawn } from './grey.mjs';
 import { layersOf } from './live_at.mjs';
 import modifier from './live.glsl';
-import { sumsOf, texelsOf } from './live_table.mjs';
+import { exposed, sumsOf, texelsOf } from './live_table.mjs';
 
 const STREAMS = [['vvgtValues', [0, 1, 2, 9]], ['vvgtGradient', [3, 4, 5, 10]], ['vvgtAxis', [6, 7, 8]]];  // and the planes of each one's r, g, b and a
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
@@ -41,7 +42,7 @@ export async function liveLook({ app }, live) {
   const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads * layers.length, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: layers.reduce((sum, layer) => sum + Math.max(layer.labels.length, 1), 0), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const [first, last] = live.log_lengths;
-  let again = 0, shown;
+  let again = 0, shown, kind = 0;
   const set = (name, value) => {
     gsplat.setParameter(name, value);
     app.renderNextFrame = true;
@@ -66,17 +67,28 @@ export async function liveLook({ app }, live) {
     if (!again || !ready || loading) return;
     gsplat.setParameter('vvgtTable', table);
     gsplat.setParameter('vvgtLabels', labels);
+    drawn(app, kind);
     app.renderNextFrame = true;
     if (!--again) shown();
   });
+  function tabulate(k) {
+    table.lock().set(texelsOf(kind === 2 ? sumsOf(look.nodes[k], exposed(look.nodes[k], layers[k])) : look.sums[k], live.table), k * means * 2 * spreads * 4);
+    table.unlock();
+    set('vvgtTable', table);
+  }
   const look = {
-    live, layers, bytes, count, sums: [], rows: [], planes: [],  // what a place is found and read by
+    live, layers, bytes, count, nodes: [], sums: [], rows: [], planes: [],  // what a place is found and read by
     // the function of a layer
     apply(nodes, k) {
+      look.nodes[k] = nodes;
       look.sums[k] = sumsOf(nodes, layers[k]);
-      table.lock().set(texelsOf(look.sums[k], live.table), k * means * 2 * spreads * 4);
-      table.unlock();
-      set('vvgtTable', table);
+      tabulate(k);
+    },
+    // one of `KINDS`, of one layer of values
+    draw(number) {
+      kind = number;
+      tabulate(0);
+      set('vvgtKind', kind);
     },
     // what each label of a layer looks like: [{rgb, opacity}], in the order of the file
     labels(list, k) {
@@ -111,6 +123,8 @@ export async function liveLook({ app }, live) {
   };
   look.light(live.light);
   gsplat.setParameter('vvgtOpaque', [live.sharp, live.dilation, ...live.tail]);
+  gsplat.setParameter('vvgtSpread', [live.widest, live.bend]);
+  gsplat.setParameter('vvgtKind', kind);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut([]);
   layers.forEach((layer, k) => {

@@ -1,6 +1,6 @@
 // A transfer function and its means over normal laws of values, as vvgt_cli/gaussians/live.py has them (its float64 twin).
 const FINE = 1 << 14;  // values over the range that a function is tabulated at
-const MAX_OPACITY = 1 - 1e-5, MOST_COVERED = 1 - 1e-6;
+const MAX_OPACITY = 1 - 1e-5, MOST_COVERED = 1 - 1e-6, PARTS = 16, NO_GRAIN = 1e-6;
 
 // Opacity and colour at x of nodes {x, y, rgb} in ascending order: at an x of several nodes the last one's opacity and the
 // first one's colour, as in VTK.
@@ -60,6 +60,17 @@ export function sumsOf(nodes, live) {
     }
   }
   return sums;
+}
+
+// A layer as the table of its X-ray is made (exposed_distance of look/tables.py): a ray as long as the box through the volume's mean keeps 1/e
+export function exposed(nodes, layer) {
+  const [lo, hi] = layer.values, { histogram } = layer, step = (hi - lo) / histogram.length;
+  let sum = 0, all = 0;
+  histogram.forEach((count, k) => {
+    all += count;
+    for (let n = 0; count && n < PARTS; n++) sum -= (count / PARTS) * Math.log1p(-Math.min(Math.max(functionAt(nodes, lo + step * (k + (n + 0.5) / PARTS)).y, 0), MAX_OPACITY));
+  });
+  return { ...layer, grain: layer.grain * NO_GRAIN, unit_distance: (2 * sum) / all || layer.unit_distance };
 }
 
 // The same as a texture of RGBA32F, means wide: rows of r, g, b and extinction, then as many of z and z^2

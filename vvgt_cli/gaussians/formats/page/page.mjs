@@ -3,6 +3,7 @@
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { Damaged, unlessFailing, wholePly } from './damage.mjs';
+import { teach } from './grey.mjs';
 import { liveLook } from './live.mjs';
 import { panel, named } from './panel.mjs';
 import { patched } from './patch.mjs';
@@ -48,7 +49,8 @@ function draw(app, { dilation, shifted }) {
     if (!text.includes(old)) throw new Error(`${name} of the engine is another one`);
     chunks.set(name, text.replaceAll(old, now));
   };
-  change('gsplatCornerVS', '+ 0.3', `+ ${(4 * dilation).toFixed(6)}`);
+  teach(app, change);
+  change('gsplatCornerVS', '+ 0.3', `+ (vvgtKind > 0.5 ? 0.3 : ${(4 * dilation).toFixed(6)})`);
   if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
 }
 

@@ -1,11 +1,12 @@
 // The panel of a live page: of each layer its function or the list of its labels; a cut, a light; what undo goes back to.
 import { cutOf } from './cut.mjs';
 import { editor } from './editor.mjs';
+import { KINDS } from './grey.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
 
 const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
-<output></output><select class="layer" aria-label="layer" title="layer"></select>`;
+<output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="drawn as" title="drawn as (k)"></select>`;
 const STEPS = 200;  // that undo goes back
 
 // the file's name and what kind it is
@@ -73,6 +74,23 @@ export function panel(look, viewer, live) {
   list.hidden = layers.length < 2;
   list.addEventListener('change', () => choose(list.selectedIndex));
 
+  // the look, MIP or X-ray: of one layer of values
+  const kinds = find('.kind'), values = layers.length === 1 && layers[0].nodes;
+  let drawn = 0;
+  function draw(k) {
+    drawn = kinds.selectedIndex = k;
+    look.draw(k);
+    told(true);
+  }
+  function drawAs(k) {
+    history.keep();
+    draw(k);
+  }
+  kinds.append(...KINDS.map((name) => new Option(name)));
+  kinds.hidden = !values;
+  kinds.addEventListener('change', () => drawAs(kinds.selectedIndex));
+  if (values) history.add({ key: 'drawn', state: () => drawn, set: draw, text: () => (drawn ? KINDS[drawn] : ''), read: (text) => Math.max(KINDS.indexOf(text), 0) });
+
   const fold = (folded) => {
     root.classList.toggle('folded', folded);
     find('.fold').textContent = folded ? '▸' : '▾';
@@ -92,7 +110,8 @@ export function panel(look, viewer, live) {
   choose(0);
   return {
     root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
-    alone: () => cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
+    drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
+    alone: () => drawn > 0 || cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };
 }

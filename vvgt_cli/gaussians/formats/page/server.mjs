@@ -84,7 +84,7 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file;
+// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut, another light, MIP or X-ray, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file;
 // converted: {file, contents, said} of the conversion under the file's own function, in a page in a file. Resolves once that is shown.
 export async function served(panel, viewer, server, converted) {
   const { root, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;

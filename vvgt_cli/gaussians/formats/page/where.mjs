@@ -128,7 +128,7 @@ export function where(viewer, scene, live, show) {
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
   const act = Object.fromEntries(buttons.filter(({ key }) => key).map(({ key, press }) => [key, press]));
-  listen(lens, { ...act, '?': help.toggle }, () => { poor.close(); ruler.measure(false); }, again);
+  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle }, () => { poor.close(); ruler.measure(false); }, again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
   addEventListener('hashchange', () => restore(parts).then(again));
@@ -138,7 +138,8 @@ export function where(viewer, scene, live, show) {
     const place = { right: (low > high - 182 ? Math.min(...boxes.map((one) => one.left || wide)) : wide) - 12, bottom: high - 24 };
     if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
     if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
-    const { layer, nodes } = live?.at() ?? {};
+    const { layer, nodes } = live?.at() ?? {}, drawn = live?.drawn();
+    if (drawn) return drawn === 1 ? drawLegend(group, { nodes: layer.values.map((x, k) => ({ x, y: 1, rgb: [k, k, k] })), live: layer, ...place }) : null;
     return nodes ? drawLegend(group, { nodes: nodes(), live: layer, ...place }) : null;
   }
 
@@ -176,7 +177,7 @@ export function where(viewer, scene, live, show) {
     if (live) slices?.follow(live.look.rows);
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
-    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.cut.state()]);
+    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.drawn(), live?.cut.state()]);
     if (said === drawn) return;
     drawn = said;
     draw();
