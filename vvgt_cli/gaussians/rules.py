@@ -83,6 +83,8 @@ RULES = {
     )
 }
 
+VIEWERS = ("inria", "compensated", "spark", "playcanvas", "viser")  # of programs made for splats
+
 
 def rule_of(rule: str | Rule) -> Rule:
     """Return a rule by its name.

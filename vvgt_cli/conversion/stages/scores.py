@@ -10,6 +10,7 @@ from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload
+from vvgt_cli.gaussians.rules import VIEWERS
 from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
@@ -120,7 +121,7 @@ class ViewingConditions(Stage):
                 view for place, enough in _places(fit.size)
                 for view in condition_views(work.field.views, [place], settings, views=SIDE, enough=enough)
             )  # fmt: skip
-            conditions = score_conditions(made, seen)
+            conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)))
             run.report.conditions = [asdict(condition) for condition in conditions]
             near, views = texture_cameras(fit.size), work.field.views
             run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))
