@@ -277,11 +277,7 @@ def convert_files(
     for one in [*kinds, *([ONE_FILE] if together else [])]:
         check_options(one, used)
     if is_streamed(output):
-        from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
-
-        request = replace(request, blocks=request.blocks or automatic(request.source, console))
-        if writes_streaming(request):
-            convert_in_batches(request, console)
+        _convert_levels(request, console)
         return None
     if dry_run:
         return plan_conversion(request, console).text()
@@ -304,6 +300,15 @@ def convert_files(
     else:
         _run(batch, Files(request, share), console)
     return None
+
+
+def _convert_levels(request: ConvertRequest, console: Console) -> None:
+    """Convert a volume to streamed levels."""
+    from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
+
+    request = replace(request, blocks=request.blocks or automatic(request.source, console))
+    if writes_streaming(request):
+        convert_in_batches(request, console)
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
