@@ -258,6 +258,24 @@ def test_the_command_is_found_by_variable_and_path(monkeypatch, tmp_path):
         command.run(["convert"])
 
 
+def test_a_kept_process_reads_a_file_again_and_ends_where_a_message_is_not_taken(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    kept, file = command.Kept(), tmp_path / "a.npy"
+    for size in (24, 36):
+        np.save(file, np.full((size, size, size), size, np.float32) * np.linspace(0, 1, size, dtype=np.float32))
+        more = ["--max-gaussians", "50", "--overwrite", "-o", f"{tmp_path}/a.ply"]
+        kept.run(["init", str(file), "--blocks", "16", *more])
+    assert "values 0 to 36" in capsys.readouterr().out
+    monkeypatch.setattr("builtins.print", lambda line: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        kept.run(["--version"])
+    monkeypatch.undo()
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    with pytest.raises(RuntimeError, match=r"^no such file"):  # not the status of the one before
+        kept.run(["info", "no such file"])
+    kept.close()
+
+
 def test_a_kept_process_runs_commands_one_after_another(monkeypatch, capsys):
     """Each with its own messages and error, also after the process was killed."""
     monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")

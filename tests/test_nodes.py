@@ -171,6 +171,30 @@ def test_layers_are_nodes_in_one_frame(vvgt, atlas) -> None:
     assert vvgt(*line, "-o", "both.html").code == 0
 
 
+def test_layers_of_one_name_stay_apart_and_units_must_agree(vvgt, atlas) -> None:
+    (atlas / "more").mkdir()
+    (atlas / "more/aseg.nii").write_bytes((atlas / "aseg.nii").read_bytes())
+    line = ("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "-o", "both.glb", "--overwrite")
+    done = vvgt(*line, "--layer", "more/aseg.nii,labels=lut.txt")
+    assert done.code == 0, done.err
+    groups = [above[1] for above, _ in tree(atlas / "both.glb").values()]
+    assert sorted(set(groups)) == ["aseg", "aseg 2"]
+    assert len(groups) == 2 * len(CENTRES)  # no name twice
+    np.save("plain_label.npy", np.eye(28, dtype=np.uint8)[None].repeat(28, 0))
+    refused = vvgt(*line, "--layer", "plain_label.npy,labels=auto")
+    assert refused.code == 1
+    assert "plain_label: its lengths are in no stated unit, those of aseg in mm" in refused.error
+
+
+def test_a_label_without_a_name_is_no_root(vvgt, atlas) -> None:
+    table = {"17": {"name": "", "color": [1, 0, 0]}, "53": {"name": "b", "color": [0, 1, 0]}}
+    table |= {number: {"name": number, "color": [0, 0, 1]} for number in ("16", "1028")}
+    (atlas / "t.json").write_text(json.dumps(table))
+    done = vvgt("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", "a.glb")
+    assert done.code == 0, done.err
+    assert {"label 17", "b"} <= set(tree(atlas / "a.glb"))
+
+
 def test_functions_are_nodes_without_paths(vvgt, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     ball = np.exp(-4 * (np.stack(np.meshgrid(*[np.linspace(-1, 1, 16)] * 3)) ** 2).sum(axis=0)).astype(np.float32)

@@ -217,6 +217,18 @@ def test_a_page_within_its_size_has_coarser_slices_before_fewer_gaussians(vvgt, 
     assert (least.code, "no Gaussian fits; expected 0.98" in least.error) == (2, True)
 
 
+def test_a_lit_page_within_its_size_counts_its_harmonics(vvgt, tmp_path):
+    grid = np.linspace(-1, 1, 48)
+    ball = np.sin(20 * np.sqrt(sum(np.square(np.meshgrid(grid, grid, grid)))))
+    np.save(tmp_path / "ball.npy", ball.astype(np.float32))
+    page, how = tmp_path / "page.html", ("--steps", "0", "--size", "64", "--light", "headlight", "--max-size", "1.5MB")
+    done = vvgt("convert", tmp_path / "ball.npy", *how, "-o", page)
+    assert done.code == 0, done.err
+    assert page.stat().st_size <= 1.5e6
+    counts = {int(count.replace(",", "")) for count in re.findall(r"([\d,]+) Gaussians", done.err)}
+    assert max(counts) < 1.1 * min(counts)  # the live form has no more of them
+
+
 def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan):
     page, layer = scan / "both.html", ("--layer", f"{scan / 'labels.nii.gz'},labels=auto")
     done = vvgt("convert", scan / "scan.nii.gz", *layer, "--live", "-o", page, *HOW[:4])

@@ -243,5 +243,5 @@ def test_damaged_slices_are_said_to_be(marked: str, person: Person, tmp_path: Pa
     cut = re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text)
     (tmp_path / "cut.html").write_text(cut, "utf-8")
     opened(person, (tmp_path / "cut.html").as_uri())
-    assert person("eval", SAID).startswith("The slices are damaged")
+    assert person("eval", SAID).startswith("The slices cannot be shown")
     assert person("eval", "window.vvgt.where.link()").count("slices=") == 0

@@ -95,10 +95,10 @@ def test_lone_splats_are_drawn_by_the_rule(viewer: str, tmp_path: Path) -> None:
     scores = {name: psnr(lone_picture(gaussians, camera, name), shot) for name in RULES}
     away = abs(formula - shot).max(axis=2)
     print(f"{viewer}: {scores}, ours {psnr(ours, shot):.2f}, largest difference {away.max() * 255:.2f}/255")
-    assert (
-        away.max() < np.exp(-RULES[RULE[viewer]].reach) + 1 / 255
-    )  # a pixel at a splat's reach, met from the other side
-    assert (away > 2 / 255).mean() < 1e-3  # everywhere else 8 bits a channel, and half floats
+    reach = RULES[RULE[viewer]].reach  # a pixel there may be met from the other side
+    assert away.max() < np.exp(-reach) + 1 / 255
+    most = 1e-3 if viewer in ("three", "babylon") else 1e-4  # of half floats, and of 8 bits a channel
+    assert (away > 2 / 255).mean() < most
     assert psnr(ours, shot) > 55
     assert psnr(ours, formula) > 65
     assert all(score < scores[RULE[viewer]] - 6 for name, score in scores.items() if name != RULE[viewer])

@@ -29,6 +29,8 @@ await page.goto(job.url);
 await page.waitForFunction('window.vvgt !== undefined');
 const pose = () => page.evaluate(() => { const { x, y, z } = vvgt.viewer.app.root.findComponent('camera').entity.getPosition(); return [x, y, z]; });
 await page.waitForTimeout(3000);
+await page.evaluate(() => { const { lens } = vvgt.where; lens.set({ ...lens.pose(), yaw: 150 }); });
+await page.waitForTimeout(1000);
 const before = await pose();
 const offered = await page.evaluate(() => [...document.querySelectorAll('#tools .xr:not([hidden])')].map((button) => button.textContent));
 await page.locator('#tools .xr', { hasText: 'VR' }).click();

@@ -203,6 +203,8 @@ def _several() -> int:
     status = 0
     for line in sys.stdin:
         status = run(json.loads(line))
+        if reader := sys.modules.get("vvgt_cli.field.reader"):
+            reader.forget()  # files may be written again before the next command
         print(f"{ENDED}{status}", file=sys.stderr, flush=True)
         if received:
             break

@@ -98,7 +98,7 @@ def command(
         tf, tf_range, distance, labels, layers = optics.values()
         function = function_of(tf, tf_range, distance, labels, light, layers)
     elif rule not in (None, "mip", "xray"):
-        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray: omit it")
+        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
     else:
         given = source_request(file, read, optics, light)
     render_file(

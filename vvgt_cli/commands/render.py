@@ -186,7 +186,7 @@ def _volume(
             source = found.source
         run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
         draw = draw_in_blocks(found, settings, cameras)
-        return (render_values.absorbed(draw) if request.rule else draw), "ray casting in blocks"
+        return (render_values.absorbed(draw), "X-ray in blocks") if request.rule else (draw, "ray casting in blocks")
     with run.stage("read") as stage:
         source = _upright(load(asked))
         stage.note = describe_source(source)
@@ -198,7 +198,7 @@ def _volume(
     run.compile(source.kernels(RAYCAST), source.kernel_type())
     scene = source.scene()
     draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    return (render_values.absorbed(draw) if request.rule else draw), "ray casting"
+    return (render_values.absorbed(draw), "X-ray") if request.rule else (draw, "ray casting")
 
 
 def _upright(source: Source) -> Source:

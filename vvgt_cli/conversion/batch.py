@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ONE, LIVE, LEVELS, ONE_FILE = "one volume", "--live", "streamed levels", "one file of several clouds"
 LAYERS = "labels of layers"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
-WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
+WHOLE = "the limit is for one cloud, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
     ONE: {"--shard": "one volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
     FRAMES: {

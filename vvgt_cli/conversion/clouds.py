@@ -120,6 +120,8 @@ class Clouds(Mapping[str, Result]):
         known = format_of(name)
         if not is_pattern(name) and known and known.write_nodes and self.kind != FRAMES:
             check_outputs([Output("save", name, SUFFIXES, splats=True)], [], overwrite)
+            if odd := sorted(set(how) - {"frame", "up", "sh_degree", "comments"}):
+                raise UsageError(f"{name}: {', '.join(odd)}: not for one file of several clouds")
             content = known.write_nodes(self.nodes(**how), name)
             with atomic_write(name, overwrite) as temporary:
                 return temporary.write_bytes(content)

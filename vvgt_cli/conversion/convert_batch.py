@@ -59,7 +59,8 @@ if TYPE_CHECKING:
 WHOLE_RUN = Shard()
 PLACE = ("scale", "centre", "affine", "space", "length_unit", "up")  # facts of a file's place in the world
 SORTED = (
-    "{}: programs that sort Gaussians node by node (three.js, Babylon) show what a node encloses on top or not at all"
+    "{}: programs that sort Gaussians node by node (three.js, Babylon.js: a .glb) show what a node encloses on top, "
+    "or not at all"
 )
 UNKNOWN = "0"  # stem of labels that are not read yet: not that of the index
 

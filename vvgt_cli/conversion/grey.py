@@ -42,7 +42,7 @@ def draw_gaussians(
     if facts is None or facts.others or facts.labels:
         what = "carry no values" if facts is None else "carry labels" if facts.labels else "are of several layers"
         raise DataError(
-            f"{name}: --rule {rule}: its Gaussians {what}; expected a file that 'vvgt convert --live' makes of one "
+            f"{name}: --rule {rule}: its Gaussians {what}; expected a .ply that 'vvgt convert --live' makes of one "
             "volume of values"
         )
     if rule == MIP:

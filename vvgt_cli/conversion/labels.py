@@ -7,6 +7,7 @@ hide are also converted alone, and their hidden Gaussians added; so are labels t
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from vvgt_cli.conversion.convert import fit_gaussians, open_field
 from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import NothingVisible
+from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.layered import AUTO, IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
@@ -32,6 +33,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
+from vvgt_cli.volume.space import metres
 
 LONGEST = 80  # characters of a label's name in a file name
 
@@ -89,10 +91,15 @@ class Labels(Batch):
             sources = [replace(source, layers=()), *(replace(one, light=source.light) for one in source.layers)]
             budget = max(request.fit.max_gaussians // len(sources), 1)
             tables: list[str] = []
+            firsts: list[Volume] = []
+            names: list[str] = []
             for one in sources:
                 own = replace(request, source=one, fit=replace(request.fit, max_gaussians=budget))
                 content = _content(one, request.blocks is not None)
-                self._layers.append((own, _parts(own, content, len(sources) > 1, tables)))
+                firsts.append(content.volumes[0])
+                check_lengths(firsts[0], firsts[-1])
+                names.append(unused(content.volumes[0].name, names))
+                self._layers.append((own, _parts(own, content, names[-1] if len(sources) > 1 else "", tables)))
                 self.volume = self.volume or content.volumes[0].name
             self.facts = {"table": " + ".join(tables)}
             found = [part for _, parts in self._layers for part in parts]
@@ -101,7 +108,8 @@ class Labels(Batch):
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item with its Gaussians for each label, and for each layer without labels."""
-        names = [part.name for _, parts in self._layers for part in parts]
+        names: list[str] = [part.name for _, parts in self._layers for part in parts]
+        used: list[str] = []
         for request, parts in self._layers:
             for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
                 if gaussians is None:
@@ -109,7 +117,27 @@ class Labels(Batch):
                     continue
                 run.console.message(f"{part.text()}: {len(gaussians)} Gaussians")
                 name = part.name if names.count(part.name) == 1 else part.stem
-                yield Item(name, part.stem, part.request, part.facts, gaussians)
+                used.append(unused(name, used))
+                yield Item(used[-1], part.stem, part.request, part.facts, gaussians)
+
+
+def unused(name: str, used: Sequence[str]) -> str:
+    """Return a name that is not used yet, with a number from 2 on where it is."""
+    return next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name} {k}") not in used)
+
+
+def check_lengths(first: Volume, other: Volume) -> None:
+    """Refuse a layer whose lengths are in another unit than the first volume's, or in one that is not known.
+
+    Raises:
+        DataError: names both units.
+    """
+    own, its = ("mm" if volume.space else volume.unit for volume in (first, other))
+    if metres(own) != metres(its):
+        raise DataError(
+            f"{other.name}: its lengths are in {its or 'no stated unit'}, those of {first.name} in "
+            f"{own or 'no stated unit'}; expected one unit: write files with places in mm, or convert them apart"
+        )
 
 
 def _content(source: SourceRequest, stored: bool) -> Content:
@@ -120,41 +148,41 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     return open_content(source.path, read)
 
 
-def _parts(request: ConvertRequest, content: Content, layered: bool, tables: list[str]) -> list[Part]:
-    """Return the labels of a map, or a layer as a whole if it is none; the names of tables are added to ``tables``.
+def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[Part]:
+    """Return the labels of a map, or a ``layer`` as a whole if it is none; the names of tables are added to ``tables``.
 
     Raises:
         DataError: see `convert`; of a single map, no label is visible.
     """
     source = request.source
-    labels = source.labels or (None if layered else AUTO)
+    labels = source.labels or (None if layer else AUTO)
     if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
-        name = content.volumes[0].name
+        name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
         return [Part(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
     maps = layers_of(content, None, labels, distance=source.unit_distance)
-    tables += [layer.tf.name for layer in maps]
-    if not layered:
-        check_labels([layer.tf for layer in maps])
+    tables += [one.tf.name for one in maps]
+    if not layer:
+        check_labels([one.tf for one in maps])
     shown = []
-    for layer in maps:
-        extents = extents_of(layer.volume)
-        for label in layer.tf.labels if isinstance(layer.tf, LabelTable) else ():
+    for whole_map in maps:
+        extents = extents_of(whole_map.volume)
+        for label in whole_map.tf.labels if isinstance(whole_map.tf, LabelTable) else ():
             extent = extents.get(float(label.number))
             if label.shown_opacity > 0 and extent is not None:
-                shown.append((layer, label, extent))
+                shown.append((whole_map, label, extent))
     numbers = [label.number for _, label, _ in shown]
     found: list[Part] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
-    for (layer, label, extent), share in zip(shown, divided, strict=True):
-        volume, table = layer.volume, layer.tf
+    for (whole_map, label, extent), share in zip(shown, divided, strict=True):
+        volume, table = whole_map.volume, whole_map.tf
         assert isinstance(table, LabelTable)
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
         again = numbers.count(label.number) > 1  # of segments that overlap
         stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
         facts = label.facts() | extent.measures(volume)
-        if layered:
-            facts["parents"] = (content.volumes[0].name, *label.parents)
+        if layer:
+            facts["parents"] = (layer, *label.parents)
         one = replace(request, source=alone, fit=replace(request.fit, max_gaussians=share))
         found.append(MapLabel(label.name, stem, one, facts, volume, table, label))
     return found
@@ -175,8 +203,9 @@ def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list
     """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
     labels = [part for part in parts if isinstance(part, MapLabel)]
-    if len(labels) < 2 or len({id(label.volume) for label in labels}) > 1:
-        return [_alone(part, console) for part in parts]  # a Gaussian would mix colours of overlapping segments
+    overlapping = len({id(label.volume) for label in labels}) > 1  # a Gaussian would mix their colours
+    if len(labels) < 2 or overlapping or not any(label.label.opacity for label in labels):
+        return [_alone(part, console) for part in parts]
     whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions((NONE,))))
     with open_field(run, plain) as field, run.stage("hidden"):

@@ -15,6 +15,7 @@ import numpy as np
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.certify import with_certificate
+from vvgt_cli.conversion.file_layout import degree_of
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.live_labels import label_facts, label_fog_field, live_labels, with_labels
 from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
@@ -55,7 +56,7 @@ def check_live(request: ConvertRequest) -> None:
     given = {
         "--target-psnr": limits.target_psnr is not None,
         "--time-budget": limits.time_budget is not None,
-        "--max-size without -o OUT.html": limits.max_megabytes is not None and not is_page(request.output),
+        "--max-size (or write a page, -o OUT.html)": limits.max_megabytes is not None and not is_page(request.output),
         "--steps": fit.steps is not None,
         "--model": fit.model is not None,
         "--init": fit.init != "vbm",
@@ -85,7 +86,7 @@ def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions
     None, with a message, if the volume has no live form or the run a time limit.
     """
     source = field.source
-    fit = FitOptions(request.budget(), request.fit.size, rule=request.fit.rule)
+    fit = FitOptions(request.budget(degree_of(request, source)), request.fit.size, rule=request.fit.rule)
     plain = ConvertRequest(request.source, fit=fit, ply=replace(request.ply, sh_degree=None), live=True)
     why = "--time-budget" if request.limits.time_budget is not None else live_refusal(plain, source)
     try:

@@ -237,9 +237,8 @@ class Conversion(Result):
             with run.stage("slices") as stage:
                 room = None if limit is None else limit - self._page_bytes(form)
                 found = self._made[name] = self.field.source.slices(room)
-                why = (
-                    "the volume has colours" if limit is None else "the volume has colours, or --max-size is too small"
-                )
+                colours = all(layer.colors for layer in self.field.source.layers)
+                why = "the volume has colours" if colours else f"--max-size leaves {max(room or 0, 0) / 1e6:.2f} MB"
                 stage.note = str(found or f"none: {why}")
         if form is not None:
             form = form[0], replace(form[1], certificate=self.ply.certificate)

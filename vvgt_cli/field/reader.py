@@ -47,6 +47,11 @@ def _opened(source: str, read: ReadOptions) -> Content:
     return open_content(source, read)
 
 
+def forget() -> None:
+    """Close the volumes that this process has opened, as their files may be written again."""
+    _opened.cache_clear()
+
+
 @dataclass(frozen=True)
 class Box:
     """A box of voxels in the layout of the kernels.

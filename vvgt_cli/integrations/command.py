@@ -59,7 +59,13 @@ class Kept:
         with suppress(BrokenPipeError):  # it has just ended: what it said follows
             self.process.stdin.write(json.dumps(arguments) + "\n")
             self.process.stdin.flush()
-        _listen(self.process, print)
+        try:
+            _listen(self.process, print)
+        except BaseException as error:
+            if not isinstance(error, RuntimeError):  # what is not read would be taken for the next command's
+                self.process.kill()
+                self.process.wait()
+            raise
 
     def close(self) -> None:
         """End the process."""
@@ -79,14 +85,15 @@ def _listen(process: subprocess.Popen[str], say: Callable[[str], object]) -> Non
     """Pass messages on until the process ends, or its command, by a line `ENDED`; raise the error of either."""
     last = ""
     for line in process.stdout or ():
-        if line.startswith(ENDED):
-            status = int(line.removeprefix(ENDED))
+        said, ended, number = line.rpartition(ENDED)
+        last = (said if ended else line).strip() or last
+        if ended:
+            status = int(number)
             break
-        last = line.strip()
         if not last.startswith(ERROR):
             say(last)
     else:
-        status = process.wait()
+        status = process.wait() or int(process.stdin is not None)  # a kept one ends by itself when something is wrong
     if status:
         raise RuntimeError(last.removeprefix(ERROR) or f"vvgt ended with status {status}")
 

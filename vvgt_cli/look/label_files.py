@@ -303,6 +303,7 @@ def _label(
         raise DataError(f"{what}: label {value}; expected a 32-bit number")
     if len(name) > LONGEST_NAME:
         warnings.warn(f"{what}: name of {len(name)} characters, cut to {LONGEST_NAME}: {name[:40]!r}...", stacklevel=2)
-    name, parents = name[:LONGEST_NAME], parents_of(name, codes)
+    name = name[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8") or f"label {value}"
+    parents = parents_of(name, codes)
     seen, hidden = (opacity, 0.0) if shown else (0.0, opacity)
     return Label(value, name, rgb(f"{what}: colour", color), seen, parents, codes, hidden)

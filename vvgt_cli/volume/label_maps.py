@@ -80,8 +80,8 @@ class Extent:
     def measures(self, volume: Volume) -> dict[str, Any]:
         """Return volume, centroid and bounds in the world of ``volume``.
 
-        Keys name the unit: millilitres and mm, or none if the unit of the world is not known. Bounds are two corners of
-        a box along the world's axes, around the voxels' faces.
+        Keys name the unit: millilitres and mm, or none if the unit of the world is not known. Bounds are two corners
+        of a box along the world's axes, around the label's box along the volume's own.
         """
         affine, metre = volume.affine, metres("mm" if volume.space else volume.unit)
         scale, ends = 1.0 if metre is None else metre / MILLIMETRE, ("", "") if metre is None else ("_ml", "_mm")

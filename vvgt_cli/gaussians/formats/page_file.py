@@ -41,6 +41,7 @@ _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">
 _SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
 _FAR = 99  # percentile of distances from the middle that counts as the radius of a cloud
 TEXTS = 100_000  # most bytes of titles, names, functions and histograms
+ENGINE_REACH = 4.0  # largest p that the engine draws
 _SEEN = -3.0  # smallest opacity logit of a Gaussian that counts as visible
 _DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
 
@@ -129,6 +130,7 @@ def rule_parameters(splats: Splats) -> dict[str, Any]:
     rule = RULES.get(next((found[1] for found in matches if found), ""), INRIA)
     return {
         "dilation": rule.dilation, "compensate": rule.compensate, "shifted": rule.shifted,
+        "reach": min(rule.reach, ENGINE_REACH),
         "minAlpha": rule.min_alpha, "minVariance": rule.min_variance,
     }  # fmt: skip
 

@@ -130,7 +130,7 @@ def _place(header: Header) -> tuple[tuple[float, ...], tuple[float, ...], tuple[
             return _in_mm(header, lengths), direction, _in_mm(header, matrix[:, 3].tolist()), "RAS"
     if header.qform is not None and all(map(math.isfinite, header.qform)):
         return _in_mm(header, steps), _rotation(header.qform, header.pixdim[0]), _in_mm(header, header.qform[3:]), "RAS"
-    return steps, IDENTITY, (0.0, 0.0, 0.0), None
+    return _in_mm(header, steps), IDENTITY, (0.0, 0.0, 0.0), None
 
 
 def _in_mm(header: Header, lengths: tuple[float, ...]) -> tuple[float, ...]:

@@ -26,6 +26,7 @@ const SCREEN = `
 const CHANGES = [
   ['gsplatCornerVS', 'uniform float minPixelSize;', 'uniform float minPixelSize;\nuniform float vvgtKind;\nvec4 vvgtGrey;'],
   ['gsplatCornerVS', '	corner.offset = vec3((source.cornerUV.x * v1 + source.cornerUV.y * v2) * c, 0.0);\n	corner.uv = source.cornerUV;\n	return true;\n', `	corner.offset = vec3((source.cornerUV.x * v1 + source.cornerUV.y * v2) * c, 0.0);${SCREEN}`],
+  ['gsplatCornerVS', 'max(l1, l2) < minPixelSize', 'vvgtKind < 0.5 && max(l1, l2) < minPixelSize'],
   ['gsplatVS', 'clr.w <= alphaClipValue', 'clr.w <= (vvgtKind < 0.5 ? alphaClipValue : 0.0)'],
   ['gsplatVS', 'clipCorner(corner, clr.w);', 'if (vvgtKind < 0.5) clipCorner(corner, clr.w);'],
   ['gsplatVS', 'gaussianColor = vec4(prepareOutputFromGamma(', 'gaussianColor = vvgtKind > 0.5 ? vvgtGrey : vec4(prepareOutputFromGamma('],

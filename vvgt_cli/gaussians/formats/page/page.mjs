@@ -42,7 +42,7 @@ function heldBytes(held) {
 }
 
 // The engine's shaders count in half pixels: their 0.3 is 0.075 px^2. Splats are drawn after this and the first content.
-function draw(app, { dilation, shifted }) {
+function draw(app, { dilation, shifted, reach }) {
   const chunks = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL);
   const change = (name, old, now) => {
     const text = chunks.get(name);
@@ -51,6 +51,7 @@ function draw(app, { dilation, shifted }) {
   };
   teach(app, change);
   change('gsplatCornerVS', '+ 0.3', `+ (vvgtKind > 0.5 ? 0.3 : ${(4 * dilation).toFixed(6)})`);
+  if (reach < 4) change('gsplatPS', 'A > 1.0', `A > (vvgtKind > 0.5 ? 1.0 : ${(reach / 4).toFixed(6)})`);
   if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
 }
 
@@ -153,7 +154,7 @@ async function start() {
     renderer: 'webgl',  // the one whose pictures are measured; WebGPU leaves more splats out
   });
   draw(viewer.app, scene.rule);
-  viewer.app.scene.gsplat.alphaClipForward = scene.rule.minAlpha;
+  viewer.app.scene.gsplat.alphaClipForward = Math.max(scene.rule.minAlpha, 1e-6);  // the shader divides by it
   viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
   if (scene.streamed) viewer.app.scene.gsplat.splatBudgetMode = GSPLAT_BUDGET_LIMIT;  // levels by distance, not as many as fit
   deliver?.(response);

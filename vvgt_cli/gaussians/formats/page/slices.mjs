@@ -13,7 +13,7 @@ const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="ra
 async function held(slices) {
   if (!slices.from) return slices;
   const answer = await fetch(slices.from);
-  if (!answer.ok) throw new Error('vvgt view has none');
+  if (!answer.ok) throw new Error(`vvgt view: ${await answer.text()}`);
   const { facts, contents } = await answer.json();
   for (const [id, textContent] of Object.entries(contents)) document.body.append(Object.assign(document.createElement('script'), { type: 'application/octet-stream', id, textContent }));
   return facts;
@@ -188,9 +188,10 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
 
   async function open() {
     if (grids) return;
-    grids = [];
     said.textContent = 'loading';
-    for (const facts of await held(scene.slices)) grids.push(await gridOf(facts));
+    const read = [];
+    for (const facts of await held(scene.slices)) read.push(await gridOf(facts));
+    grids = read;
     labels = grids.filter((grid) => grid.labels);
     const valued = grids.filter((grid) => !grid.labels), bases = valued.length ? valued : labels.slice(0, 1), list = find('.grid');
     list.replaceChildren(...bases.map(({ title }, k) => new Option(title || `layer ${k}`)));
@@ -201,7 +202,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   async function toggle(shown = root.hidden) {
     root.hidden = !shown;
     document.body.classList.toggle('sliced', shown);
-    if (shown) await open().catch(({ message }) => { said.textContent = `The slices are damaged: ${message}.`; });
+    if (shown) await open().catch(({ message }) => { said.textContent = `The slices cannot be shown: ${message}.`; });
     draw();
     moved();
     dispatchEvent(new Event('resize'));

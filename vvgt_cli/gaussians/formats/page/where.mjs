@@ -120,6 +120,7 @@ export function where(viewer, scene, live, show) {
   app.xr?.on('start', () => {
     const { target, yaw } = lens.pose(), away = AWAY * (scene.enlarged ?? 1), turn = (yaw * Math.PI) / 180;
     lens.rig.setPosition(target[0] + away * Math.sin(turn), target[1] - UP, target[2] + away * Math.cos(turn));
+    lens.rig.setEulerAngles(0, yaw, 0);
   });
   help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
   about.of(button('about', 'about this file', 'i', about.toggle));
