@@ -102,7 +102,7 @@ def test_gaussians_of_one_grid_in_the_frame_of_another() -> None:
     one = Volume(empty, (1.0, 2.0, 0.5), (3.0, 1.0, 0.0))
     other = Volume(empty, (2.0, 1.0, 1.5), (-4.0, 0.0, 2.0))
     some = cloud()
-    moved = to_frame_of(some, one, other)
+    moved = to_frame_of(some, one.unit_frame(), other.unit_frame())
     worlds = [
         (g.means / v.unit_frame().scale + np.array(v.unit_frame().centre), np.exp(g.log_scales) / v.unit_frame().scale,
          g.live[:, 2] / v.unit_frame().scale)  # type: ignore[index]

@@ -61,21 +61,8 @@ def test_a_page_that_is_far_from_its_volume_says_so_until_it_is_closed(person: P
     person("open", pages["slices"])
     assert person("eval", seen) == ""
     far = Path(pages["slices"].removeprefix("file://")).with_name("far.html")
-    assert (
-        run(
-            [
-                "convert",
-                str(far.with_name("marked.nii.gz")),
-                "--live",
-                "--max-gaussians",
-                "60",
-                "--quiet",
-                "-o",
-                str(far),
-            ]
-        )
-        == 0
-    )
+    line = ["convert", str(far.with_name("marked.nii.gz")), "--live", "--max-gaussians", "60", "--quiet", "--overwrite"]
+    assert run([*line, "-o", str(far)]) == 0
     person("open", far.as_uri())
     assert " dB" in person("eval", seen)
     person("eval", "document.querySelector('#notice button').focus()")

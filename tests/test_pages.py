@@ -134,10 +134,10 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "with one file of several clouds" in done.error
     done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
-    assert (done.code, "--max-size with a page of several clouds" in done.error) == (2, True)
+    assert (done.code, "--max-size with one file of several clouds" in done.error) == (2, True)
     for without in ("--no-live", "--no-slices"):
         done = vvgt("convert", "four.nii", "-o", "four.html", without, *how)
-        assert (done.code, f"{without} with a page of several clouds" in done.error) == (2, True)
+        assert (done.code, f"{without} with one file of several clouds" in done.error) == (2, True)
         done = vvgt("convert", "four.nii", "-o", "four_{}.ply", without, *how)
         assert (done.code, "are for a page" in done.error) == (2, True)
     white = {"rgb": [1, 1, 1]}

@@ -354,7 +354,7 @@ def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Pat
         served(site) as url,
         Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", controller.on_message) as converter,
     ):
-        controller.await_volume(converter)
+        controller.await_volume(converter, lambda: None)
         assert scene_of(url)["waits"]
         assert state_of(url)["state"] in ("first", "failed")
         assert controller.shown.wait(120)
@@ -420,7 +420,7 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
     for without in ("--no-live", "--no-slices"):
         left = vvgt("view", tmp_path / "run_*.npy", without, "-o", tmp_path / "a.html")
-        assert (left.code, f"{without} with a page of several clouds" in left.error) == (2, True)
+        assert (left.code, f"{without} with one file of several clouds" in left.error) == (2, True)
     wrong = vvgt("view", tmp_path / "run_*.npy", "--crop", "30:,:,:")
     assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []

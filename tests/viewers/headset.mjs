@@ -21,7 +21,7 @@ await page.route((url) => /^(https?|wss?):/.test(url.href), (route) => {
 page.on('pageerror', (error) => { throw error; });
 await page.addInitScript({ path: path.join(modules, 'node_modules/iwer/build/iwer.min.js') });
 await page.addInitScript(() => {
-  const device = new IWER.XRDevice(IWER.metaQuest3);
+  const device = window.device = new IWER.XRDevice(IWER.metaQuest3);
   device.installRuntime({ forceInstall: true });
   device.stereoEnabled = true;
 });
@@ -35,6 +35,7 @@ const before = await pose();
 const offered = await page.evaluate(() => [...document.querySelectorAll('#tools .xr:not([hidden])')].map((button) => button.textContent));
 await page.locator('#tools .xr', { hasText: 'VR' }).click();
 await page.waitForFunction('vvgt.viewer.app.xr.active && vvgt.viewer.app.xr.views.list.length === 2');
+await page.evaluate(() => device.position.set(0.01, 1.6, 0));  // a head is never still: Gaussians are sorted when it moves
 await page.waitForTimeout(6000);
 const eyes = await page.evaluate(() => vvgt.viewer.app.xr.views.list.map(({ viewport: { x, y, z, w }, projMat, viewOffMat }) => (
   { viewport: [x, y, z, w], projection: [...projMat.data], view: [...viewOffMat.data] })));
