@@ -341,7 +341,7 @@ def test_slurm_jobs_that_all_end_early_are_reported(slurm, jobs, monkeypatch):
         pytest.raises(DataError, match=r"all jobs ended before all blocks were done.*slurm-\d+\.out"),
     ):
         runner.run(print, range(3), None)
-    assert len(list(slurm[0].glob("job-*.sh"))) == 2
+    assert 2 <= len(list(slurm[0].glob("job-*.sh"))) <= 8  # one that ends first on a busy machine is followed by others
 
 
 def test_a_slurm_job_that_ends_before_it_answers_is_followed_by_another(slurm, jobs, monkeypatch, tmp_path):
