@@ -98,8 +98,7 @@ def command(
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
-      vvgt convert head.nrrd --tf bone.json -o head.ply --time-budget 10
-      vvgt convert head.nrrd --tf bone.json --for quest -o head.html
+      vvgt convert head.nrrd --tf bone.json -o head.html --for quest --time-budget 60
       vvgt convert huge.zarr -o huge/lod-meta.json --max-gaussians 10000000
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
@@ -116,13 +115,12 @@ def command(
     from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.errors import UsageError
 
-    context = click.get_current_context()
-    given = {parameter.name for parameter in typed(context)}
+    given = {parameter.name for parameter in typed(click.get_current_context())}
     options["fit"]["rule"] = options.pop("rule")
     options["fit"] |= {name: None for name in ("max_gaussians", "size", "rule") if name not in given}
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    line = command_line(context, ASIDE, folders=False)
+    line = command_line(click.get_current_context(), ASIDE, folders=False)
     request = convert_request(volume, **options)
     if not is_page(request.output) and not (slices and live is not False):
         raise UsageError(f"--no-live and --no-slices are for a page; got -o {request.output}; expected -o OUT.html")

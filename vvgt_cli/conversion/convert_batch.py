@@ -49,7 +49,7 @@ from vvgt_cli.files import claim
 from vvgt_cli.gaussians.formats.page_live import contents
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import check_outputs, claimed
-from vvgt_cli.gaussians.targets import target_of
+from vvgt_cli.gaussians.targets import check_opened
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
@@ -280,8 +280,7 @@ def convert_files(
     nodes = together and kind == FUNCTIONS and not is_page(output)
     for one in [*kinds, *([ONE_FILE] if together else []), *([NODES] if nodes else [])]:
         check_options(one, used)
-    if (target := target_of(request.fit.target)) is not None:
-        target.check_output(output)
+    check_opened(output, request.fit.target)
     if is_streamed(output):
         _convert_levels(request, console)
         return None

@@ -40,15 +40,6 @@ class Target:
         pixels, outwards, inwards = self.eye
         return pixels / (math.tan(math.radians(outwards)) + math.tan(math.radians(inwards)))
 
-    def check_output(self, path: str) -> None:
-        """Refuse a file that no program of the device opens.
-
-        Raises:
-            UsageError: names the ending that most of them open.
-        """
-        if path.lower().endswith(self.unread):
-            raise UsageError(f"-o {path} with --for {self.name}: no program there opens it; expected {self.best}")
-
 
 USD = (".usdc", ".usdz")
 TARGETS = {
@@ -71,3 +62,14 @@ def target_of(name: str | None) -> Target | None:
     if name is not None and name not in TARGETS:
         raise UsageError(f"target {name!r}; expected one of {', '.join(TARGETS)}")
     return None if name is None else TARGETS[name]
+
+
+def check_opened(path: str, name: str | None) -> None:
+    """Refuse a file that no program of a target opens; ``name`` is None for none.
+
+    Raises:
+        UsageError: names the ending that most of them open.
+    """
+    target = target_of(name)
+    if target is not None and path.lower().endswith(target.unread):
+        raise UsageError(f"-o {path} with --for {name}: no program there opens it; expected {target.best}")
