@@ -113,17 +113,17 @@ def _asked(splats: Splats) -> dict[str, Any] | None:
 def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     """Return points in the viewer's axes that must be in view for everything visible of ``clouds`` to fit.
 
-    These are the farthest Gaussians in 98 directions, of all that are not faint, and of fog the densest 95 %; the list is empty if nothing is visible, and if the first cloud
-    states a camera, which stays where it is.
+    These are the farthest Gaussians in 98 directions, of all that are not faint, and of fog the densest 95 %. The list
+    is empty if nothing is visible, and if the first cloud states a camera, which stays where it is.
     """
     if clouds and _asked(clouds[0]):
         return []
     logits = np.concatenate([splats.logits for splats in clouds])
     ordered = np.sort(logits).astype(np.float64)
     opacity = np.cumsum(1 / (1 + np.exp(-ordered)))
-    faint = ordered[opacity <= _FAINT * opacity[-1:]]
-    least = np.clip(faint[-1] if len(faint) else _DRAWN, _DRAWN, _SEEN)
-    places = np.concatenate([splats.means for splats in clouds])[logits > least] * (-1.0, -1.0, 1.0)
+    first = np.searchsorted(opacity, _FAINT * opacity[-1]) if len(ordered) else 0
+    least = np.clip(ordered[first : first + 1], _DRAWN, _SEEN)
+    places = np.concatenate([splats.means for splats in clouds])[logits >= least] * (-1.0, -1.0, 1.0)
     towards = np.array([d for d in product(range(-2, 3), repeat=3) if any(d)]).T
     if not len(places):
         return []
