@@ -130,14 +130,14 @@ UPRIGHT = {"supersplat": (-1, -1), "playcanvas": (1, 1), "spark": (1, 1), "splat
 @pytest.mark.parametrize("viewer", UPRIGHT)
 def test_which_way_up_a_ply_is_shown(viewer: str, tmp_path: Path) -> None:
     """Red, green and blue at +x, +y and +z of a file: each where the viewer's own camera sees it, none mirrored."""
-    means = np.array([(0.5, 0, 0), (0, 0.5, 0), (-0.3, -0.3, 0.4)])
+    means = np.array([(0.5, 0.1, 0.05), (0.07, 0.5, 0), (-0.3, -0.35, 0.4)])  # on no axis: see docs/viewers.md
     rest = (
-        np.full((6, 3), np.log(0.05)),
-        np.tile((1.0, 0, 0, 0), (6, 1)),
-        np.full(6, 4.0),
-        np.repeat(np.eye(3), 2, axis=0),
+        np.full((60, 3), np.log(0.05)),
+        np.tile((1.0, 0, 0, 0), (60, 1)),
+        np.full(60, 4.0),
+        np.repeat(np.eye(3), 20, axis=0),
     )
-    write_ply(tmp_path / "axes.ply", Gaussians(np.repeat(means, 2, axis=0), *rest))  # two programs leave out one splat
+    write_ply(tmp_path / "axes.ply", Gaussians(np.repeat(means, 20, axis=0), *rest))
     shot = shoot(viewer, tmp_path / "axes.ply", [None], 400, tmp_path)[0]
     places = np.argwhere(shot > 0.5)
     found = np.stack([places[places[:, 2] == k, :2].mean(axis=0) for k in range(3)])
