@@ -17,8 +17,10 @@ from report_runs import document
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cli.main import run
 from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.images import read_png, write_png
 from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import Volume
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 
 ROOT = Path(__file__).parent.parent
@@ -400,3 +402,40 @@ def test_kept(bench, tmp_path, monkeypatch):
     assert rows[".usdc", "certificate"]["usd-core"] == "yes"
     assert rows[".spz", "certificate"]["gsply"] == "no"
     assert "| `.glb` | certificate; place" in call(module.main, "--table", tmp_path / "kept.csv")
+
+
+def test_viewers(bench, scenes, tmp_path, monkeypatch):
+    """A viewer that draws as its rule says, of an anatomical file, which is turned: our drawing, like the volume."""
+    module = bench("viewers", SIZE=SIZE)
+    drawn = []
+
+    def shoot(viewer, file, cameras, size, folder, options):
+        drawn.append((viewer, file.name, options))
+        return [module.render(read_splats(file)[0], one, rule=module.VIEWERS[viewer][0])[..., :3] for one in cameras]
+
+    monkeypatch.setattr(module, "shoot", shoot)
+    block = np.zeros((12, 12, 12), np.float32)
+    block[7:11, 2:9, 1:5] = 1  # at one corner, with three different edges
+    write_nrrd(tmp_path / "block.nrrd", Volume(block, (1, 1, 1), space="RAS"))
+    look = [
+        "--tf",
+        f"{scenes[1]}/shells.json",
+        "--max-gaussians",
+        300,
+        "--steps",
+        0,
+        "--pictures",
+        tmp_path / "pictures",
+    ]
+    only = ["--viewer", "three", "--viewer", "gsplatjs", "--format", ".ply", "--format", ".glb"]
+    said = call(module.main, tmp_path / "block.nrrd", *look, *only)
+    rows = [line.split(",") for line in said.splitlines()[:3]]
+    assert drawn == [
+        ("three", "splats.ply", "stored"),
+        ("gsplatjs", "splats.ply", ""),
+        ("three", "splats.glb", "stored"),
+    ]
+    assert all(float(row[2]) > 20 for row in rows)
+    assert all(float(row[4]) > 50 for row in rows)
+    assert "| three | " in said
+    assert read_png(tmp_path / "pictures" / "sheet.png").shape == (SIZE // 4, SIZE // 4 * 6, 3)
