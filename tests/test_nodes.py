@@ -149,6 +149,9 @@ def test_usd_has_the_same_tree_and_measures(vvgt, atlas) -> None:
         assert (facts["volume_ml"], np.array(facts["bounds_mm"]).shape) == (pytest.approx(0.36), (2, 3))
     off = [name for name, (_, node) in tree(atlas / "a.glb").items() if "extensions" in node]
     assert off == ["Hippo-campus"]
+    for ending in (".usdc", ".usdz", ".glb"):
+        with pytest.warns(UserWarning, match="1 of its nodes are switched off, and read all the same: Hippo-campus"):
+            read_splats(f"a{ending}")
     assert document(atlas / "a.glb")["extensionsUsed"] == ["KHR_gaussian_splatting", "KHR_node_visibility"]
 
 
