@@ -246,16 +246,19 @@ def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: P
             assert place is not None
             person("click", *place.tolist())
         person.picture(tmp_path, f"ruler-{flat}.png", bare=False)
-        distance, text = person(
-            "eval", "[window.vvgt.where.ruler.distance(), document.querySelector('#places').textContent]"
+        text, drawn = person(
+            "eval",
+            "[document.querySelector('#marks li:last-child span').textContent, "
+            "document.querySelector('#where text[font-weight=\"600\"]').textContent]",
         )
-        print(f"{person.size}, orthographic {flat}: {distance} mm by the ruler, {apart:.3f} mm known; {text!r}")
-        assert distance == pytest.approx(apart, rel=0.005)
-        assert f"distance {distance:.4g} mm" in text
-        for line, dot in zip(text.splitlines(), DOTS, strict=False):
-            words = [part.split()[:2] for part in line[3:].split(",")]
-            told = [float(number) * (-1 if letter in "LPI" else 1) for letter, number in words]
-            np.testing.assert_allclose(told, dot / SCALE + (5, 6, 7), atol=0.25)
+        print(f"{person.size}, orthographic {flat}: {text!r} by the ruler, {apart:.3f} mm known")
+        assert drawn == text.removeprefix("ruler ")
+        assert float(drawn.removesuffix(" mm")) == pytest.approx(apart, rel=0.005)
+        line = person("eval", "document.querySelector('#places').textContent").splitlines()[0]
+        words = [part.split()[:2] for part in line.split(",")]
+        told = [float(number) * (-1 if letter in "LPI" else 1) for letter, number in words]
+        np.testing.assert_allclose(told, DOTS[1] / SCALE + (5, 6, 7), atol=0.25)
+        person("click", "#marks li button")
         person("press", "Escape")
         person("settled")
         assert person("eval", "document.querySelector('#places').hidden")
@@ -269,11 +272,11 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     person("eval", f"window.vvgt.where.lens.set({pose})")
     mark, _ = found(person.picture(tmp_path, "front.png"), 0)
     assert mark is not None
-    person("click", "#tools .measure")
     person("click", *mark.tolist())
+    on_mark = person("eval", "window.vvgt.where.clicked")
     across, down = person("eval", MIDDLE)
     person("click", across + 0.1 * person.size[0], down + 0.12 * person.size[0])
-    on_mark, on_ball = person("eval", "window.vvgt.where.ruler.places")
+    on_ball = person("eval", "window.vvgt.where.clicked")
     print(f"{person.size}: {on_mark}, {on_ball}")
     person.picture(tmp_path, "places.png", bare=False)
     assert 50 < on_mark["value"] <= 100  # at a surface it lies between inside and outside: where the function is red

@@ -9,7 +9,7 @@ const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .han
 export function helpRows(buttons, { live, values, picks, sliced }) {
   return [
     ['drag', 'turn'], ['right drag, two fingers', 'move'], ['wheel, pinch', 'nearer, farther'],
-    ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['double click', 'turn about that place']] : []),
+    ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['Enter', 'as a click in the middle of the view'], ['double click', 'turn about that place']] : []),
     ['arrow keys', 'turn; with Shift: move'], ['+ −', 'nearer, farther'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
     ...(live?.next ? [['K', 'the look, MIP, X-ray']] : []),

@@ -23,6 +23,14 @@ export async function pictureOf({ app }, svg) {
   return new Promise((done) => picture.toBlob(done, 'image/png'));
 }
 
+// this page as its file was, but that it begins with `link`
+export function pageOf(source, link) {
+  const said = source.getElementById('said'), scene = source.getElementById('scene');
+  said.textContent = said.dataset.without ?? said.textContent;
+  scene.textContent = JSON.stringify({ ...JSON.parse(scene.textContent), link }).replaceAll('<', '\\u003c');  // so that no name can end the script
+  return new Blob([`<!doctype html>\n${source.documentElement.outerHTML}\n`], { type: 'text/html' });
+}
+
 export function save(blob, name) {
   const link = document.createElement('a');
   [link.href, link.download] = [URL.createObjectURL(blob), name];
