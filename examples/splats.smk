@@ -3,6 +3,7 @@
 # version of vvgt is not in the cache's key ("omit-software"): clear the folder when you update it.
 #
 #   export SNAKEMAKE_OUTPUT_CACHE=~/.cache/splats
+#   mkdir -p $SNAKEMAKE_OUTPUT_CACHE
 #   snakemake --snakefile splats.smk --cores 4 --cache --config function=bone.json -- head.html
 #
 # --threads does not change the bytes; --time-budget does (docs/commands/convert.md, "Same command, same bytes").

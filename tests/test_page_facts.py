@@ -50,6 +50,20 @@ def test_a_page_states_the_extent_of_visible_gaussians() -> None:
         [places.min(axis=0), places.max(axis=0)], [shown.min(axis=0), shown.max(axis=0)], atol=1e-3
     )
     assert outermost([replace(far, logits=far.logits - 9)]) == []
+    fog = np.array(
+        outermost([replace(some, logits=np.full(500, -4.0, np.float32)), replace(far, logits=far.logits - 5)])
+    )
+    assert np.ptp(fog, axis=0).min() > 1.9  # all faint, and seen together
+
+
+def test_a_round_body_fits_from_every_side() -> None:
+    rng = np.random.default_rng(4)
+    means = rng.normal(size=(4000, 3))
+    ball = (means / np.linalg.norm(means, axis=1)[:, None]).astype(np.float32)
+    points = np.array(
+        outermost([replace(splats_of(one(), PlyOptions()), means=ball, logits=np.zeros(4000, np.float32))])
+    )
+    assert (points @ ball[:500].T).max(axis=0).min() > 0.95
 
 
 def node(text: str, folder: Path) -> Any:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from tests.headers import uncertified
 from tests.test_scale import FIT, bodies
 from vvgt_cli.cli.main import run as command
 from vvgt_cli.errors import DataError
+from vvgt_cli.files import atomic_write
 
 ROOT = Path(__file__).parent.parent
 SIZE = ("--blocks", "32")
@@ -93,6 +95,26 @@ def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):
     other = vvgt("init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
     assert other.code == 2
     assert "holds no blocks of vvgt" in other.err
+
+
+def test_shards_may_start_together(tmp_path, monkeypatch):
+    """One looks at the folder while another writes its first file there, and goes on when it has come."""
+    from vvgt_cli.field import block_store
+
+    store, met = block_store.BlockStore(tmp_path / "v.blocks"), []
+
+    @contextmanager
+    def slowly(path, overwrite):
+        with atomic_write(path, overwrite) as temporary:
+            temporary.write_text("not yet whole")
+            if not met:
+                met.append(True)
+                assert not store.open({"edge": 16}, ours=False)
+            yield temporary
+
+    monkeypatch.setattr(block_store, "atomic_write", slowly)
+    assert not store.open({"edge": 16}, ours=False)
+    assert store.open({"edge": 16}, ours=False)
 
 
 def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):

@@ -100,6 +100,15 @@ def test_kernels_match_the_twin_by_every_rule(name, scale):
     assert_matches_twin(cloud(300, 5, scale=scale), camera(64, 64), 5, share=0.03, rule=RULES[name])
 
 
+@pytest.mark.parametrize("name", RULES)
+def test_gradients_behind_many_opaque_splats_are_finite(name):
+    g = cloud(200, 7, scale=0.3, logit=9.0)  # a transmittance of less than float32 has
+    c = camera(48, 48)
+    p = project(g, c, RULES[name])
+    slopes = render_backward(g, c, p, render(g, c, projection=p), np.ones((48, 48, 4), np.float32))
+    assert all(np.isfinite(getattr(slopes, field)).all() for field in FIELDS)
+
+
 @pytest.mark.parametrize("axes", [(0.8, 1e-3, 1e-3), (0.8, 0.8, 1e-4), (1e-6, 1e-6, 1e-6), (3.0, 3.0, 3.0)])
 def test_needles_pancakes_points_and_giants_match_the_twin(axes):
     g = cloud(60, 1)

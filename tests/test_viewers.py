@@ -124,6 +124,30 @@ def test_up_and_hand_in_supersplat(tmp_path: Path) -> None:
     assert hand == pytest.approx(np.linalg.det(means), rel=1e-5)
 
 
+UPRIGHT = {"supersplat": (-1, -1), "playcanvas": (1, 1), "spark": (1, 1), "splats3d": (1, 1), "gsplatjs": (1, -1)}
+
+
+@pytest.mark.parametrize("viewer", UPRIGHT)
+def test_which_way_up_a_ply_is_shown(viewer: str, tmp_path: Path) -> None:
+    """Red, green and blue at +x, +y and +z of a file: each where the viewer's own camera sees it, none mirrored."""
+    means = np.array([(0.5, 0.1, 0.05), (0.07, 0.5, 0), (-0.3, -0.35, 0.4)])  # on no axis: see docs/viewers.md
+    rest = (
+        np.full((60, 3), np.log(0.05)),
+        np.tile((1.0, 0, 0, 0), (60, 1)),
+        np.full(60, 4.0),
+        np.repeat(np.eye(3), 20, axis=0),
+    )
+    write_ply(tmp_path / "axes.ply", Gaussians(np.repeat(means, 20, axis=0), *rest))
+    shot = shoot(viewer, tmp_path / "axes.ply", [None], 400, tmp_path)[0]
+    places = np.argwhere(shot > 0.5)
+    found = np.stack([places[places[:, 2] == k, :2].mean(axis=0) for k in range(3)])
+    right, up = UPRIGHT[viewer]
+    depth = 3 - right * up * means[:, 2]  # a camera at z = 3, or one that is turned by 180 degrees with y
+    across = np.stack([-up * means[:, 1], right * means[:, 0]], axis=1)
+    expected = 200 + 200 / np.tan(np.radians(20)) * across / depth[:, None]
+    assert abs(found - expected).max() < 2
+
+
 @pytest.mark.parametrize("viewer", RULE)
 def test_harmonics_are_seen_from_their_side(viewer: str, tmp_path: Path) -> None:
     """Strong harmonics of degree 3: what a viewer shows is our picture, and not that from the other side."""

@@ -13,6 +13,7 @@ from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.images.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.score.viewing import (
     ViewingCondition,
+    condition_pictures,
     condition_views,
     score_conditions,
     score_texture,
@@ -47,7 +48,8 @@ def test_a_condition_close_up_is_the_same_place_with_a_narrower_field():
 def test_conditions_are_scored_by_their_rule_size_and_field_worst_first(pair):
     scene, gaussians = pair
     rules, views = ("inria", "playcanvas"), (4, 9)
-    found = score_conditions(gaussians, condition_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
+    pictures = condition_pictures([(24, 40.0), (40, 10.0)], views)
+    found = score_conditions(gaussians, condition_views(scene, pictures, ONE_RAY), rules)
     assert [condition.psnr for condition in found] == sorted(condition.psnr for condition in found)
     assert len(found) == 4
     for condition in found:

@@ -23,8 +23,13 @@ export async function settled(place, shot, sorted) {
   return last;
 }
 
-/** Position and right, up, back (the axes of an OpenGL camera) of a world-to-camera pose (OpenCV axes), `shift` to the right. */
-export function axes({ rotation: r, translation: t }, shift) {
+/**
+ * Position and right, up, back (the axes of an OpenGL camera) of a world-to-camera pose (OpenCV axes), `shift` to the right;
+ * without a pose, at z = 3, y up.
+ */
+export function axes(pose, shift) {
+  if (!pose) return { position: [shift, 0, 3], right: [1, 0, 0], up: [0, 1, 0], back: [0, 0, 1] };
+  const { rotation: r, translation: t } = pose;
   const position = [0, 1, 2].map((i) => shift * r[0][i] - (r[0][i] * t[0] + r[1][i] * t[1] + r[2][i] * t[2]));
   return { position, right: r[0], up: r[1].map((x) => -x), back: r[2].map((x) => -x) };
 }

@@ -15,11 +15,11 @@ const TYPES = {
   '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.wasm': 'application/wasm', '.css': 'text/css',
 };
 
-// pages at /, packages at /node_modules/, the files of the jobs at /file/<job> with their endings, and nothing else
+// pages at /, packages at /node_modules/, the folders of the jobs' files at /file/<job>/, and nothing else
 function located(url) {
-  const file = /^\/file\/(\d+)\.\w+$/.exec(url);
-  if (file) return jobs[Number(file[1])]?.file;
-  const [root, rest] = url.startsWith('/node_modules/') ? [path.join(modules, 'node_modules'), url.slice(13)] : [pages, url];
+  const file = /^\/file\/(\d+)(\/.+)$/.exec(url);
+  const [root, rest] = file ? [path.dirname(jobs[Number(file[1])].file), file[2]]
+    : url.startsWith('/node_modules/') ? [path.join(modules, 'node_modules'), url.slice(13)] : [pages, url];
   const found = path.join(root, path.normalize(rest));
   return found.startsWith(root) ? found : undefined;
 }
@@ -43,7 +43,7 @@ for (const [index, job] of jobs.entries()) {
     page.on('pageerror', (error) => fail(new Error(`${job.viewer}: ${error.message}`)));
   });
   page.on('console', (message) => { if (message.type() === 'error') console.error(`${job.viewer}: ${message.text()}`); });
-  const query = `file=/file/${index}${path.extname(job.file)}&size=${job.size}&${job.options ?? ''}`;
+  const query = `file=/file/${index}/${path.basename(job.file)}&size=${job.size}&${job.options ?? ''}`;
   await page.goto(`http://127.0.0.1:${server.address().port}/${job.viewer}.html?${query}`);
   await Promise.race([broken, page.waitForFunction('window.show !== undefined')]);
   for (const [view, camera] of job.cameras.entries()) {

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.blocks import block_options, block_options_of
-from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
+from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option, target_option
 from vvgt_cli.cli.options import (
     common_options,
     device_option,
@@ -20,7 +20,7 @@ from vvgt_cli.cli.options import (
     title_option,
 )
 from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.cli.typed import ASIDE, command_line
+from vvgt_cli.cli.typed import ASIDE, command_line, typed
 from vvgt_cli.defaults import RULE
 from vvgt_cli.progress import Console
 
@@ -32,6 +32,10 @@ from vvgt_cli.progress import Console
     help="Output file; its ending selects the format, - is standard output.",
 )  # fmt: skip
 @tfs_options
+@target_option(
+    "Device to make the file for: sets --max-gaussians, --max-size, --size and --rule where they are not given, and "
+    "scores it as seen there, on a headset by both eyes."
+)
 @fit_options
 @limit_options
 @light_options
@@ -94,7 +98,7 @@ def command(
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
-      vvgt convert head.nrrd --tf bone.json -o head.ply --time-budget 10
+      vvgt convert head.nrrd --tf bone.json -o head.html --for quest --time-budget 60
       vvgt convert huge.zarr -o huge/lod-meta.json --max-gaussians 10000000
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
@@ -111,6 +115,9 @@ def command(
     from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.errors import UsageError
 
+    given = {parameter.name for parameter in typed(click.get_current_context())}
+    options["fit"]["rule"] = options.pop("rule")
+    options["fit"] |= {name: None for name in ("max_gaussians", "size", "rule") if name not in given}
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
     line = command_line(click.get_current_context(), ASIDE, folders=False)

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.blocks import block_options
-from vvgt_cli.cli.fit import rule_option
+from vvgt_cli.cli.fit import rule_option, target_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
@@ -21,6 +21,7 @@ from vvgt_cli.progress import Console
     help="Image size to score at. Default: the size recorded in the file, or 400.",
 )  # fmt: skip
 @rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
+@target_option("Device to score it on: by its size and rule unless given, on a headset also as both eyes see it.")
 @click.option(
     "--no-conditions", "conditions", is_flag=True, default=True, flag_value=False,
     help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
@@ -60,7 +61,7 @@ def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], consol
     from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"], options["light"])
-    names = ("size", "rule", "step", "conditions", "preview", "overwrite")
+    names = ("size", "rule", "step", "conditions", "preview", "overwrite", "target")
     asked = {name: options[name] for name in names}
     evaluation = evaluate(EvaluateRequest(ply, source, blocks=block_options_of(blocks), **asked), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vvgt_cli.cli.options import MEGABYTES, SECONDS, Measure, group
-from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
+from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, SIZE
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
@@ -36,6 +36,14 @@ fit_options = group(
 
 # `vvgt_cli.gaussians.rules.RULES`; a test compares
 RULES = ("inria", "compensated", "spark", "playcanvas", "viser", "three", "babylon", "cesium")
+
+
+TARGETS = ("quest", "visionos", "phone", "desktop")  # `vvgt_cli.gaussians.targets.TARGETS`; a test compares
+
+
+def target_option(help: str) -> Callable[[Any], Any]:
+    """Return the option ``--for``."""
+    return click.option("--for", "target", type=click.Choice(TARGETS), help=help)
 
 
 def rule_option(help: str, default: str | None = None, more: tuple[str, ...] = ()) -> Callable[[Any], Any]:
@@ -131,8 +139,8 @@ def convert_request(
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
-    rule: str = RULE,
     steps: int | None = None,
+    target: str | None = None,
     model: str | None = None,
     limits: dict[str, Any] | None = None,
     checkpoint: str | None = None,
@@ -146,7 +154,7 @@ def convert_request(
     return ConvertRequest(
         source_request(volume, read, optics, light),
         output,
-        FitOptions(**fit, rule=rule, steps=steps, model=model, device=device),
+        FitOptions(**fit, steps=steps, model=model, device=device, target=target),
         Limits(**(limits or {})),
         PlyOptions(**ply),
         up,

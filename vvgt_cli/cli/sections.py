@@ -11,7 +11,7 @@ SECTIONS = {  # parameters by name, in the order shown; all others come first, u
     "Look": "tf_range opacity_unit_distance labels layers ambient diffuse specular specular_power occlusion",
     "Quality": "steps init model rule seed renderer samples step",
     "Output": "frame up camera sh_degree comments split_labels slices format half background points report conditions",
-    "Running": "device checkpoint shard block_size workers scheduler level threads memory quiet",
+    "Running": "dry_run device checkpoint shard block_size workers scheduler level threads memory quiet",
 }
 
 

@@ -35,7 +35,15 @@ from vvgt_cli.gaussians.frames import rescale
 from vvgt_cli.gaussians.live_facts import WORD as LIVE
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import CLOSE, PREVIEW_VIEWS, condition_views, score_conditions, score_texture, screens
+from vvgt_cli.score.viewing import (
+    CLOSE,
+    PREVIEW_VIEWS,
+    condition_pictures,
+    condition_views,
+    score_conditions,
+    score_texture,
+    screens,
+)
 from vvgt_cli.score.views import score_test_views
 
 SIZE = 1080  # pixels, for files without a recorded size
@@ -126,7 +134,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
 
     @cache
     def conditions() -> Any:
-        places = [*screens(size), (size, CLOSE)]
+        places = condition_pictures([*screens(size), (size, CLOSE)])
         return score_conditions(gaussians, condition_views(field.views, places, settings))
 
     def error(name: str) -> Figure:

@@ -23,6 +23,7 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, 
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.images.metrics import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
 from vvgt_cli.look.labels import LabelTable
@@ -34,6 +35,7 @@ from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_pictures,
     condition_views,
+    eye_pictures,
     near_cameras,
     score_conditions,
     score_texture,
@@ -61,6 +63,7 @@ class EvaluateRequest:
         blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
         preview: PNG to write (reference, splats, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
+        target: name of the device to score it on, by its size and rule where none is given; None: as the file records.
     """
 
     ply: str | BinaryIO
@@ -72,6 +75,7 @@ class EvaluateRequest:
     blocks: BlockOptions | None = None
     preview: str | None = None
     overwrite: bool = False
+    target: str | None = None
 
     def inputs(self) -> list[str]:
         """Return the files that are read."""
@@ -203,6 +207,12 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     if request.ply == STDIN == request.source.volume:
         raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
+    if (target := target_of(request.target)) is not None:
+        if not request.conditions:
+            raise UsageError(
+                f"--no-conditions with --for {target.name}: its eyes are conditions; give one or the other"
+            )
+        request = replace(request, size=request.size or target.size, rule=request.rule or target.rule)
     if request.preview:
         check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
     gaussians, header = open_gaussians(request.ply)
@@ -258,22 +268,24 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
     if request.conditions:
-        _look_around(run, evaluation, volume, gaussians, rule)
+        _look_around(run, evaluation, volume, gaussians, rule, request.target)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
 
 
-def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule) -> None:
-    """Score the viewing conditions, and texture seen from near."""
+def _look_around(
+    run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule, target: str | None
+) -> None:
+    """Score the viewing conditions, those of a headset, too, and texture seen from near."""
     from vvgt_cli.dvr import RenderSettings
 
     size, settings = evaluation.size, RenderSettings()
-    places = viewing_conditions(size)
-    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in condition_pictures(places)]
+    places = condition_pictures(viewing_conditions(size)) + eye_pictures(target)
+    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
     with run.stage("conditions") as stage, _together(volume, wanted):
-        seen = condition_views(volume.views, places, settings, progress=run.console.bar("conditions"))
-        conditions = score_conditions(gaussians, seen)
+        seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))
+        conditions = score_conditions(gaussians, seen, own=rule.name)
         evaluation.conditions = [asdict(condition) for condition in conditions]
         stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]

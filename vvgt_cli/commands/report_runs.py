@@ -162,7 +162,7 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        conditions = list(condition_views(volume.views, screens(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, around, REFERENCE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 

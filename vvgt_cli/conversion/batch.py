@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.warm_start import WarmStart
 
 ONE, LIVE, LEVELS, ONE_FILE = "one volume", "--live", "streamed levels", "one file of several clouds"
-LAYERS = "labels of layers"
+LAYERS, NODES = "labels of layers", "one file with a node for each function"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one cloud, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
@@ -56,13 +56,15 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "after": "only one conversion can start from another; remove it",
     },
     LIVE: {"--dry-run": "live files need no plan; remove it", "after": "live files need no earlier one; remove it"},
-    LEVELS: dict.fromkeys(
+    LEVELS: {"--for": "levels are scored by rays through blocks, not by eyes; give --max-gaussians and --size"}
+    | dict.fromkeys(
         (
             *("several --tf", "--model", "--rule", "--max-size", "--live"),
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
         "levels are cuts of one closed form, refined on the CPU; remove it",
     ),
+    NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
     ONE_FILE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
         "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
@@ -190,7 +192,7 @@ def options_in(request: ConvertRequest) -> set[str]:
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--labels none": source.labels == NONE,
         "--steps": fit.steps, "--model": fit.model, "--rule": fit.rule != INRIA.name,
         "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
-        "--device": fit.device != "cpu",
+        "--device": fit.device != "cpu", "--for": fit.target,
     }  # fmt: skip
     return {option for option, value in used.items() if value}
 

@@ -333,9 +333,15 @@ def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
         run.console.message(warning)
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
-    run.report.options = asdict(request.fit) | asdict(request.limits) | {
-        "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
+    fit = request.fit
+    run.report.options = asdict(fit) | asdict(request.limits) | {
+        "max_megabytes": request.megabytes, "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
+    if fit.target is not None:
+        most = "" if request.megabytes is None else f"{request.megabytes:g} MB, "
+        run.console.message(
+            f"for {fit.target}: at most {most}{request.budget()} Gaussians, {fit.size} px, drawn as {fit.rule}"
+        )
 
 
 def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) -> tuple[str, ...]:
@@ -359,7 +365,7 @@ def _write_file(run: Run, request: ConvertRequest, found: Conversion, again: boo
     """Write the file, a page with all its contents, or ``again`` with its certificate; ``more`` ends the message."""
     assert request.output is not None
     page = is_page(request.output) and request.ply.comments
-    limit = None if request.limits.max_megabytes is None else 1e6 * request.limits.max_megabytes
+    limit = None if request.megabytes is None else 1e6 * request.megabytes
     extras = found.extras(request.editor, request.slices, run, limit) if page else NOTHING
     write_gaussians(
         run, request.output, found.gaussians, found.ply, request.overwrite or again, found.normals(),

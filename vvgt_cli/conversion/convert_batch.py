@@ -13,6 +13,7 @@ from vvgt_cli.conversion.batch import (
     LAYERS,
     LEVELS,
     LIVE,
+    NODES,
     ONE,
     ONE_FILE,
     Batch,
@@ -48,6 +49,7 @@ from vvgt_cli.files import claim
 from vvgt_cli.gaussians.formats.page_live import contents
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import check_outputs, claimed
+from vvgt_cli.gaussians.targets import check_opened
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
@@ -275,8 +277,10 @@ def convert_files(
     named = LAYERS if kind == LABELS and request.source.layers else kind
     kinds = [LEVELS] if is_streamed(output) else [named, *([LIVE] if request.live else [])]
     together = kind != ONE and holds_several(output) and not numbered
-    for one in [*kinds, *([ONE_FILE] if together else [])]:
+    nodes = together and kind == FUNCTIONS and not is_page(output)
+    for one in [*kinds, *([ONE_FILE] if together else []), *([NODES] if nodes else [])]:
         check_options(one, used)
+    check_opened(output, request.fit.target)
     if is_streamed(output):
         _convert_levels(request, console)
         return None

@@ -207,7 +207,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
         )
         stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as other viewers show it"
     work = Work(run, field, fit, gaussians=gaussians)
-    for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
+    for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions(fit.target)):
         stage_of_scores.run(work)
     return live.psnr
 

@@ -152,7 +152,7 @@ class Planner:
         count = self.fit.max_gaussians
         plan = Plan(workload, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
-        last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
+        last: list[Stage] = [TestViews(self.whole), ViewingConditions(self.fit.target)]
         left = None
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])

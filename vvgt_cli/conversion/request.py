@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from vvgt_cli.conversion.place import AUTO
 from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
@@ -16,6 +16,7 @@ from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.formats.page_file import page_bytes
 from vvgt_cli.gaussians.formats.page_slices import SMALLEST as SMALLEST_SLICES
 from vvgt_cli.gaussians.outputs import STDOUT, Output
+from vvgt_cli.gaussians.targets import target_of
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # by degree
@@ -27,25 +28,37 @@ class FitOptions:
     """Options of the fit: budget, screen, method, steps.
 
     Attributes:
-        max_gaussians: budget of Gaussians.
-        size: pixels along the edge of the screen that the file is made for.
+        max_gaussians: budget of Gaussians; None: the target's, or `MAX_GAUSSIANS`.
+        size: pixels along the edge of the screen that the file is made for; None: the target's, or `SIZE`.
         init: "vbm", "wavelet" or "uniform".
-        rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by.
+        rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by; None: the target's, or `RULE`.
         seed: seed of random numbers.
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.
         steps: maximal number of steps of gradient descent; None: `STEPS`, or `MOST_STEPS` of
             `vvgt_cli.conversion.plan` with a target or a time budget.
         device: "cpu", or "cuda" for views and steps.
+        target: name of the device that the file is made for (`vvgt_cli.gaussians.targets`), None for none.
+
+    Raises:
+        UsageError: there is no such target.
     """
 
-    max_gaussians: int = MAX_GAUSSIANS
-    size: int = SIZE
+    max_gaussians: int = None  # type: ignore[assignment] # set below, as size and rule
+    size: int = None  # type: ignore[assignment]
     init: str = INIT
-    rule: str = RULE
+    rule: str = None  # type: ignore[assignment]
     seed: int = 0
     steps: int | None = None
     model: str | None = None
     device: str = "cpu"
+    target: str | None = None
+
+    def __post_init__(self) -> None:
+        """Set what is not given."""
+        target = target_of(self.target)
+        for name, default in (("max_gaussians", MAX_GAUSSIANS), ("size", SIZE), ("rule", RULE)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(target, name, default))
 
 
 @dataclass(frozen=True)
@@ -156,7 +169,16 @@ class ConvertRequest:
             )
         else:
             header, each = file_bytes(0, degree), file_bytes(1, degree) - file_bytes(0, degree)
-        return self.limits.gaussians(self.fit.max_gaussians, header, each)
+        return replace(self.limits, max_megabytes=self.megabytes).gaussians(self.fit.max_gaussians, header, each)
+
+    @property
+    def megabytes(self) -> float | None:
+        """Return the limit of the file's size: the given one, or the target's for files that have such a limit."""
+        target, known = target_of(self.fit.target), format_of(self.output or "")
+        if self.limits.max_megabytes is not None or target is None:
+            return self.limits.max_megabytes
+        limited = not self.live if known is None else known.suffix == ".html"
+        return target.megabytes if limited else None
 
     @property
     def scored_whole(self) -> bool:

@@ -44,25 +44,27 @@ class BlockStore:
         """
         text = json.dumps(settings, sort_keys=True, indent=1)
         place = self.folder / RUN
-        if self.folder.exists() and not (place.is_file() and place.read_text("utf-8") == text):
-            if not ours and any(self.folder.iterdir()) and not place.is_file():
-                raise UsageError(f"{self.folder}: exists and holds no blocks of vvgt; choose another name")
-            if not ours and place.is_file():
-                raise UsageError(
-                    f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
-                    "name, or remove the folder"
-                )
-            if ours:
-                shutil.rmtree(self.folder, ignore_errors=True)
+        # shards start together: `place`, the first file, may come at any moment, and until then has a hidden name
+        found = list(self.folder.iterdir()) if self.folder.is_dir() else []
         there = place.is_file()
+        same = there and place.read_text("utf-8") == text
+        if there and not same and not ours:
+            raise UsageError(
+                f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
+                "name, or remove the folder"
+            )
+        if not there and not ours and any(not path.name.startswith(".run.") for path in found):
+            raise UsageError(f"{self.folder}: exists and holds no blocks of vvgt; choose another name")
+        if not same and ours:
+            shutil.rmtree(self.folder, ignore_errors=True)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DataError(f"{self.folder}: cannot be created ({error.strerror or error})") from error
-        if not there:
+        if not same:
             with atomic_write(place, overwrite=True) as temporary:
                 temporary.write_text(text, "utf-8")
-        return there
+        return same
 
     def kept_edge(self, settings: dict[str, Any]) -> int | None:
         """Return the block edge of an earlier run with the same settings, None if there was none."""

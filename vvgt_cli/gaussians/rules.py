@@ -63,8 +63,9 @@ class Rule:
         return np.array([*ends, *falloff, self.min_transmittance], np.float32)
 
 
-# WebGL blends every splat whatever is in front of it. 0.999 stands for no clamp: 8 bits per channel show no difference.
-WEBGL: dict[str, Any] = {"max_alpha": 0.999, "min_transmittance": 0.0}
+# WebGL blends every splat whatever is in front of it. 0.999 stands for no clamp, a billionth for no end: 8 bits per
+# channel show no difference, and gradients would divide by what float32 rounds to 0.
+WEBGL: dict[str, Any] = {"max_alpha": 0.999, "min_transmittance": 1e-9}
 # Cesium's unit is a quarter pixel, its splat a square to p = 4 along its axes: as much is left of a circle to 4.68.
 # PlayCanvas' shaders use half pixels: in pixels its variance of 0.3 is a quarter of that, its length of 2 half.
 HALF_PIXELS: dict[str, Any] = {"dilation": DILATION / 4, "min_variance": 0.125}

@@ -184,6 +184,7 @@ def evaluate(
     rule: str | None = None,
     step: float = 0.125,
     conditions: bool = True,
+    target: str | None = None,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -198,6 +199,7 @@ def evaluate(
         rule: drawing rule; None: the file's.
         step: step of the reference, in voxels.
         conditions: also score every rule at several sizes and close up.
+        target: device to score it on, as ``--for``.
         blocks: as in `convert`.
         progress: print messages and bars on standard error.
 
@@ -207,7 +209,9 @@ def evaluate(
     from vvgt_cli.commands import evaluate as pipeline
 
     source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, conditions, _blocks(blocks))
+    request = pipeline.EvaluateRequest(
+        ply_of(ply), source, size, rule, step, conditions, _blocks(blocks), target=target
+    )  # fmt: skip
     return pipeline.evaluate(request, console_of(progress))
 
 

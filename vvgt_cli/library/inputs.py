@@ -131,13 +131,18 @@ def _name_of(function: FunctionLike | None) -> str:
 
 @dataclass(frozen=True)
 class Goal(Limits, FitOptions):
-    """The goal of a conversion: the attributes of `FitOptions` and `Limits`.
+    """The goal of a conversion: the attributes of `FitOptions` (``target`` is ``--for``) and `Limits`.
 
     Attributes:
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
     """
 
     all_views: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the limits, and set what is not given."""
+        Limits.__post_init__(self)
+        FitOptions.__post_init__(self)
 
     @classmethod
     def of(cls, goal: GoalLike) -> Goal:

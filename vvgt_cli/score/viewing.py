@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras import Camera, default_views, look_at
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
+from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ NEAR = 14.0  # degrees, for texture: faces fill the picture, and cells are some 
 TEXTURED = 3  # a conversion measures texture in the middle of a near view, one part in so many of its edge
 VIEWS = (0, 4, 9)  # test views: above, side, below
 SIDE = (4,)  # one view is enough to find the worst condition
+# In a headset a body's longest edge is 2 m, its middle 1.3 m up and, at first, 2 m away (formats/page/where.mjs).
+AWAY = (2.0, 1.5)  # metres from the middle to the eyes: at first, and half a metre before the surface, an arm's length
+UP, APART = 0.3, 0.063  # metres: eyes 1.6 m up, and between both
 PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of scores without a report: above, side, below
 
 
@@ -38,16 +42,20 @@ class ViewingCondition:
         size: pixels along the picture's edge.
         field_of_view: degrees.
         psnr: mean dB of the views, over black.
+        where: name of the place in a headset; "" for a screen.
     """
 
     rule: str
     size: int
     field_of_view: float
     psnr: float
+    where: str = ""
 
     def name(self) -> str:
         """Return the name in tables and messages."""
-        return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
+        return self.where or f"{self.rule} {self.size} px" + (
+            "" if self.field_of_view == FIELD_OF_VIEW else " close up"
+        )
 
 
 def viewing_conditions(size: int) -> list[tuple[int, float]]:
@@ -66,18 +74,28 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
     return replace(camera, fx=focal, fy=focal)
 
 
+class Place(NamedTuple):
+    """A viewing condition without its rule; attributes as in `ViewingCondition`."""
+
+    size: int
+    field_of_view: float
+    where: str = ""
+
+
+ConditionPicture = tuple[Place, Camera, Blocks | None]
+
+
 @dataclass(frozen=True)
 class ConditionView:
     """The reference of a viewing condition in one view.
 
     Attributes:
-        size, field_of_view: pixels and degrees of the condition.
+        place: the condition.
         camera, blocks: camera of the view, and its blocks that are scored, None for all.
         reference: (h, w, 3) float32 picture of the blocks, or of the whole.
     """
 
-    size: int
-    field_of_view: float
+    place: Place
     camera: Camera
     blocks: Blocks | None
     reference: np.ndarray
@@ -85,44 +103,61 @@ class ConditionView:
 
 def condition_pictures(
     places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
-) -> list[tuple[tuple[int, float], Camera, Blocks | None]]:
+) -> list[ConditionPicture]:
     """List every place with the camera of each view, and the blocks of its picture that are scored."""
     found = []
     for size, field_of_view in places:
         cameras = default_views("test", size=size)
         for i in views:
             camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
-            found.append(((size, field_of_view), camera, blocks))
+            found.append((Place(size, field_of_view), camera, blocks))
+    return found
+
+
+def eye_pictures(
+    target: str | None, views: Collection[int] = VIEWS, enough: int = ENOUGH
+) -> list[ConditionPicture]:  # fmt: skip
+    """List the pictures of both eyes in a headset, as `condition_pictures`; none for a screen.
+
+    Eyes look at the middle of the body from the azimuths of the test views; the middle `FIELD_OF_VIEW` degrees count.
+    """
+    device = target_of(target)
+    if device is None or device.focal is None:
+        return []
+    size, found = round(2 * device.focal * float(np.tan(np.radians(FIELD_OF_VIEW / 2)))), []
+    for away in AWAY:
+        place = Place(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
+        for i in views:
+            x, y, _ = default_views("test")[i].position
+            ring = away / float(np.hypot(x, y))
+            head = look_at((ring * x, ring * y, UP), width=size, height=size)
+            for right in (-APART / 2, APART / 2):
+                eye = replace(head, translation=head.translation - (right, 0, 0))
+                found.append((place, eye, spread_blocks(size, size, i, enough)))
     return found
 
 
 def condition_views(
     scene: Scene | Viewed,
-    places: Iterable[tuple[int, float]],
+    pictures: Sequence[ConditionPicture],
     settings: RenderSettings | None = None,
-    *,
-    views: Collection[int] = VIEWS,
-    enough: int = ENOUGH,
     progress: ProgressCallback | None = None,
 ) -> Iterator[ConditionView]:
-    """Render the references of every place, one at a time.
+    """Render the references of pictures, one at a time.
 
     Args:
         scene: the volume.
-        places: (size in pixels, field of view in degrees).
+        pictures: of `condition_pictures` and `eye_pictures`.
         settings: settings of the reference; the renderer's default without.
-        views: numbers of the test views.
-        enough: approximate number of blocks per view.
-        progress: called after each view of a place.
+        progress: called after each picture.
     """
     from vvgt_cli.dvr import render_view
 
-    wanted = condition_pictures(places, views, enough)
-    for done, (place, camera, blocks) in enumerate(wanted, 1):
+    for done, (place, camera, blocks) in enumerate(pictures, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
-        yield ConditionView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
+        yield ConditionView(place, camera, blocks, image if blocks is None else blocks.pick(image))
         if progress:
-            progress(done, len(wanted))
+            progress(done, len(pictures))
 
 
 def score_texture(
@@ -187,7 +222,7 @@ def texture_note(found: Texture) -> str:
 
 
 def score_conditions(
-    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES)
+    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES), own: str = INRIA.name
 ) -> list[ViewingCondition]:
     """Score every rule at every place, on blocks of the test views; worst first.
 
@@ -195,15 +230,18 @@ def score_conditions(
         gaussians: Gaussians to draw.
         seen: references of `condition_views`.
         rules: names of drawing rules.
+        own: name of the rule of a headset's programs.
     """
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    errors: dict[tuple[str, int, float], list[float]] = {}
+    errors: dict[tuple[str, Place], list[float]] = {}
     for view in seen:
-        for rule in rules:
+        for rule in (own,) if view.place.where else rules:
             ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
             shown = ours if view.blocks is None else view.blocks.pick(ours)
-            errors.setdefault((rule, view.size, view.field_of_view), []).append(psnr(view.reference, shown))
-    found = [ViewingCondition(*condition, float(np.mean(dbs))) for condition, dbs in errors.items()]
+            errors.setdefault((rule, view.place), []).append(psnr(view.reference, shown))
+    found = [
+        ViewingCondition(rule, *place[:2], float(np.mean(dbs)), place.where) for (rule, place), dbs in errors.items()
+    ]
     return sorted(found, key=lambda condition: condition.psnr)

@@ -15,8 +15,10 @@ from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
     TEXTURED,
+    ConditionPicture,
     condition_pictures,
     condition_views,
+    eye_pictures,
     score_conditions,
     score_texture,
     screens,
@@ -87,24 +89,32 @@ def _places(size: int) -> list[tuple[tuple[int, float], int]]:
 
 @dataclass(frozen=True)
 class ViewingConditions(Stage):
-    """Scores by every rule at the target size and above, and of texture on smooth areas; skipped where time is up."""
+    """Scores by every rule at the target size and above, and of texture on smooth areas; skipped where time is up.
+
+    Attributes:
+        target: name of the device that the file is made for; a headset's eyes are scored, too.
+    """
 
     name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
+    target: str | None = None
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels and Gaussians."""
         near = (workload.size // TEXTURED) ** 2
         splats = CONDITIONS[0] + CONDITIONS[1] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
-        views = sum(enough == FEW for _, enough in _places(workload.size))
+        views = sum(enough == FEW for _, enough in _places(workload.size)) + len(eye_pictures(self.target, SIDE))
         return Cost(views * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats)
+
+    def _wanted(self, size: int) -> list[ConditionPicture]:
+        around = [one for place, enough in _places(size) for one in condition_pictures([place], SIDE, enough)]
+        return around + eye_pictures(self.target, SIDE, FEW)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = [one for place, enough in _places(fit.size) for one in condition_pictures([place], SIDE, enough)]
-        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in self._wanted(fit.size)]
         return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
     def run(self, work: Work) -> None:
@@ -117,11 +127,8 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = (
-                view for place, enough in _places(fit.size)
-                for view in condition_views(work.field.views, [place], settings, views=SIDE, enough=enough)
-            )  # fmt: skip
-            conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)))
+            seen = condition_views(work.field.views, self._wanted(fit.size), settings)
+            conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)), fit.rule)
             run.report.conditions = [asdict(condition) for condition in conditions]
             near, views = texture_cameras(fit.size), work.field.views
             run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))

@@ -23,7 +23,7 @@ function qualityOf(text) {
     const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
     if (!Number.isFinite(dB)) return {};
     const quality = `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)`, better = Number.isFinite(live) ? 'convert it for this look without --live' : 'give it more Gaussians or steps';
-    return { quality, far: dB < POOR ? `This is far from the volume, ${dB.toFixed(1)} dB: dots, pits and missing detail may not be in the data. To see detail, ${better}.` : '' };
+    return { quality, far: dB < POOR ? `This is far from the volume, ${dB.toFixed(1)} dB: dots and pits may not be in the data, and detail may be missing. To see it, ${better}.` : '' };
   } catch { return {}; }
 }
 
