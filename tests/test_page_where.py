@@ -380,11 +380,30 @@ def test_a_link_restores_the_picture(marked: str, person: Person, tmp_path: Path
     assert np.abs(before - begin).mean() > 1e-2
 
 
+def test_a_larger_picture_is_the_same_and_sharper(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    person("press", "y")
+    page = person.picture(tmp_path, "page.png", bare=False)
+    saved = {}
+    for times, label in (1, "first-child"), (4, "last-child"):
+        person("press", "p")
+        person("save", f"#sizes button:{label}", str(tmp_path / f"{times}.png"))
+        saved[times] = read_png(tmp_path / f"{times}.png")[..., :3].astype(np.float64)
+        assert saved[times].shape == (times * person.size[1], times * person.size[0], 3)
+    small, (high, wide) = saved[1], saved[1].shape[:2]
+    large = saved[4].reshape(high, 4, wide, 4, 3).mean(axis=(1, 3))
+    assert -10 * math.log10(((large - small) ** 2).mean()) > 35
+    letters = saved[4][-4 * 112 :, : 4 * 100].reshape(112, 4, 400, 3)
+    assert np.abs(np.diff(letters, axis=1)).max() > 0.5  # within a pixel of the window: no blown up letters
+    assert np.abs(person.picture(tmp_path, "after.png", bare=False) - page).mean() < 1e-3
+
+
 def test_a_saved_picture_has_legend_scale_and_letters(marked: str, person: Person, tmp_path: Path) -> None:
     person("open", marked)
     person("press", "y")
     page = person.picture(tmp_path, "page.png", bare=False)
-    assert person("save", "#tools .picture", str(tmp_path / "saved.png")) == "volume-60-x-50-x-40.png"
+    person("click", "#tools .picture")
+    assert person("save", "#sizes button", str(tmp_path / "saved.png")) == "volume-60-x-50-x-40.png"
     picture, (wide, high) = read_png(tmp_path / "saved.png")[..., :3], person.size
     assert picture.shape == (high, wide, 3)
     legend = picture[high - 154 : high - 24, wide - 30 : wide - 12]

@@ -13,7 +13,7 @@ import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
-import { pageOf, pictureOf, save } from './shot.mjs';
+import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
 import { slicesOf } from './slices.mjs';
 import { element } from './svg.mjs';
 
@@ -34,10 +34,10 @@ export function where(viewer, scene, live, show) {
   const values = live?.layers.some(({ nodes }) => nodes), box = document.createElement('nav'), buttons = [];
   box.id = 'tools';
   box.setAttribute('aria-label', 'view');
-  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []);
+  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []), sizes = listed('sizes', 'Save the picture as PNG');
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
   const poor = notice();
-  document.body.append(poor.root, box, help.root, about.root, places);
+  document.body.append(poor.root, box, help.root, about.root, sizes.root, places);
   places.setAttribute('role', 'status');
   let data, world, facts, drawn = '', stamp = 0, told = '';
   const state = {};
@@ -119,8 +119,16 @@ export function where(viewer, scene, live, show) {
   const measuring = button('measure', 'rulers, angles and notes: click their points', 'm', () => measure(true));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume, beside the picture', 's', () => slices.toggle());
-  const picture = async () => save(await pictureOf(viewer, svg), `${name()}.png`);
-  button('picture', 'save the picture as PNG', 'p', picture);
+  const picture = (size) => pictureOf(viewer, svg, size).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
+  sizes.of(button('picture', 'save the picture as PNG, in the window\'s size, twice or four times as large', 'p', () => {
+    sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
+      const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
+      made.addEventListener('click', () => { sizes.close(); lens.canvas.focus({ preventScroll: true }); picture(size); });
+      return made;
+    }));
+    sizes.toggle();
+    sizes.root.querySelector('button').focus();
+  }));
   button('link', 'link to this view', 'l', async () => {
     const link = linkOf(parts);
     try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
@@ -209,6 +217,6 @@ export function where(viewer, scene, live, show) {
   take(dataNow());
   const fit = stayFree(lens, scene, draw);
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
