@@ -10,13 +10,14 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from vvgt_cli.conversion.label_assignment import HiddenCells
-from vvgt_cli.gaussians import in_unit_frame
+from vvgt_cli.conversion.label_assignment import HiddenCells, assign_labels
+from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.gaussians.formats.gltf import glb_of_nodes
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.look.label_files import read_labels
+from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.terms import codes_of_tags
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
@@ -149,6 +150,9 @@ def test_usd_has_the_same_tree_and_measures(vvgt, atlas) -> None:
         assert (facts["volume_ml"], np.array(facts["bounds_mm"]).shape) == (pytest.approx(0.36), (2, 3))
     off = [name for name, (_, node) in tree(atlas / "a.glb").items() if "extensions" in node]
     assert off == ["Hippo-campus"]
+    for ending in (".usdc", ".usdz", ".glb"):
+        with pytest.warns(UserWarning, match="1 of its nodes are switched off, and read all the same: Hippo-campus"):
+            read_splats(f"a{ending}")
     assert document(atlas / "a.glb")["extensionsUsed"] == ["KHR_gaussian_splatting", "KHR_node_visibility"]
 
 
@@ -282,3 +286,17 @@ def test_groups_have_names_that_no_node_has() -> None:
     size = struct.unpack_from("<I", content := glb_of_nodes(nodes, "a"), 12)[0]
     names = [node["name"] for node in json.loads(content[20 : 20 + size])["nodes"]]
     assert names == ["Splats", "Liver group", "Blood", "Liver group group", "Liver", "cyst", "vein"]
+
+
+def test_a_gaussian_beside_a_label_is_not_of_its_twin_on_the_other_side() -> None:
+    """Left and right have one colour in FreeSurfer's table."""
+    values = np.zeros((12, 12, 24), np.uint8)
+    values[4:8, 4:8, 2:6], values[4:8, 4:8, 18:22] = 1, 2
+    volume = Volume(values, (1.0, 1.0, 1.0), (0.0, 0, 0), (1, 0, 0, 0, 1, 0, 0, 0, 1))
+    labels = [Label(number, str(number), (0.1, 0.8, 0.6), 1.0) for number in (1, 2)]
+    table, frame = LabelTable("t", tuple(labels)), volume.unit_frame()
+    voxels = np.array([[1.4, 6, 6], [22.6, 6, 6], [20, 8.6, 6], [4, 6, 10.5]])  # beside 1, 2, 2 and 1
+    means = (voxels * frame.step - frame.half).astype(np.float32)
+    turn, zeros = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.zeros(4, np.float32)
+    some = Gaussians(means, np.full((4, 3), -12, np.float32), turn, zeros, np.tile(np.float32([0.1, 0.8, 0.6]), (4, 1)))
+    assert assign_labels(some, [(volume, table, label) for label in labels]).tolist() == [0, 1, 1, 0]

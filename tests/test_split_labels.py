@@ -140,7 +140,7 @@ def test_gaussians_are_assigned_to_the_label_with_most_of_them() -> None:
     turned = np.tile([1.0, 0, 0, 0], (4, 1))
     colors = np.array([table.labels[k].color for k in (1, 0, 0, 1)])  # as it should not be told
     gaussians = Gaussians(means, wide, turned, np.zeros(4), colors)
-    np.testing.assert_array_equal(assign_labels(gaussians, shown), [0, 1, 1, 1])  # the last is near none: by its colour
+    np.testing.assert_array_equal(assign_labels(gaussians, shown), [0, 1, 1, 0])  # the last lies beside label 1
     along_y = Gaussians(means, wide, np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (4, 1)), np.zeros(4), colors)
     np.testing.assert_array_equal(assign_labels(along_y, shown)[:3], [0, 1, 1])
     faint = [(volume, table, label) for label in (shown[0][2], split.replace(shown[1][2], opacity=0.01))]

@@ -145,7 +145,8 @@ def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> 
     _refuse_reading(request.source, files[0])
     if request.output is None or not is_page(request.output):
         raise UsageError(
-            f"-o {request.output}: holds one file, got {len(files)}; expected a page (.html), which holds several"
+            f"-o {request.output}: got {len(files)} files; expected a page (.html), which holds several "
+            "(one .glb, .usdc or .usdz of several labels is written by 'vvgt convert MAP --split-labels')"
         )
     with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
         names = [name for name, _ in clouds]

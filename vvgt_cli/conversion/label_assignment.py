@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from vvgt_cli.volume.stored import planes, values_at
 
 DARKENED = 0.1  # difference of colours that counts as much as a label's colour taken for black
 OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis at which labels are sampled
+REACH = (1, 2, 4)  # voxels from a Gaussian in no label, within which labels are near
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.
 
 
 def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
-    """Return (K,) int64, the index of the label with most of each Gaussian's extinction; where none is near, by colour.
+    """Return (K,) int64, the index of the label with most of each Gaussian's extinction, else a near one, by colour.
 
     Args:
         gaussians: box frame.
@@ -103,13 +105,28 @@ def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable
             index = np.floor((points + frame.half) / frame.step).astype(np.int64)
             _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
     found: np.ndarray = votes.argmax(axis=1)
-    lost = votes.max(axis=1) == 0
+    lost = np.flatnonzero(votes.max(axis=1) == 0)
+    near = _near(np.floor((gaussians.means[lost] + frame.half) / frame.step).astype(np.int64), tau, shown)
     colors = np.array([label.color for *_, label in shown])
-    for k in np.flatnonzero(lost):
+    for k, candidates in zip(lost, near, strict=True):
         own = gaussians.colors[k]
         share = np.clip(colors @ own / np.maximum((colors**2).sum(axis=1), 1e-6), 0, 1)  # light darkens
-        found[k] = (np.abs(share[:, None] * colors - own).sum(axis=1) + DARKENED * (1 - share)).argmin()
+        distance = np.abs(share[:, None] * colors - own).sum(axis=1) + DARKENED * (1 - share)
+        found[k] = np.where(candidates, distance, np.inf).argmin()
     return found
+
+
+def _near(index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
+    """Return (K, labels) bool, the labels near voxels ``index`` (K, 3) (x, y, z); all where none is within `REACH`."""
+    found = np.zeros((len(index), len(shown)), np.float32)
+    for reach in REACH:
+        rows = np.flatnonzero(found.max(axis=1) == 0)
+        votes = np.zeros((len(rows), len(shown)), np.float32)
+        for shift in itertools.product((-reach, 0, reach), repeat=3):
+            _vote(index[rows] + shift, weights, shown, votes)
+        found[rows] = votes
+    near: np.ndarray = (found > 0) | (found.max(axis=1, keepdims=True) == 0)
+    return near
 
 
 def _vote(

@@ -15,7 +15,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.metres import offset_in, placed
-from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, report_off
 from vvgt_cli.gaussians.formats.splats import Splats, joined, logits_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.version import VERSION
@@ -146,20 +146,24 @@ def _read(content: bytes, name: str) -> Splats:
     comments = tuple(str(line).replace("\n", " ") for line in document["asset"].get("extras", {}).get("comments", []))
     found: list[Splats] = []
     roots = document["scenes"][document.get("scene", 0)]["nodes"]
-    open_nodes: list[tuple[int, np.ndarray | None, np.ndarray]] = [(one, None, np.eye(4)) for one in reversed(roots)]
-    met = 0
+    open_nodes: list[tuple[int, np.ndarray | None, np.ndarray, bool]]
+    open_nodes = [(one, None, np.eye(4), True) for one in reversed(roots)]
+    off, met = list[str](), 0
     while open_nodes:
         met += 1
         if met > len(document["nodes"]):
             raise ValueError("nodes in a circle, or in several places")
-        number, root, above = open_nodes.pop()
+        number, root, above, on = open_nodes.pop()
         node = document["nodes"][number]
         place = above @ _matrix(node)
         root = place if root is None else root
-        open_nodes += [(child, root, place) for child in reversed(node.get("children", []))]
+        on = on and node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+        open_nodes += [(child, root, place, on) for child in reversed(node.get("children", []))]
         if "mesh" in node:
             offset = offset_in(root, place, comments, name)
             found.append(_columns(document, binary, node["mesh"], comments).moved(offset))
+            off += [] if on else [str(node.get("name", number))]
+    report_off(name, off)
     return joined(found)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -57,3 +58,10 @@ def group_names(nodes: Sequence[Node]) -> dict[tuple[str, ...], str]:
 def common_comments(nodes: Sequence[Node]) -> tuple[str, ...]:
     """Return the comments that the files of all nodes would have."""
     return tuple(line for line in nodes[0].splats.comments if all(line in node.splats.comments for node in nodes))
+
+
+def report_off(name: str, off: Sequence[str]) -> None:
+    """Warn that a file has nodes of Gaussians that are switched off, by their names."""
+    if off:
+        shown = ", ".join(off[:5]) + (", ..." if len(off) > 5 else "")
+        warnings.warn(f"{name}: {len(off)} of its nodes are switched off, and read all the same: {shown}", stacklevel=2)

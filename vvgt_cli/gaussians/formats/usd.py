@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.metres import offset_in, placed
-from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, report_off
 from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, logits_of, opacities_of
 from vvgt_cli.volume.libraries import library_errors, need
 
@@ -175,6 +175,8 @@ def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
         DataError: the file is not such a stage, or OpenUSD is not installed.
     """
     usd = library(name)
+    from pxr import UsdGeom
+
     with library_errors(name, f"a {KIND}"), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"in{ending}"
         path.write_bytes(content)
@@ -183,6 +185,8 @@ def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
         prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == KIND]
         if not prims:
             raise DataError(f"{name}: no prim of type {KIND}; expected one or more")
+        invisible = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible]
+        report_off(name, [prim.GetDisplayName() or prim.GetName() for prim in invisible])
         return joined([_columns(prim, comments, name) for prim in prims])
 
 
