@@ -47,6 +47,11 @@ def test_no_serious_finding_and_no_trap(name: str, person: Person, pages: dict[s
     person("open", pages[name])
     if name == "slices":
         person("press", "s")
+        person(
+            "eval",
+            'window.vvgt.where.marks.part.set(\'[["ruler", [[0, 0, 0], [9, 0, 0]]], ["note", [[0, 0, 0]], "here"]]\')',
+        )
+        person("press", "m")
     if person.touch:
         person("eval", "document.querySelector('#live.folded .fold')?.click()")
     person("eval", "document.querySelectorAll('details').forEach((one) => { one.open = true; })")

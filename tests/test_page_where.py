@@ -246,16 +246,19 @@ def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: P
             assert place is not None
             person("click", *place.tolist())
         person.picture(tmp_path, f"ruler-{flat}.png", bare=False)
-        distance, text = person(
-            "eval", "[window.vvgt.where.ruler.distance(), document.querySelector('#places').textContent]"
+        text, drawn = person(
+            "eval",
+            "[document.querySelector('#marks li:last-child span').textContent, "
+            "document.querySelector('#where text[font-weight=\"600\"]').textContent]",
         )
-        print(f"{person.size}, orthographic {flat}: {distance} mm by the ruler, {apart:.3f} mm known; {text!r}")
-        assert distance == pytest.approx(apart, rel=0.005)
-        assert f"distance {distance:.4g} mm" in text
-        for line, dot in zip(text.splitlines(), DOTS, strict=False):
-            words = [part.split()[:2] for part in line[3:].split(",")]
-            told = [float(number) * (-1 if letter in "LPI" else 1) for letter, number in words]
-            np.testing.assert_allclose(told, dot / SCALE + (5, 6, 7), atol=0.25)
+        print(f"{person.size}, orthographic {flat}: {text!r} by the ruler, {apart:.3f} mm known")
+        assert drawn == text.removeprefix("ruler ")
+        assert float(drawn.removesuffix(" mm")) == pytest.approx(apart, rel=0.005)
+        line = person("eval", "document.querySelector('#places').textContent").splitlines()[0]
+        words = [part.split()[:2] for part in line.split(",")]
+        told = [float(number) * (-1 if letter in "LPI" else 1) for letter, number in words]
+        np.testing.assert_allclose(told, DOTS[1] / SCALE + (5, 6, 7), atol=0.25)
+        person("click", "#marks li button")
         person("press", "Escape")
         person("settled")
         assert person("eval", "document.querySelector('#places').hidden")
@@ -269,11 +272,11 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     person("eval", f"window.vvgt.where.lens.set({pose})")
     mark, _ = found(person.picture(tmp_path, "front.png"), 0)
     assert mark is not None
-    person("click", "#tools .measure")
     person("click", *mark.tolist())
+    on_mark = person("eval", "window.vvgt.where.clicked")
     across, down = person("eval", MIDDLE)
     person("click", across + 0.1 * person.size[0], down + 0.12 * person.size[0])
-    on_mark, on_ball = person("eval", "window.vvgt.where.ruler.places")
+    on_ball = person("eval", "window.vvgt.where.clicked")
     print(f"{person.size}: {on_mark}, {on_ball}")
     person.picture(tmp_path, "places.png", bare=False)
     assert 50 < on_mark["value"] <= 100  # at a surface it lies between inside and outside: where the function is red
@@ -377,11 +380,30 @@ def test_a_link_restores_the_picture(marked: str, person: Person, tmp_path: Path
     assert np.abs(before - begin).mean() > 1e-2
 
 
+def test_a_larger_picture_is_the_same_and_sharper(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    person("press", "y")
+    page = person.picture(tmp_path, "page.png", bare=False)
+    saved = {}
+    for times, label in (1, "first-child"), (4, "last-child"):
+        person("press", "p")
+        person("save", f"#sizes button:{label}", str(tmp_path / f"{times}.png"))
+        saved[times] = read_png(tmp_path / f"{times}.png")[..., :3].astype(np.float64)
+        assert saved[times].shape == (times * person.size[1], times * person.size[0], 3)
+    small, (high, wide) = saved[1], saved[1].shape[:2]
+    large = saved[4].reshape(high, 4, wide, 4, 3).mean(axis=(1, 3))
+    assert -10 * math.log10(((large - small) ** 2).mean()) > 35
+    letters = saved[4][-4 * 112 :, : 4 * 100].reshape(112, 4, 400, 3)
+    assert np.abs(np.diff(letters, axis=1)).max() > 0.5  # within a pixel of the window: no blown up letters
+    assert np.abs(person.picture(tmp_path, "after.png", bare=False) - page).mean() < 1e-3
+
+
 def test_a_saved_picture_has_legend_scale_and_letters(marked: str, person: Person, tmp_path: Path) -> None:
     person("open", marked)
     person("press", "y")
     page = person.picture(tmp_path, "page.png", bare=False)
-    assert person("save", "#tools .picture", str(tmp_path / "saved.png")) == "volume-60-x-50-x-40.png"
+    person("click", "#tools .picture")
+    assert person("save", "#sizes button", str(tmp_path / "saved.png")) == "volume-60-x-50-x-40.png"
     picture, (wide, high) = read_png(tmp_path / "saved.png")[..., :3], person.size
     assert picture.shape == (high, wide, 3)
     legend = picture[high - 154 : high - 24, wide - 30 : wide - 12]

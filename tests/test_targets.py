@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import vvgt_cli
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cli.fit import TARGETS as NAMES
+from vvgt_cli.conversion.place import headset_axes
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings, render_view
@@ -24,6 +26,7 @@ from vvgt_cli.images.metrics import psnr
 from vvgt_cli.library.inputs import Goal
 from vvgt_cli.score.viewing import AWAY, eye_pictures
 from vvgt_cli.splat import render
+from vvgt_cli.volume import Volume
 
 BLOB = "example:blob:16"
 FEW = ("--max-gaussians", 60, "--steps", 0)
@@ -67,6 +70,7 @@ def test_what_is_given_wins_over_the_target():
 def test_the_size_limit_is_of_files_that_have_one(output, given, limit):
     request = ConvertRequest(SourceRequest(BLOB), output, FitOptions(10_000_000, target="phone"), **given)
     assert request.megabytes == limit
+    assert replace(request, several=True).megabytes == request.limits.max_megabytes
     if limit is None:
         assert request.budget() == 10_000_000
     elif output == "a.ply":
@@ -74,7 +78,7 @@ def test_the_size_limit_is_of_files_that_have_one(output, given, limit):
 
 
 def test_eyes_stand_where_the_page_puts_them():
-    pictures = eye_pictures("quest", (4,))
+    pictures = eye_pictures("quest", views=(4,))
     assert [place.where for place, *_ in pictures] == [BOTH[1]] * 2 + [BOTH[0]] * 2
     for (_, left, _), (_, right, _), away in zip(pictures[::2], pictures[1::2], AWAY, strict=True):
         assert left.rotation @ (right.position - left.position) == pytest.approx([0.063, 0, 0])
@@ -87,7 +91,17 @@ def test_eyes_stand_where_the_page_puts_them():
         assert np.degrees(2 * np.arctan(left.height / 2 / left.fy)) == pytest.approx(40)
     assert len(eye_pictures("visionos")) == 2 * 3 * 2
     assert eye_pictures("phone") == eye_pictures(None) == []
-    assert ViewingConditions("quest").views(FitOptions(size=64))[:-1] != ViewingConditions().views(FitOptions(size=64))
+    fit = FitOptions(size=64)
+    assert len(ViewingConditions("quest").views(fit)) == len(ViewingConditions().views(fit)) + 4
+
+
+@pytest.mark.parametrize(("up", "direction"), [("none", (0, -1, 0)), ("z", (0, 0, 1)), ("x", (1, 0, 0))])
+def test_eyes_stand_above_the_middle_as_viewers_show_it(up, direction):
+    volume = Volume(np.zeros((4, 4, 4), np.uint8), direction=(1, 0, 0, 0, -1, 0, 0, 0, 1))  # j points down in the world
+    for place, eye, _ in eye_pictures("quest", headset_axes(volume, up), (4,)):
+        away = float(place.where.split()[-2])
+        assert volume.axes @ eye.position @ direction == pytest.approx(0.3)
+        assert np.linalg.norm(eye.position) == pytest.approx(math.hypot(away, 0.3, 0.0315))
 
 
 def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
@@ -108,7 +122,7 @@ def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
         assert one["rule"] == "playcanvas"
         assert recorded[name] == round(one["psnr"], 2)
         expected = []
-        for place, camera, _ in eye_pictures("quest", (4,)):
+        for place, camera, _ in eye_pictures("quest", views=(4,)):
             if place.where == name:
                 whole = render_view(scene, camera, RenderSettings()), render(gaussians, camera, "playcanvas")
                 expected.append(psnr(whole[0][..., :3], whole[1][..., :3]))
@@ -137,6 +151,10 @@ def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
     told = json.loads(found.out)
     assert told["rule"] == "playcanvas"
     assert set(BOTH) <= {one["where"] for one in told["conditions"]}
+    assert (
+        vvgt("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions").code
+        == 0
+    )
     refused = vvgt("evaluate", out, "--volume", BLOB, "--for", "quest", "--no-conditions")
     assert (refused.code, "--no-conditions with --for quest" in refused.error) == (2, True)
 

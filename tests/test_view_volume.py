@@ -101,6 +101,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         until(lambda: not scene_of(url).get("waits"))
         scene = scene_of(url)
         assert scene["server"] == {"converts": True, "name": "blob-12"}
+        assert scene["slices"] == {"from": "slices.json"}
         assert scene["live"]["layers"][0]["values"][1] == pytest.approx(0.9, abs=0.1)
         path = urlsplit(url).path
         assert len(Cloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
@@ -146,6 +147,16 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         assert child.returncode == 0
         assert "Traceback" not in said
     assert list(temporary.iterdir()) == list(folder.iterdir()) == []
+
+
+def test_colours_are_offered_no_slices(tmp_path: Path, temporary: Path) -> None:
+    nib = pytest.importorskip("nibabel")
+    data = np.zeros((8, 8, 8), np.dtype([(c, np.uint8) for c in "RGB"]))
+    data["R"][2:6, 2:6, 2:6] = 200
+    nib.save(nib.Nifti1Image(data, np.eye(4)), tmp_path / "rgb.nii")
+    with shown(str(tmp_path / "rgb.nii"), folder=tmp_path) as (_, url):
+        until(lambda: not scene_of(url).get("waits"))
+        assert "slices" not in scene_of(url)
 
 
 def test_what_is_cancelled_stops_and_an_interrupt_leaves_nothing(tmp_path: Path, temporary: Path) -> None:

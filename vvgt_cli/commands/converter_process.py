@@ -123,7 +123,8 @@ class LoadedVolume:
         """Return a conversion with its page: the libraries that a page needs are loaded here already."""
         cloud = Cloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
-        return Converted(cloud.ply, page_files(cloud, converts=True), cloud.live)
+        sliced = not all(layer.colors for layer in conversion.field.source.layers)
+        return Converted(cloud.ply, page_files(cloud, converts=True, sliced=sliced), cloud.live)
 
 
 def _missing() -> str | None:

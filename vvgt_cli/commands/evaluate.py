@@ -13,7 +13,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.place import headset_axes, preview, to_box_frame, upright_axes
 from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -32,6 +32,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
 from vvgt_cli.score.viewing import (
     CLOSE,
+    ConditionPicture,
     ViewingCondition,
     condition_pictures,
     condition_views,
@@ -208,7 +209,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
     if (target := target_of(request.target)) is not None:
-        if not request.conditions:
+        if target.eye is not None and not request.conditions:
             raise UsageError(
                 f"--no-conditions with --for {target.name}: its eyes are conditions; give one or the other"
             )
@@ -268,20 +269,21 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
     if request.conditions:
-        _look_around(run, evaluation, volume, gaussians, rule, request.target)
+        eyes = eye_pictures(request.target, headset_axes(source.volume, header.up))
+        _look_around(run, evaluation, volume, gaussians, rule, eyes)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
 
 
 def _look_around(
-    run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule, target: str | None
+    run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule, eyes: list[ConditionPicture]
 ) -> None:
     """Score the viewing conditions, those of a headset, too, and texture seen from near."""
     from vvgt_cli.dvr import RenderSettings
 
     size, settings = evaluation.size, RenderSettings()
-    places = condition_pictures(viewing_conditions(size)) + eye_pictures(target)
+    places = condition_pictures(viewing_conditions(size)) + eyes
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
     with run.stage("conditions") as stage, _together(volume, wanted):
         seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))

@@ -212,13 +212,13 @@ def parse_function(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
+def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
     """Return the text of a page, named "", and the file that it loads.
 
     Args:
         cloud: what it shows, live if possible.
-        converts: whether there is a volume, which has slices, and which can be converted for a function if it has a
-            single layer.
+        converts: whether there is a volume, which can be converted for a function if it has a single layer.
+        sliced: whether the volume has slices.
 
     Raises:
         DataError: a library that pages of live Gaussians need is missing.
@@ -232,7 +232,7 @@ def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         held = base64.b64encode(planes).decode("ascii")
         elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
         more = {"live": facts, "server": {"converts": converts and len(facts["layers"]) == 1, "name": cloud.name}}
-    if converts:
+    if sliced:
         more["slices"] = {"from": SLICES}
     text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
     return {"": text.encode("utf-8"), name: file}

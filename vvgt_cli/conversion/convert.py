@@ -13,8 +13,8 @@ from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.file_layout import degree_of, harmonics_warning, ply_options
 from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
 from vvgt_cli.conversion.live import check_live, convert_live, editor_form
-from vvgt_cli.conversion.place import placement_warnings, to_unit_frame
-from vvgt_cli.conversion.plan import Plan, Planner, check_memory
+from vvgt_cli.conversion.place import headset_axes, placement_warnings, to_unit_frame
+from vvgt_cli.conversion.plan import Plan, Planner, check_memory, report_target
 from vvgt_cli.conversion.readback import report_format_cost
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.result import Conversion
@@ -113,7 +113,9 @@ def plan_conversion(request: ConvertRequest, console: Console | None = None) -> 
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
     with open_field(run, replace(request, output=None)) as field:
-        return _planned(run, request, field)[-1]
+        work, _, plan = _planned(run, request, field)
+        report_target(run, work.fit, request.megabytes)
+        return plan
 
 
 def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
@@ -155,6 +157,7 @@ def run_conversion(
     if start is not None:
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
+    report_target(run, work.fit, request.megabytes)
     if made is not None or regions:
         finish = planner.finish(work.limits.time_budget is None) if regions else []
         plan = plan.for_made(plan.gaussians if made is None else len(made), planner.sh_degree, finish)
@@ -206,7 +209,7 @@ def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = T
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit, sh_degree=request.ply.sh_degree or degree, wide=guess, whole=request.scored_whole,
-        writes=request.writes,
+        writes=request.writes, axes=headset_axes(field.source.volume, ply_options(request, field.source).up),
     )  # fmt: skip
     plan = planner.plan(workload, run.elapsed())
     run.report.plan = plan.record()
@@ -337,11 +340,6 @@ def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     run.report.options = asdict(fit) | asdict(request.limits) | {
         "max_megabytes": request.megabytes, "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
-    if fit.target is not None:
-        most = "" if request.megabytes is None else f"{request.megabytes:g} MB, "
-        run.console.message(
-            f"for {fit.target}: at most {most}{request.budget()} Gaussians, {fit.size} px, drawn as {fit.rule}"
-        )
 
 
 def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) -> tuple[str, ...]:

@@ -297,7 +297,7 @@ def convert_files(
         kind, together = FRAMES, True
         check_options(ONE_FILE, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
-    request = replace(request, editor=request.editor and not together)
+    request = replace(request, editor=request.editor and not together, several=together)
     looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
     batch = _batch(kind, request, looks, share, together)
     if together:

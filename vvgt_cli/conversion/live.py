@@ -15,10 +15,11 @@ import numpy as np
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.certify import with_certificate
-from vvgt_cli.conversion.file_layout import degree_of
+from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.live_labels import label_facts, label_fog_field, live_labels, with_labels
-from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
+from vvgt_cli.conversion.place import headset_axes, to_box_frame, to_frame_of, to_unit_frame
+from vvgt_cli.conversion.plan import report_target
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.result import Conversion
@@ -112,6 +113,8 @@ def convert_live(
     """
     source, fit = field.source, replace(request.fit, max_gaussians=request.budget())
     request = replace(request, fit=fit)
+    if scored:
+        report_target(run, fit, request.megabytes)
     lighting, pixel = box_lighting(source), pixel_width(fit.size)
     check_layers(source)
     if len(source.layers) > 1:
@@ -207,7 +210,10 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
         )
         stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as other viewers show it"
     work = Work(run, field, fit, gaussians=gaussians)
-    for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions(fit.target)):
+    for stage_of_scores in (
+        TestViews(request.scored_whole),
+        ViewingConditions(fit.target, headset_axes(source.volume, ply_options(request, source).up)),
+    ):
         stage_of_scores.run(work)
     return live.psnr
 

@@ -20,6 +20,7 @@ from vvgt_cli.volume.space import shear_text, world_axis
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.score.viewing import Axes
 
 AUTO, NONE = "auto", "none"
 
@@ -96,6 +97,11 @@ def upright_axes(volume: Volume, up: str) -> np.ndarray:
     """Return the (3, 3) matrix from the box frame to the frame of previews: world directions with ``up`` along +z."""
     result: np.ndarray = upright_matrix(up) @ volume.axes
     return result
+
+
+def headset_axes(volume: Volume, up: str) -> Axes:
+    """Return the rows of `upright_axes` with what is up in a viewer along +z; without an ``up`` that is PLY -y."""
+    return tuple(map(tuple, upright_axes(volume, "-y" if up == NONE else up).tolist()))
 
 
 def preview(

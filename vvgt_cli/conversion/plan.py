@@ -24,6 +24,8 @@ from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
+from vvgt_cli.score.record import Run
+from vvgt_cli.score.viewing import UPRIGHT, Axes
 
 MOST_STEPS = 400  # where a target or a time limit decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
@@ -133,6 +135,7 @@ class Planner:
         wide: whether Gaussians are wide enough to be seen in small views.
         whole: whether all ten test views are scored.
         writes: number of times that the file is written.
+        axes: those of a headset, `vvgt_cli.conversion.place.headset_axes`.
     """
 
     limits: Limits
@@ -141,6 +144,7 @@ class Planner:
     wide: bool = True
     whole: bool = False
     writes: int = 1
+    axes: Axes = UPRIGHT
 
     @property
     def vbm(self) -> bool:
@@ -152,7 +156,7 @@ class Planner:
         count = self.fit.max_gaussians
         plan = Plan(workload, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
-        last: list[Stage] = [TestViews(self.whole), ViewingConditions(self.fit.target)]
+        last: list[Stage] = [TestViews(self.whole), ViewingConditions(self.fit.target, self.axes)]
         left = None
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
@@ -273,3 +277,12 @@ def check_memory(plan: Plan, pictures: float = 0.0, beside: Callable[[Workload],
         f"{plan.gaussians} Gaussians need about {need / 2**30:.2f} GiB of memory more, {free / 2**30:.2f} GiB are "
         f"free; --max-gaussians {fewer} would fit, or give the job more"
     )
+
+
+def report_target(run: Run, fit: FitOptions, megabytes: float | None) -> None:
+    """Report what a device allows, where the file is made for one."""
+    if fit.target is not None:
+        most = "" if megabytes is None else f"{megabytes:g} MB, "
+        run.console.message(
+            f"for {fit.target}: at most {most}{fit.max_gaussians} Gaussians, {fit.size} px, drawn as {fit.rule}"
+        )

@@ -130,6 +130,7 @@ class ConvertRequest:
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
+        several: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
     """
 
     source: SourceRequest
@@ -146,6 +147,7 @@ class ConvertRequest:
     editor: bool = False
     slices: bool = False
     all_views: bool = False
+    several: bool = False
     command: str | None = None
     title: str | None = None
     blocks: BlockOptions | None = None
@@ -178,7 +180,7 @@ class ConvertRequest:
         if self.limits.max_megabytes is not None or target is None:
             return self.limits.max_megabytes
         limited = not self.live if known is None else known.suffix == ".html"
-        return target.megabytes if limited else None
+        return target.megabytes if limited and not self.several else None
 
     @property
     def scored_whole(self) -> bool:

@@ -133,6 +133,8 @@ def _name_of(function: FunctionLike | None) -> str:
 class Goal(Limits, FitOptions):
     """The goal of a conversion: the attributes of `FitOptions` (``target`` is ``--for``) and `Limits`.
 
+    What is not given follows from the target when the goal is made; ``replace`` with another target keeps it.
+
     Attributes:
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
     """

@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views, look_at
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
+from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
@@ -29,6 +30,8 @@ VIEWS = (0, 4, 9)  # test views: above, side, below
 SIDE = (4,)  # one view is enough to find the worst condition
 # In a headset a body's longest edge is 2 m, its middle 1.3 m up and, at first, 2 m away (formats/page/where.mjs).
 AWAY = (2.0, 1.5)  # metres from the middle to the eyes: at first, and half a metre before the surface, an arm's length
+Axes = tuple[tuple[float, ...], ...]
+UPRIGHT: Axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 UP, APART = 0.3, 0.063  # metres: eyes 1.6 m up, and between both
 PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of scores without a report: above, side, below
 
@@ -115,11 +118,17 @@ def condition_pictures(
 
 
 def eye_pictures(
-    target: str | None, views: Collection[int] = VIEWS, enough: int = ENOUGH
-) -> list[ConditionPicture]:  # fmt: skip
+    target: str | None, axes: Axes = UPRIGHT, views: Collection[int] = VIEWS, enough: int = ENOUGH
+) -> list[ConditionPicture]:
     """List the pictures of both eyes in a headset, as `condition_pictures`; none for a screen.
 
     Eyes look at the middle of the body from the azimuths of the test views; the middle `FIELD_OF_VIEW` degrees count.
+
+    Args:
+        target: name of a device, None for none.
+        axes: rows of the (3, 3) matrix from the box frame to one whose +z is up in the headset.
+        views: numbers of the test views.
+        enough: approximate number of blocks per view.
     """
     device = target_of(target)
     if device is None or device.focal is None:
@@ -133,7 +142,7 @@ def eye_pictures(
             head = look_at((ring * x, ring * y, UP), width=size, height=size)
             for right in (-APART / 2, APART / 2):
                 eye = replace(head, translation=head.translation - (right, 0, 0))
-                found.append((place, eye, spread_blocks(size, size, i, enough)))
+                found.append((place, to_box_frame(eye, np.array(axes))[0], spread_blocks(size, size, i, enough)))
     return found
 
 

@@ -15,6 +15,8 @@ from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
     TEXTURED,
+    UPRIGHT,
+    Axes,
     ConditionPicture,
     condition_pictures,
     condition_views,
@@ -93,22 +95,26 @@ class ViewingConditions(Stage):
 
     Attributes:
         target: name of the device that the file is made for; a headset's eyes are scored, too.
+        axes: those of a headset (`vvgt_cli.conversion.place.headset_axes`).
     """
 
     name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
     target: str | None = None
+    axes: Axes = UPRIGHT
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels and Gaussians."""
         near = (workload.size // TEXTURED) ** 2
         splats = CONDITIONS[0] + CONDITIONS[1] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
-        views = sum(enough == FEW for _, enough in _places(workload.size)) + len(eye_pictures(self.target, SIDE))
+        views = sum(enough == FEW for _, enough in _places(workload.size)) + len(
+            eye_pictures(self.target, self.axes, SIDE)
+        )
         return Cost(views * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats)
 
     def _wanted(self, size: int) -> list[ConditionPicture]:
         around = [one for place, enough in _places(size) for one in condition_pictures([place], SIDE, enough)]
-        return around + eye_pictures(self.target, SIDE, FEW)
+        return around + eye_pictures(self.target, self.axes, SIDE, FEW)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """List the pictures that are scored."""

@@ -120,7 +120,7 @@ def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
         return []
     logits = np.concatenate([splats.logits for splats in clouds])
     ordered = np.sort(logits).astype(np.float64)
-    opacity = np.cumsum(1 / (1 + np.exp(-ordered)))
+    opacity = np.cumsum(1 / (1 + np.exp(-np.maximum(ordered, -80))))
     first = np.searchsorted(opacity, _FAINT * opacity[-1]) if len(ordered) else 0
     least = np.clip(ordered[first : first + 1], _DRAWN, _SEEN)
     places = np.concatenate([splats.means for splats in clouds])[logits >= least] * (-1.0, -1.0, 1.0)

@@ -1,5 +1,6 @@
-// In a page that is one file, the viewer's program is packed; it becomes a script.
+// In a page that is one file, the viewer's program is packed; it becomes a script. What the file holds is kept for saving it again.
 (async () => {
+  window.vvgtSource = document.cloneNode(true);
   const text = atob(document.getElementById('program').textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));

@@ -9,7 +9,7 @@ const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .han
 export function helpRows(buttons, { live, values, picks, sliced }) {
   return [
     ['drag', 'turn'], ['right drag, two fingers', 'move'], ['wheel, pinch', 'nearer, farther'],
-    ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['double click', 'turn about that place']] : []),
+    ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['Enter', 'as a click in the middle of the view'], ['double click', 'turn about that place']] : []),
     ['arrow keys', 'turn; with Shift: move'], ['+ −', 'nearer, farther'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
     ...(live?.next ? [['K', 'the look, MIP, X-ray']] : []),
@@ -20,10 +20,10 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
   ];
 }
 
-// {root, toggle()} of a panel of rows; of all of them one is open at a time
+// {root, toggle()} of a panel of rows, or without them of what the caller puts there; of all of them one is open at a time
 const panels = [];
 export function listed(id, name, rows) {
-  const root = Object.assign(document.createElement('section'), { id, className: 'listed', hidden: true, tabIndex: 0, innerHTML: '<h2></h2><dl></dl>' });
+  const root = Object.assign(document.createElement('section'), { id, className: 'listed', hidden: true, tabIndex: 0, innerHTML: `<h2></h2><${rows ? 'dl' : 'div'}></${rows ? 'dl' : 'div'}>` });
   root.firstChild.textContent = name;
   root.setAttribute('aria-label', name);
   let button = null;
@@ -41,7 +41,7 @@ export function listed(id, name, rows) {
     },
   };
   panels.push(panel);
-  panel.rows(rows);
+  if (rows) panel.rows(rows);
   return panel;
 }
 

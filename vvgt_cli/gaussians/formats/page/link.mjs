@@ -1,4 +1,4 @@
-// A link that restores what is seen: #slices=...&view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
+// A link that restores what is seen: #marks=...&slices=...&view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
 // which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 
@@ -45,15 +45,15 @@ function stateOf({ key, state, set, text: own, read }) {
 
 export const liveParts = (live) => live.parts.map(stateOf);
 
-export function linkOf(parts) {
-  const said = parts.map(({ key, get }) => [key, get()]).filter(([, text]) => text).map(([key, text]) => `${key}=${text}`);
-  return `${location.href.split('#')[0]}#${said.join('&')}`;
-}
+export const saidBy = (parts) => parts.map(({ key, get }) => [key, get()]).filter(([, text]) => text).map(([key, text]) => `${key}=${text}`).join('&');
+export const linkOf = (parts) => `${location.href.split('#')[0]}#${saidBy(parts)}`;
 
-export async function restore(parts) {
-  let text = '';
-  try { text = decodeURIComponent(location.hash.slice(1)); } catch { return; }  // not a link of ours
-  const said = new Map(text.split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
+// what the address says, else what a saved page begins with
+export async function restore(parts, begins = '') {
+  let said;
+  try {
+    said = new Map((location.hash.slice(1) || begins).split('&').map((part) => [part.split('=')[0], decodeURIComponent(part.slice(part.indexOf('=') + 1))]));
+  } catch { return; }  // not a link of ours
   if (!said.has('view')) return;
   for (const { key, get, set } of parts) {
     const text = said.get(key) ?? '';

@@ -1,4 +1,4 @@
-// Places that are clicked, with their values; in measuring, two and the distance between them.
+// Places that are clicked, with their values.
 import { cloudOf, seen } from './cloud.mjs';
 import { looksOf, valueAt } from './live_at.mjs';
 import { shown } from './facts.mjs';
@@ -6,21 +6,17 @@ import { element, label } from './svg.mjs';
 
 const STILL = 6;  // pixels that a click stays within
 
-// picked(place): of every place that is found
-export function rulerOf(lens, worldNow, dataNow, look, changed, picked) {
+// pick(x, y), also at every click; picked(place): what is there, or null
+export function pickerOf(lens, worldNow, dataNow, look, picked) {
   const { canvas } = lens;
-  let measuring = false, places = [], of = null, cloud = null, down = null;
+  let of = null, cloud = null, down = null;
 
   function pick(x, y) {
     const data = dataNow();
-    if (!data.numSplats) return null;  // streamed: not here
+    if (!data.numSplats) return;  // streamed: not here
     if (of !== data) [of, cloud] = [data, cloudOf(data)];
-    places = measuring && places.length < 2 ? places : [];
     const place = seen(cloud, lens.ray(x, y), look && looksOf(look), lens.flat);
-    if (place) places.push({ place, world: worldNow().place(place), ...(look ? valueAt(look, cloud, place) : { value: null, in: '' }) });
-    changed(measuring && !place ? 'nothing under the pointer' : '');
-    if (place) picked(places.at(-1));
-    return place && places.at(-1);
+    picked(place && { place, world: worldNow().place(place), ...(look ? valueAt(look, cloud, place) : { value: null, in: '' }) });
   }
 
   canvas.addEventListener('pointerdown', (event) => {
@@ -32,22 +28,8 @@ export function rulerOf(lens, worldNow, dataNow, look, changed, picked) {
     down = null;
   });
   canvas.addEventListener('pointercancel', () => { down = null; });
-  canvas.addEventListener('dblclick', () => {
-    if (places.length && !measuring) lens.set({ ...lens.pose(), target: places.at(-1).place });
-  });
-
-  return {
-    pick,
-    get places() { return places; },
-    get measuring() { return measuring; },
-    measure(now) {
-      measuring = now;
-      canvas.classList.toggle('measuring', now);
-      places = [];
-      changed();
-    },
-    distance: () => (places.length > 1 ? Math.hypot(...places[0].world.map((x, k) => x - places[1].world[k])) : null),
-  };
+  canvas.addEventListener('mousedown', (event) => event.preventDefault());  // after a tap it would take the focus from a new note
+  return pick;
 }
 
 // The value at a place, in words; '' where it is unknown
@@ -60,23 +42,18 @@ export function placeText(place, { letters, anatomical, unit }) {
   return `${along.join(', ')}${unit && ` ${unit}`}${text && `: ${text}`}`;
 }
 
+const LOOKS = [{ stroke: '#000', 'stroke-width': 4, 'stroke-opacity': 0.6, fill: 'none' }, { stroke: '#fc3', 'stroke-width': 1.5, fill: 'none' }];
+export const drawPath = (group, d) => group.append(...LOOKS.map((look) => element('path', { d, ...look })));
+
+// a ring at a pixel, with text beside it
+export function drawPlace(group, [x, y], text, size = 14) {
+  drawPath(group, `M${(x + 5).toFixed(1)},${y.toFixed(1)}a5,5 0 1 0 0,.01Z`);
+  group.append(label(text, x + 8, y - 6, { fill: '#fc3', 'font-size': size }));
+}
+
 // The lines that cross in the slices, in the picture
 export function drawCross(group, lens, lines) {
   for (const [a, b] of lines.map((line) => line.map(lens.project))) {
     if (a && b) group.append(element('line', { x1: a[0], y1: a[1], x2: b[0], y2: b[1], stroke: '#fff', 'stroke-width': 1, 'stroke-opacity': 0.6 }));
   }
-}
-
-export function drawRuler(group, { lens, world, ruler }) {
-  const at = ruler.places.map(({ place }) => lens.project(place)), [a, b] = at, distance = ruler.distance();
-  if (a && b) {
-    const line = { x1: a[0], y1: a[1], x2: b[0], y2: b[1] };
-    group.append(element('line', { ...line, stroke: '#000', 'stroke-width': 4, 'stroke-opacity': 0.6 }), element('line', { ...line, stroke: '#fc3', 'stroke-width': 1.5 }));
-  }
-  at.forEach((p, k) => {
-    if (!p) return;
-    group.append(element('circle', { cx: p[0], cy: p[1], r: 5, fill: 'none', stroke: '#000', 'stroke-width': 4, 'stroke-opacity': 0.6 }), element('circle', { cx: p[0], cy: p[1], r: 5, fill: 'none', stroke: '#fc3', 'stroke-width': 1.5 }));
-    group.append(label(ruler.measuring ? String(k + 1) : valueText(ruler.places[k]), p[0] + 8, p[1] - 6, { fill: '#fc3', 'font-size': ruler.measuring ? 12 : 14 }));
-  });
-  if (a && b) group.append(label(`${shown(distance, 4)}${world.unit && ` ${world.unit}`}`, (a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8, { fill: '#fc3', 'text-anchor': 'middle', 'font-weight': 600 }));
 }

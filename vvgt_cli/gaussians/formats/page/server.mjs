@@ -172,7 +172,8 @@ export async function served(panel, viewer, server, converted) {
     try {
       const answer = await send('save', improved() ? { file, number, ...shown() } : { file, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
-      download(await answer.blob(), `${name}.${file}`);
+      const link = file === 'html' && panel.begins?.(), at = (found) => `${found}"link": ${JSON.stringify(link).replaceAll('<', '\\u003c')}, `;
+      download(link ? new Blob([(await answer.text()).replace('id="scene">{', at)], { type: 'text/html' }) : await answer.blob(), `${name}.${file}`);
     } catch (error) {
       say(error instanceof TypeError ? 'vvgt view has stopped' : error.message, true);
     }

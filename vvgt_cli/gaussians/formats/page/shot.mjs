@@ -8,19 +8,42 @@ async function drawingOf(svg, scale) {
   return image;
 }
 
-export async function pictureOf({ app }, svg) {
-  const source = app.graphicsDevice.canvas, picture = document.createElement('canvas'), context = picture.getContext('2d');
-  await new Promise((done) => {
+// [wide, high] of the pictures that this browser can draw: the window's, twice and four times as large
+export function sizesOf({ graphicsDevice: { gl, canvas } }) {
+  const most = Math.min(gl.getParameter(gl.MAX_TEXTURE_SIZE), gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), ...gl.getParameter(gl.MAX_VIEWPORT_DIMS));
+  return [1, 2, 4].map((times) => [times * canvas.width, times * canvas.height]).filter((size, k) => !k || Math.max(...size) <= most);
+}
+
+// a PNG of `size`, [wide, high]; one frame is drawn so large, and the viewer gives the canvas its own size in the next one
+export async function pictureOf({ app }, svg, size) {
+  const { graphicsDevice: { canvas: source, gl } } = app, picture = document.createElement('canvas'), context = picture.getContext('2d');
+  const [wide, high] = size ?? [source.width, source.height];
+  const enlarge = () => { if (source.width !== wide || source.height !== high) [source.width, source.height] = [wide, high]; };  // after the viewer's
+  const tooLarge = () => new Error(`this browser cannot draw ${wide} × ${high} px: choose a smaller picture`);
+  app.once('framerender', enlarge);
+  await new Promise((done, fail) => {
     app.once('frameend', () => {  // later the engine's picture is gone
-      [picture.width, picture.height] = [source.width, source.height];
-      context.fillRect(0, 0, picture.width, picture.height);
+      app.renderNextFrame = true;
+      if (gl.drawingBufferWidth !== wide || gl.drawingBufferHeight !== high) return fail(tooLarge());
+      [picture.width, picture.height] = [wide, high];
+      context.fillRect(0, 0, wide, high);
       context.drawImage(source, 0, 0);
-      done();
+      return done();
     });
     app.renderNextFrame = true;
   });
-  context.drawImage(await drawingOf(svg, source.width / source.clientWidth), 0, 0, picture.width, picture.height);
-  return new Promise((done) => picture.toBlob(done, 'image/png'));
+  context.drawImage(await drawingOf(svg, wide / source.clientWidth), 0, 0, wide, high);
+  const blob = await new Promise((done) => picture.toBlob(done, 'image/png'));
+  if (!blob) throw tooLarge();
+  return blob;
+}
+
+// this page as its file was, but that it begins with `link`
+export function pageOf(source, link) {
+  const said = source.getElementById('said'), scene = source.getElementById('scene');
+  said.textContent = said.dataset.without ?? said.textContent;
+  scene.textContent = JSON.stringify({ ...JSON.parse(scene.textContent), link }).replaceAll('<', '\\u003c');  // so that no name can end the script
+  return new Blob([`<!doctype html>\n${source.documentElement.outerHTML}\n`], { type: 'text/html' });
 }
 
 export function save(blob, name) {

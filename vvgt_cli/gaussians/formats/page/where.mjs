@@ -1,6 +1,6 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
 import { notice, rowsOf } from './about.mjs';
-import { factsOf, shown, worldOf } from './facts.mjs';
+import { factsOf, worldOf } from './facts.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
 import { facesOf } from './face.mjs';
 import { firstAngles, stayFree } from './free.mjs';
@@ -8,11 +8,12 @@ import { handlesOf } from './handles.mjs';
 import { helpRows, listed, listen } from './keys.mjs';
 import { lensOf } from './lens.mjs';
 import { messages } from './messages.mjs';
-import { frameParts, linkOf, liveParts, restore, viewParts } from './link.mjs';
+import { frameParts, linkOf, liveParts, restore, saidBy, viewParts } from './link.mjs';
+import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
-import { drawCross, drawRuler, placeText, rulerOf } from './ruler.mjs';
+import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
-import { pictureOf, save } from './shot.mjs';
+import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
 import { slicesOf } from './slices.mjs';
 import { element } from './svg.mjs';
 
@@ -33,10 +34,10 @@ export function where(viewer, scene, live, show) {
   const values = live?.layers.some(({ nodes }) => nodes), box = document.createElement('nav'), buttons = [];
   box.id = 'tools';
   box.setAttribute('aria-label', 'view');
-  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []);
+  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []), sizes = listed('sizes', 'Save the picture as PNG');
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
   const poor = notice();
-  document.body.append(poor.root, box, help.root, about.root, places);
+  document.body.append(poor.root, box, help.root, about.root, sizes.root, places);
   places.setAttribute('role', 'status');
   let data, world, facts, drawn = '', stamp = 0, told = '';
   const state = {};
@@ -45,7 +46,15 @@ export function where(viewer, scene, live, show) {
   const dataNow = () => app.assets.get(app.root.findByName('gsplat').gsplat.asset)?.resource?.gsplatData ?? data ?? { comments: scene.comments ?? [], numSplats: 0 };
   const frame = () => (show ? document.querySelector('#series select').selectedIndex : 0);
   const again = (text = '') => { told = text; stamp++; app.renderNextFrame = true; };
-  const ruler = rulerOf(lens, () => world, dataNow, live?.look ?? null, again, (place) => {
+  const name = () => scene.frames[frame()].name.replace(/\.(ply|html)$/, '').replace(/[^\w.-]+/g, '-');
+  const marks = marksOf(() => world, () => again(), window.vvgtSource ? () => save(pageOf(window.vvgtSource, saidBy(parts)), `${name()}.html`) : null);
+  box.after(marks.root);
+  let clicked = null;
+  const pick = pickerOf(lens, () => world, dataNow, live?.look ?? null, (place) => {
+    clicked = place;
+    again(marks.open && !place ? 'nothing under the pointer' : '');
+    if (!place) return;
+    if (marks.open) marks.take(place);
     live?.select(place);
     slices?.to(place.world);
     site.say('picked', { place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
@@ -53,17 +62,21 @@ export function where(viewer, scene, live, show) {
   const labelled = (layer) => live && live.look.layers[layer].labels.map((_, k) => live.look.rows[live.look.layers[layer].row + k]);
   const slices = scene.slices && slicesOf(scene, {
     world: () => world, cuts: Boolean(live), rows: labelled, moved: () => again(),
-    picked: (place) => place && site.say('picked', { place: place.world, unit: world.unit, value: place.value ?? place.names[0] ?? null, in: place.in, layer: place.layer }),
+    picked(place) {
+      if (place && marks.open) marks.take(place);
+      if (place) site.say('picked', { place: place.world, unit: world.unit, value: place.value ?? place.names[0] ?? null, in: place.in, layer: place.layer });
+    },
   });
   const faces = slices && live && facesOf(viewer);
   let faced = '[[],0]';
-  const parts = [...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const parts = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+
+  if (live) live.begins = () => saidBy(parts.filter(({ key }) => !/^(function|labels|light|drawn)/.test(key)));  // of a page that the server makes for the look
 
   function take(now) {  // another frame is another file
     data = now;
     facts = factsOf(now.comments);
     world = worldOf(facts, scene.enlarged);
-    if (ruler.measuring) ruler.measure(true);
     sides(world).forEach(([, axis, sign], k) => {
       const { made, title } = buttons[k];
       made.textContent = world.letters[axis][sign < 0 ? 0 : 1];
@@ -96,11 +109,26 @@ export function where(viewer, scene, live, show) {
   button('fit', 'fit into the window', 'f', () => look(lens.pose()));
   button('reset', 'reset the view', 'r', () => { last = null; look(firstAngles(scene)); });
   const projection = button('perspective', 'orthographic or perspective', 'o', () => { lens.flat = !lens.flat; again(); });
-  const measuring = button('measure', 'measure a distance: click two points', 'm', () => ruler.measure(!ruler.measuring));
+  const measure = (now) => {
+    if (now) marks.toggle();
+    else marks.stop();
+    lens.canvas.classList.toggle('measuring', marks.open);
+    clicked = null;
+    again();
+  };
+  const measuring = button('measure', 'rulers, angles and notes: click their points', 'm', () => measure(true));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume, beside the picture', 's', () => slices.toggle());
-  const picture = async () => save(await pictureOf(viewer, svg), `${scene.frames[frame()].name.replace(/\.(ply|html)$/, '').replace(/[^\w.-]+/g, '-')}.png`);
-  button('picture', 'save the picture as PNG', 'p', picture);
+  const picture = (size) => pictureOf(viewer, svg, size).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
+  sizes.of(button('picture', 'save the picture as PNG, in the window\'s size, twice or four times as large', 'p', () => {
+    sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
+      const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
+      made.addEventListener('click', () => { sizes.close(); lens.canvas.focus({ preventScroll: true }); picture(size); });
+      return made;
+    }));
+    sizes.toggle();
+    sizes.root.querySelector('button').focus();
+  }));
   button('link', 'link to this view', 'l', async () => {
     const link = linkOf(parts);
     try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
@@ -129,9 +157,13 @@ export function where(viewer, scene, live, show) {
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
   const act = Object.fromEntries(buttons.filter(({ key }) => key).map(({ key, press }) => [key, press]));
-  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle }, () => { poor.close(); ruler.measure(false); }, again);
+  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => { poor.close(); measure(false); }, again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
+  lens.canvas.addEventListener('dblclick', () => {
+    if (clicked && !marks.open) lens.set({ ...lens.pose(), target: clicked.place });
+  });
+  for (const event of ['focus', 'blur']) lens.canvas.addEventListener(event, () => { if (marks.open) again(told); });
   addEventListener('hashchange', () => restore(parts).then(again));
 
   function legend(group, wide, high) {
@@ -152,25 +184,24 @@ export function where(viewer, scene, live, show) {
   }
 
   function draw() {
-    const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, ruler, left: LEFT };
+    const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, left: LEFT };
     const [letters, rest, colors] = ['over', '', 'over'].map((name) => element('g', { class: name }));
     state.letters = drawLetters(letters, all);
     state.scale = drawScale(rest, { ...all, left: LEFT + 96 });
     state.legend = legend(colors, wide, high);
-    drawRuler(rest, all);
+    marks.draw(rest, { ...all, cross: marks.open && lens.canvas.matches(':focus-visible') && lens.middle });
+    const at = clicked && !marks.open && lens.project(clicked.place);
+    if (at) drawPlace(rest, at, valueText(clicked));
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
     handles?.draw(world);
     if (faces) drawFaces();
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
-    const lines = ruler.places.map((place, k) => `${ruler.measuring ? `${k + 1}: ` : ''}${placeText(place, world)}`);
-    if (ruler.places.length > 1) lines.push(`distance ${shown(ruler.distance(), 4)}${world.unit && ` ${world.unit}`}`);
-    else if (ruler.measuring && !lines.length) lines.push('click two points');
-    if (told) lines.push(told);
+    const lines = [...(clicked ? [placeText(clicked, world)] : []), ...(marks.open ? [marks.hint] : []), ...(told ? [told] : [])];
     [places.hidden, places.textContent] = [!lines.length, lines.join('\n')];
     projection.innerHTML = ICONS[lens.flat ? 'orthographic' : 'perspective'];
-    measuring.setAttribute('aria-pressed', String(ruler.measuring));
+    measuring.setAttribute('aria-expanded', String(marks.open));
     slicing?.setAttribute('aria-expanded', String(slices.open));
   }
 
@@ -185,6 +216,7 @@ export function where(viewer, scene, live, show) {
   });
   take(dataNow());
   const fit = stayFree(lens, scene, draw);
-  Object.assign(state, { lens, ruler, site, slices, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
+  Object.defineProperty(state, 'clicked', { get: () => clicked });
+  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
