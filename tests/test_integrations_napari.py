@@ -117,6 +117,20 @@ def test_a_first_axis_is_time(viewer, tmp_path) -> None:
 
 
 @pytest.mark.long
+def test_what_napari_draws_otherwise_is_named_once(viewer, tmp_path, recwarn) -> None:
+    plane = {"position": (5, 5, 5), "normal": (1, 0, 0), "enabled": True}
+    look = {"rendering": "attenuated_mip", "interpolation3d": "nearest", "depiction": "plane"}
+    viewer.add_image(point(), name="a", contrast_limits=(0, 90), experimental_clipping_planes=[plane], **look)
+    viewer.add_image(point(), name="b", contrast_limits=(0, 90), rendering="translucent", gamma=0.5)
+    saved(viewer, tmp_path / "a.splats.ply")
+    said = [str(one.message) for one in recwarn if "not taken" in str(one.message)]
+    assert said == [
+        "not taken from the layers: a: rendering attenuated_mip (translucent instead), nearest-neighbour interpolation "
+        "(linear instead), one plane (all instead), clipping planes"
+    ]
+
+
+@pytest.mark.long
 def test_what_cannot_be_saved_says_why(viewer, tmp_path) -> None:
     viewer.add_image(np.zeros((8, 8, 3), np.uint8), rgb=True, name="photo")
     with pytest.raises(vvgt_cli.UsageError, match="photo: an RGB image; expected z, y, x"):

@@ -86,10 +86,20 @@ def test_what_is_in_memory_is_read_alike(field, converted, tmp_path):
     inputs = {"image": (grid, {}), "labelled": (labelled, {}), "affine": (field, {"affine": affine})}
     inputs["turned"] = (labelled.transpose("x", "z", "y")[::-1], {})  # its coordinates say where values are
     inputs["volume"] = (vvgt.read_volume(field, spacing=SPACING), {})
+    inputs["pyvista's"] = (grid["values"].reshape(field.shape), {"spacing": SPACING})  # has the methods of VTK's arrays
     for name, (volume, reading) in inputs.items():
         result = vvgt.convert(volume, TF, HOW, **reading)
         unnamed = saved(result, tmp_path / f"{name}.ply").replace(b'"quantity": "values"', b'"quantity": ""')
         assert unnamed == wanted, name
+
+
+def test_masked_values_are_nan(field):
+    masked = np.ma.masked_greater((field * 255).astype(np.int16), 100)
+    read = np.asarray(vvgt.read_volume(masked).data)
+    assert np.array_equal(np.isnan(read), masked.mask)
+    assert np.array_equal(read[~masked.mask], masked.compressed())
+    whole = np.ma.masked_array(np.ones((4, 4, 4), np.uint8))
+    assert vvgt.read_volume(whole).data.dtype == np.uint8
 
 
 def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):

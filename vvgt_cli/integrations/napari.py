@@ -10,6 +10,7 @@ Enable:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,8 @@ NODES = 33  # of a colour map, which napari interpolates between 256 colours
 def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[str]:
     """Write the visible layers among ``layers`` (data, attributes, kind) to a page or file; return its path.
 
+    One warning names what is drawn otherwise.
+
     Raises:
         UsageError: none is visible, or one has no three axes in space; napari passes over a ValueError.
         VvgtError: see `vvgt_cli.convert`.
@@ -39,6 +42,9 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     if not shown:
         raise UsageError("no visible layer; show one of those that are saved")
     steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
+    lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer))]
+    if lost:
+        warnings.warn(f"not taken from the layers: {'; '.join(lost)}", stacklevel=2)
     found = [_converted(shown, step) for step in range(steps)]
     if steps == 1:
         found[0].save(path)
@@ -56,6 +62,18 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
 def _converted(layers: Sequence[Any], step: int) -> Any:
     """Convert a time step of all layers, unlit: napari's views of images have no light."""
     return together([(Content((_volume(layer, step),)), _look(layer)) for layer in layers], "none")
+
+
+def _lost(layer: Any) -> list[str]:
+    """Return notes on how napari draws a layer, and its Gaussians do not."""
+    lost = {
+        f"rendering {layer.rendering} (translucent instead)": layer.rendering not in ("translucent", "iso_categorical"),
+        "nearest-neighbour interpolation (linear instead)": getattr(layer, "interpolation3d", "") == "nearest",
+        "one plane (all instead)": layer.depiction != "volume",
+        "clipping planes": any(plane.enabled for plane in layer.experimental_clipping_planes),
+        "colour of NaN (clear instead)": hasattr(layer.colormap, "nan_color") and bool(layer.colormap.nan_color[3]),
+    }
+    return [note for note, found in lost.items() if found]
 
 
 def _values(layer: Any) -> Any:

@@ -28,9 +28,9 @@ def volume_in_memory(
     """Make a volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
 
     Args:
-        data: array of three axes, (nz, ny, nx) as slices are stacked; an xarray.DataArray, whose coordinates say where
-            its values are; or a vtkDataSet (pyvista.ImageData, ...), of which an image is taken as it is and a mesh is
-            resampled.
+        data: array of three axes, (nz, ny, nx) as slices are stacked, of which masked values become NaN; an
+            xarray.DataArray, whose coordinates say where its values are; or a vtkDataSet (pyvista.ImageData, ...), of
+            which an image is taken as it is and a mesh is resampled.
         options: spacing (x, y, z) of an array; array, component, time, dims as of a file; ``space`` is the one that the
             affine of an array leads to.
         origin: world position of the centre of voxel (0, 0, 0), (x, y, z), of an array.
@@ -43,12 +43,14 @@ def volume_in_memory(
         UsageError: options that the object does not take.
     """
     placed = [key for key, value in (("origin", origin), ("affine", affine)) if value is not None]
-    if hasattr(data, "IsA"):
+    if hasattr(data, "IsA") and not isinstance(data, np.ndarray):  # pyvista's arrays have the methods of VTK's
         _refuse(placed, "a VTK dataset says itself where it is")
         return dataset_volume(data, options, name)
     if hasattr(data, "dims") and hasattr(data, "coords") and hasattr(data, "attrs"):
         _refuse(placed, "the coordinates of a DataArray say where it is")
         return _labelled(data, options, name)
+    if np.ma.is_masked(data):
+        data = data.astype(np.promote_types(data.dtype, np.float32)).filled(np.nan)
     values: Any = lazy(data, name) if is_dask(data) else np.asarray(data)
     return _array(values, options, origin, affine, name)
 
