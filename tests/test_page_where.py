@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import PAGES, browser, packages
+from PIL import Image
 
 from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
@@ -393,6 +394,12 @@ def test_a_larger_picture_is_the_same_and_sharper(marked: str, person: Person, t
     small, (high, wide) = saved[1], saved[1].shape[:2]
     large = saved[4].reshape(high, 4, wide, 4, 3).mean(axis=(1, 3))
     assert -10 * math.log10(((large - small) ** 2).mean()) > 35
+    blown = [
+        Image.fromarray(small[..., c].astype(np.float32)).resize((4 * wide, 4 * high), Image.Resampling.BILINEAR)
+        for c in range(3)
+    ]
+    drawn = np.s_[: 4 * (high - 170), : 4 * (wide - 60)]  # without legend, bar and letters
+    assert np.abs(np.stack(blown, axis=-1) - saved[4])[drawn].max() > 0.02
     letters = saved[4][-4 * 112 :, : 4 * 100].reshape(112, 4, 400, 3)
     assert np.abs(np.diff(letters, axis=1)).max() > 0.5  # within a pixel of the window: no blown up letters
     assert np.abs(person.picture(tmp_path, "after.png", bare=False) - page).mean() < 1e-3
