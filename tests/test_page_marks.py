@@ -93,8 +93,16 @@ def test_an_angle_is_that_of_the_world(marked: str, person: Person) -> None:
     person("open", marked)
     person("eval", f"window.vvgt.where.marks.part.set(JSON.stringify([['angle', {points}]]))")
     assert person("eval", LIST) == ["angle 60°"]
+    person("eval", "window.vvgt.where.marks.part.set('[[\"angle\", [[1, 1, 1], [1, 1, 1], [5, 2, 1]]]]')")
+    assert person("eval", LIST) == ["angle –°"]
+    person("eval", f"window.vvgt.where.marks.part.set(JSON.stringify([['angle', {points}]]))")
     link = person("eval", "window.vvgt.where.link()")
-    for wrong in ("nothing", "%5B%5B%22angle%22,%5B%5B1,2,3%5D%5D%5D%5D", "%5B%5B%22toString%22,%5B%5D%5D%5D"):
+    for wrong in (
+        "nothing",
+        "%5B%5B%22angle%22,%5B%5B1,2,3%5D%5D%5D%5D",
+        "%5B%5B%22toString%22,%5B%5D%5D%5D",
+        "%5B%5B%5B%22ruler%22%5D,%5B%5B0,0,0%5D,%5B1,1,1%5D%5D%5D%5D",
+    ):
         person("open", link.split("marks=")[0] + f"marks={wrong}&" + link.split("&", 1)[1])
         assert person("eval", LIST) == []
         assert person("eval", "window.vvgt.where.lens.pose().pitch") < 0  # the rest of the link holds

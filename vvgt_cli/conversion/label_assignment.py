@@ -122,17 +122,22 @@ def _near(index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, 
     for reach in REACH:
         rows = np.flatnonzero(found.max(axis=1) == 0)
         votes = np.zeros((len(rows), len(shown)), np.float32)
-        for shift in itertools.product((-reach, 0, reach), repeat=3):
-            _vote(index[rows] + shift, weights, shown, votes)
+        shifts = np.array(list(itertools.product((-reach, 0, reach), repeat=3)))
+        around = (index[rows][:, None] + shifts).reshape(-1, 3)  # in one pass over a map that stays in its file
+        _vote(around, weights, shown, votes, np.repeat(np.arange(len(rows)), len(shifts)))
         found[rows] = votes
     near: np.ndarray = (found > 0) | (found.max(axis=1, keepdims=True) == 0)
     return near
 
 
 def _vote(
-    index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]], votes: np.ndarray
-) -> None:
-    """Add the ``weights`` (labels,) of the labels of voxels ``index`` (K, 3) (x, y, z) to ``votes`` (K, labels)."""
+    index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]], votes: np.ndarray,
+    owner: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Add the ``weights`` (labels,) of the labels of voxels ``index`` (K, 3) (x, y, z) to ``votes`` (K, labels).
+
+    With ``owner`` (K,), each counts in that row instead, once for several voxels of a label.
+    """
     maps = {id(volume): volume for volume, *_ in shown}
     dims = np.array(shown[0][0].dims)
     rows = np.flatnonzero(((index >= 0) & (index < dims)).all(axis=1))
@@ -142,4 +147,5 @@ def _vote(
         numbers, columns = (np.array(part) for part in zip(*sorted(own), strict=True))
         at = np.minimum(np.searchsorted(numbers, values), len(numbers) - 1)
         there = numbers[at] == values
-        votes[rows[there], columns[at[there]]] += weights[columns[at[there]]].astype(np.float32)
+        row = rows[there] if owner is None else owner[rows[there]]
+        votes[row, columns[at[there]]] += weights[columns[at[there]]].astype(np.float32)

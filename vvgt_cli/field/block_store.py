@@ -64,6 +64,8 @@ class BlockStore:
         if not same:
             with atomic_write(place, overwrite=True) as temporary:
                 temporary.write_text(text, "utf-8")
+            if not ours and place.read_text("utf-8") != text:
+                raise UsageError(f"{self.folder}: another run started there at the same time; choose another name")
         return same
 
     def kept_edge(self, settings: dict[str, Any]) -> int | None:

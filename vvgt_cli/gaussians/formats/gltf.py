@@ -131,7 +131,7 @@ def read_glb(content: bytes, name: str) -> Splats:
     """
     try:
         return _read(content, name)
-    except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error) as error:
         raise DataError(
             f"{name}: not a .glb of Gaussians ({type(error).__name__}: {error}); expected meshes with {EXTENSION} "
             "in float32, as vvgt writes them"

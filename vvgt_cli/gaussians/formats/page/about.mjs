@@ -1,12 +1,12 @@
 // What is shown: a list of names and values, of what the file says of itself.
 import { shown } from './facts.mjs';
 
-export function rowsOf(name, { facts, world, count, live, converted }) {
+export function rowsOf(name, { facts, world, count, live, converted, slices }) {
   const number = (n) => n.toLocaleString('en'), length = (n) => `${shown(n)}${world.unit && ` ${world.unit}`}`;
   const kinds = new Set(live?.layers.map(({ labels }) => (labels.length ? 'labels' : 'function')));
   return [
     ['name', name],
-    ['contains', [`Gaussians${live ? ', the data values under them and their histogram' : ''}`, ...(live?.layers.some(({ labels }) => labels.length) ? ['names of labels'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
+    ['contains', [`Gaussians${live ? ', the data values under them and their histogram' : ''}`, ...(live?.layers.some(({ labels }) => labels.length) ? ['names of labels'] : []), ...(slices ? ['slices of the volume'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
     ['look', live ? `${[...kinds, 'light'].join(' and ')} can be changed` : 'fixed'],
     ['function', live ? live.layers.map(({ name }) => name).filter(Boolean).join('; ') : facts.function],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],

@@ -52,7 +52,8 @@ export const linkOf = (parts) => `${location.href.split('#')[0]}#${saidBy(parts)
 export async function restore(parts, begins = '') {
   let said;
   try {
-    said = new Map((location.hash.slice(1) || begins).split('&').map((part) => [part.split('=')[0], decodeURIComponent(part.slice(part.indexOf('=') + 1))]));
+    const hash = location.hash.slice(1), plain = hash.includes('=') ? hash : decodeURIComponent(hash);  // some programs encode a link whole
+    said = new Map((/(^|&)view=/.test(plain) ? plain : begins).split('&').map((part) => [part.split('=')[0], decodeURIComponent(part.slice(part.indexOf('=') + 1))]));
   } catch { return; }  // not a link of ours
   if (!said.has('view')) return;
   for (const { key, get, set } of parts) {

@@ -9,10 +9,11 @@ const MOST = 100, LONG = 200;  // of a page; letters of a note
 const HTML = `<div role="group" aria-label="kind">${KINDS.map((kind) => `<button data-kind="${kind}">${kind}</button>`).join('')}<button class="save" title="save this page as it is now, with its rulers, angles and notes" hidden>save page</button></div><ul></ul>`;
 
 const size = (a) => Math.hypot(...a);
+const wordsOf = (text) => String(text).slice(0, LONG).replace(/[\p{Cc}\p{Cs}\ufffe\uffff]/gu, '');  // what a picture of SVG takes
 export function amountOf({ kind, places }) {
   const [a, b, c] = places;
   if (kind === 'ruler') return size(plus(b, a, -1));
-  const [u, v] = [plus(a, b, -1), plus(c, b, -1)].map((w) => w.map((x) => x / (size(w) || 1)));
+  const [u, v] = [plus(a, b, -1), plus(c, b, -1)].map((w) => w.map((x) => x / size(w)));  // NaN where points coincide
   return (2 * Math.atan2(size(plus(u, v, -1)), size(plus(u, v))) * 180) / Math.PI;
 }
 
@@ -24,7 +25,7 @@ export function marksOf(worldNow, changed, save) {
   const buttons = [...root.querySelectorAll('[data-kind]')], rows = root.lastChild, saving = root.querySelector('.save');
   let kind = 'ruler', list = [], begun = [];
 
-  const text = (mark) => (mark.kind === 'note' ? mark.text : `${shown(amountOf(mark), 4)}${mark.kind === 'angle' ? '°' : worldNow().unit && ` ${worldNow().unit}`}`);
+  const text = (mark) => (mark.kind === 'note' ? mark.text : `${Number.isFinite(amountOf(mark)) ? shown(amountOf(mark), 4) : '–'}${mark.kind === 'angle' ? '°' : worldNow().unit && ` ${worldNow().unit}`}`);
   const number = (k) => (list.length > 1 ? `${k + 1}: ` : '');
 
   function rowOf(mark, k) {
@@ -38,14 +39,15 @@ export function marksOf(worldNow, changed, save) {
     if (mark.kind === 'note') {
       Object.assign(said, { value: mark.text, maxLength: LONG, placeholder: 'text of the note' });
       said.setAttribute('aria-label', `text of ${name}`);
-      said.addEventListener('input', () => { mark.text = said.value; changed(); });
+      said.addEventListener('input', () => { mark.text = wordsOf(said.value); changed(); });
     } else said.textContent = `${mark.kind} ${text(mark)}`;
     row.append(`${k + 1}`, said, gone);
     return row;
   }
   function put(now) {
+    const made = now.map(rowOf);
     list = now;
-    rows.replaceChildren(...list.map(rowOf));
+    rows.replaceChildren(...made);
     changed();
   }
   function choose(now) {
@@ -98,8 +100,8 @@ export function marksOf(worldNow, changed, save) {
       key: 'marks',
       get: () => (list.length ? encodeURIComponent(JSON.stringify(list.map(({ kind: of, places, text: said }) => [of, places.map((p) => p.map((x) => Number(x.toPrecision(7)))), ...(said ? [said] : [])]))) : ''),
       set(said) {
-        const read = (said ? JSON.parse(said) : []).slice(0, MOST).map(([of, places, words = '']) => ({ kind: of, places, text: String(words).slice(0, LONG) }));
-        const whole = ({ kind: of, places }) => Object.hasOwn(POINTS, of) && places.length === POINTS[of] && places.every((p) => p.length === 3 && p.every(Number.isFinite));
+        const read = (said ? JSON.parse(said) : []).slice(0, MOST).map(([of, places, words = '']) => ({ kind: of, places, text: wordsOf(words) }));
+        const whole = ({ kind: of, places }) => KINDS.includes(of) && places.length === POINTS[of] && places.every((p) => p.length === 3 && p.every(Number.isFinite));
         if (!read.every(whole)) throw new Error('no marks');
         put(read);
       },

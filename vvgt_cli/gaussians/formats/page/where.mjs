@@ -84,7 +84,7 @@ export function where(viewer, scene, live, show) {
     });
     live?.cut.name(world.letters);
     poor.say(facts.far);
-    about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live, converted: scene.converted }));
+    about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live, converted: scene.converted, slices: scene.slices }));
   }
 
   const button = (name, title, key, press) => {
@@ -156,7 +156,7 @@ export function where(viewer, scene, live, show) {
   lens.canvas.tabIndex = 0;
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
-  const act = Object.fromEntries(buttons.filter(({ key }) => key).map(({ key, press }) => [key, press]));
+  const act = Object.fromEntries(buttons.filter(({ key, made }) => key && !made.hidden).map(({ key, press }) => [key, press]));
   listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => { poor.close(); measure(false); }, again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
