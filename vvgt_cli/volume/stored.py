@@ -195,6 +195,8 @@ def give_back(data: np.ndarray) -> None:
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
     """Read the data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
     found = np.empty(len(index))
+    if not len(index):
+        return found
     edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]]) if isinstance(volume.data, Stored) else None
     if edge is None:
         x, y, z = index.T
