@@ -11,8 +11,7 @@ from tests.closed_form_scenes import Ramp, scene_of, score
 from tests.test_closed_form_tree import some_tree
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, cut_by_error, initialise
-from vvgt_cli.closed_form.closed_form import FEW
-from vvgt_cli.closed_form.error import LEAST, MOST, SHARED, UNSEEN, scores_by_error, unseen
+from vvgt_cli.closed_form.closed_form import FEW, LEAST, MOST, SHARED, UNSEEN, scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights
 from vvgt_cli.closed_form.tree import select, split_score
 from vvgt_cli.dvr import RenderSettings, render_views

@@ -9,8 +9,8 @@ import pytest
 
 from tests.test_gaussians_harmonics import cloud
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import fit
 from vvgt_cli.closed_form import fit as fit_module
-from vvgt_cli.closed_form import view_fit
 from vvgt_cli.closed_form.fit import BRIGHTEST, solve_colors
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.harmonics import basis, directions
@@ -56,7 +56,7 @@ def test_twin_of_the_normal_equations(degree, monkeypatch):
         weights += columns.sum(axis=0)
     a = np.concatenate(rows)
     prior = np.full((12, terms), fit_module.PRIOR)
-    prior[:, 1:] = (view_fit.PIXELS + view_fit.SHARE * weights)[:, None]
+    prior[:, 1:] = (fit.PIXELS + fit.SHARE * weights)[:, None]
     x0 = np.zeros((12, terms, 3))
     x0[:, 0] = 0.5
     right = a.T @ views[..., :3].reshape(-1, 3).astype(np.float64) + prior.reshape(-1, 1) * x0.reshape(-1, 3)
@@ -68,7 +68,7 @@ def test_twin_of_the_normal_equations(degree, monkeypatch):
 
 def test_adjoint():
     g = shiny(50, 3)
-    system = view_fit.ViewDependentSystem(g, [c.position for c in CAMERAS], [project(g, c) for c in CAMERAS], 1.0)
+    system = fit.ViewDependentSystem(g, [c.position for c in CAMERAS], [project(g, c) for c in CAMERAS], 1.0)
     rng = np.random.default_rng(0)
     unknowns = rng.standard_normal((50, 16, 3))
     images = [rng.standard_normal((40, 40, 3)).astype(np.float32) for _ in CAMERAS]

@@ -25,8 +25,7 @@ from vvgt_cli.gaussians.harmonics import (
     view_colors,
 )
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.network.damp import interpolate
-from vvgt_cli.network.prepare import pack
+from vvgt_cli.network.prepare import interpolate, pack
 from vvgt_cli.splat import render
 from vvgt_cli.splat.harmonics import deposit
 

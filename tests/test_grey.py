@@ -13,7 +13,7 @@ from test_live import HI, LO, RAMP, cloud, statistics
 import vvgt_cli as vvgt_library
 from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cli.main import run
-from vvgt_cli.commands import render_values
+from vvgt_cli.commands import render
 from vvgt_cli.dvr import reference
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -113,14 +113,14 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", values)
     source = load(SourceRequest(str(tmp_path / "a.npy"), tf="viridis"))
     scene, eye = source.scene(), camera()
-    origin, rays = reference.rays(eye, render_values.RAYS)
+    origin, rays = reference.rays(eye, render.RAYS)
     flat = rays.reshape(-1, 3)
     with np.errstate(divide="ignore"):
         near, far = (-scene.half - origin) / flat, (scene.half - origin) / flat
     first, last = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
     inside = last > np.maximum(first, 0)
     length = (last - first) * np.linalg.norm(flat / scene.step, axis=1)
-    count = np.where(inside, np.ceil(length / render_values.STEP), 0)
+    count = np.where(inside, np.ceil(length / render.STEP), 0)
     best = np.zeros(len(flat))
     for k in range(int(count.max())):
         t = first + (last - first) * (k + 0.5) / np.maximum(count, 1)
@@ -129,7 +129,7 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
         best = np.maximum(best, np.where(k < count, value, 0))
     wanted = best.reshape(SIZE, SIZE, -1).mean(axis=2)
     assert 0.2 < wanted.mean() < 0.9
-    np.testing.assert_allclose(render_values.mip_of(source)(eye)[..., 0], wanted, atol=1e-4)
+    np.testing.assert_allclose(render.mip_of(source)(eye)[..., 0], wanted, atol=1e-4)
 
 
 def test_the_x_ray_of_a_uniform_volume_keeps_1_over_e_along_its_edge(tmp_path: Path) -> None:

@@ -23,11 +23,11 @@ from vvgt_cli.integrations import command
 from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
+from vvgt_cli.library.inputs import volume_in_memory
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.function import SPACES
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions
-from vvgt_cli.volume.memory import volume_in_memory
 
 SHARP = [(-1.0, 0.0, 0.3, 0.4), (0.5, 0.9, 0.7, 0.0), (2.0, 0.2, 0.5, 1.0), (3.0, 0.6, 0.5, 0.0)]
 COLOURS = [(-1.0, 0.1, 0.2, 0.9, 0.3, 0.5), (1.0, 0.9, 0.4, 0.1, 0.5, 0.0), (3.0, 0.2, 0.8, 0.3, 0.5, 0.0)]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from network_models import as_rows, scene
 
-from vvgt_cli.network.damp import damped, interpolate
-from vvgt_cli.network.prepare import pack, unpack
+from vvgt_cli.network.prepare import damped, interpolate, pack, unpack
 from vvgt_cli.splat import render
 
 

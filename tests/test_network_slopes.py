@@ -12,8 +12,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
-from vvgt_cli.network.prepare import pack, unpack
-from vvgt_cli.network.slopes import STEP, own_axes_gradients, slope_rows
+from vvgt_cli.network.prepare import STEP, own_axes_gradients, pack, slope_rows, unpack
 from vvgt_cli.splat import render, render_reference
 from vvgt_cli.splat.half import halved
 

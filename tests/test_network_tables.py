@@ -17,8 +17,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import NAMED, GeometryConfig, ImageConfig, NetworkConfig
 from vvgt_cli.network import tables as tb
 from vvgt_cli.network.config import SLOPES
-from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
 from vvgt_cli.network.prepare import filter_matrix, pack, prepare, resize, unpack, view_arrays
+from vvgt_cli.network.tables import CURVES, curve_code, hilbert, interleave
 
 SMALL = NAMED["small"]
 

@@ -15,10 +15,9 @@ from vvgt_cli.network.prepare import pack, prepare, view_arrays
 
 torch = pytest.importorskip("torch")
 
-from vvgt_cli.network import epipolar, head, layers  # noqa: E402
+from vvgt_cli.network import epipolar, layers, model  # noqa: E402
 from vvgt_cli.network.export import randomised  # noqa: E402
-from vvgt_cli.network.geometry import NeighbourConv  # noqa: E402
-from vvgt_cli.network.model import Vvgt  # noqa: E402
+from vvgt_cli.network.model import NeighbourConv, Vvgt  # noqa: E402
 
 
 def tensors(arrays):
@@ -190,12 +189,12 @@ def test_neighbour_convolution_is_a_sum_over_those_that_are_there():
 def test_the_head_moves_along_the_gaussians_own_axes():
     gaussians, _, _ = scene(count=20)
     rows = torch.from_numpy(pack(gaussians))
-    module = head.GaussianHead(TINY.geometry)
+    module = model.GaussianHead(TINY.geometry)
     with torch.no_grad():
         module.last.bias[:3] = torch.tensor([50.0, 0.0, 0.0])  # as far along the first axis as it goes
         out = module(torch.randn(20, 8), rows)
     moved = (out - rows)[:, :3]
-    axis = head.rotation(rows[:, 6:10])[:, :, 0]
+    axis = model.rotation(rows[:, 6:10])[:, :, 0]
     assert torch.allclose(moved, 2 * rows[:, 3:4].exp() * axis, atol=1e-6)
     assert torch.allclose(out[:, 3:], rows[:, 3:], atol=1e-6)
 

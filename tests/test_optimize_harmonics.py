@@ -18,9 +18,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.checkpoint import fingerprint, resume, save
-from vvgt_cli.refine.densify import SLOPE, Densified, densify
 from vvgt_cli.refine.judge import Judge
-from vvgt_cli.refine.loop import begin, step
+from vvgt_cli.refine.loop import SLOPE, Densified, begin, densify, step
 from vvgt_cli.refine.states import GIVEN
 from vvgt_cli.splat import blend, render
 

@@ -17,8 +17,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import BLOCK
 from vvgt_cli.conversion.changes import EDGE, REACH, Changes, changes
 from vvgt_cli.conversion.convert import convert
-from vvgt_cli.conversion.pictures import RememberedViews
-from vvgt_cli.conversion.previous_frame import PreviousFrame
+from vvgt_cli.conversion.previous_frame import PreviousFrame, RememberedViews
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident

@@ -14,7 +14,7 @@ import pytest
 
 from tests.onnx_models import write_model
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands.report_runs import RunOptions, plan_runs, random_points
+from vvgt_cli.commands.report import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
 from vvgt_cli.score.charts import FILES, draw, log_ticks

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vvgt_cli.field.counting import counted, statistics_of, tally, with_limits
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.stats import statistics
-from vvgt_cli.volume.tallies import counted, statistics_of, tally, with_limits
 
 FIT = ("--max-gaussians", "3000", "--size", "150", "-q")
 

@@ -16,13 +16,11 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.streamed_site import streamed_resources
-from vvgt_cli.commands.view import named_files
+from vvgt_cli.commands.view import named_files, streamed_resources
 from vvgt_cli.conversion.shards.cut import Node
-from vvgt_cli.conversion.shards.level_errors import level_errors
-from vvgt_cli.conversion.shards.level_selection import CutErrors
+from vvgt_cli.conversion.shards.level_selection import CutErrors, level_errors
 from vvgt_cli.conversion.shards.regions import Made, save
-from vvgt_cli.conversion.shards.streamed_files import Part, WrittenFiles, divide
+from vvgt_cli.conversion.shards.streamed import Part, WrittenFiles, divide
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
@@ -185,7 +183,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
-    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 2500)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 2500)
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
     whole, out = tmp_path / "whole", tmp_path / "out"
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
@@ -223,7 +221,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
 
 
 def test_files_hold_neighbouring_nodes_of_one_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 10)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 10)
     parts, places = divide(np.array([[6, 1], [5, 2], [12, 4], [1, 3]]))
     assert parts == (Part(0, 0, 0, 2), Part(1, 0, 0, 4), Part(0, 1, 2, 3), Part(0, 2, 3, 4))
     assert [lods[0]["offset"] for lods in places] == [0, 6, 0, 0]

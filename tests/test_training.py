@@ -36,9 +36,9 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("yaml")
 
 from vvgt_cli.network.checkpoint import load_checkpoint  # noqa: E402
-from vvgt_cli.network.training import loop, losses, sample  # noqa: E402
+from vvgt_cli.network.training import loop, sample  # noqa: E402
 from vvgt_cli.network.training.config import config_text, read_config  # noqa: E402
-from vvgt_cli.network.training.splatter import gsplat_picture, splat  # noqa: E402
+from vvgt_cli.network.training.sample import gsplat_picture, splat  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("whole_march")  # runs are compared with those of other processes
 
@@ -152,10 +152,10 @@ def test_losses_against_the_metrics():
     rng = np.random.default_rng(0)
     a, b, c = (rng.random((24, 20, 4)).astype(np.float32) for _ in range(3))
     ta, tb, tc = map(torch.from_numpy, (a, b, c))
-    assert float(losses.ssim(ta[..., :3], tb[..., :3])) == pytest.approx(ssim_metric(a[..., :3], b[..., :3]), abs=1e-5)
+    assert float(sample.ssim(ta[..., :3], tb[..., :3])) == pytest.approx(ssim_metric(a[..., :3], b[..., :3]), abs=1e-5)
     gain = psnr(b[..., :3], a[..., :3]) - psnr(b[..., :3], c[..., :3])
-    assert float(losses.decibels(ta, tb, tc)) == pytest.approx(gain, abs=1e-4)
-    whole = losses.view_loss(ta, tb, tc, LossConfig(l1=0.8, ssim=0.2, decibel=0.5))
+    assert float(sample.decibels(ta, tb, tc)) == pytest.approx(gain, abs=1e-4)
+    whole = sample.view_loss(ta, tb, tc, LossConfig(l1=0.8, ssim=0.2, decibel=0.5))
     expected = 0.8 * np.abs(a - b).mean() + 0.2 * (1 - ssim_metric(a[..., :3], b[..., :3])) - 0.05 * gain
     assert float(whole) == pytest.approx(expected, abs=1e-5)
 

@@ -16,8 +16,8 @@ from test_training import CONFIG, rows_of  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from vvgt_cli.network.training import loop  # noqa: E402
-from vvgt_cli.network.training.losses import view_loss  # noqa: E402
 from vvgt_cli.network.training.lpips import load_lpips  # noqa: E402
+from vvgt_cli.network.training.sample import view_loss  # noqa: E402
 from vvgt_cli.progress import Console  # noqa: E402
 from vvgt_cli.synth.shapes import make_shape  # noqa: E402
 from vvgt_cli.volume.medical.nrrd import write_nrrd  # noqa: E402

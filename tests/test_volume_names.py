@@ -15,7 +15,7 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader, vtkXMLImageDataWriter
 from tests import vtk_files as files
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.unread import ROWS, way_out
+from vvgt_cli.volume.registry import ROWS, way_out
 
 MARK = b"\xef\xbb\xbf"
 VALUES = np.arange(60, dtype=np.int16).reshape(3, 4, 5)

@@ -17,9 +17,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume, statistics
 from vvgt_cli.volume.components import magnitude
 from vvgt_cli.volume.openvdb import codec
-from vvgt_cli.volume.openvdb.bricks import BrickArray
 from vvgt_cli.volume.openvdb.cursor import Cursor
-from vvgt_cli.volume.openvdb.layout import brick_array
+from vvgt_cli.volume.openvdb.reader import BrickArray, brick_array
 from vvgt_cli.volume.openvdb.tree import Tree
 
 ARCHIVE = Path(__file__).parent / "fixtures" / "vdb" / "grids.tar.xz"

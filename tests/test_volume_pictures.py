@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.stored import read_block
-from vvgt_cli.volume.tiff.slice_names import by_number, in_order
+from vvgt_cli.volume.tiff.slices import by_number, in_order
 
 RNG = np.random.default_rng(11)
 GREY = RNG.integers(0, 256, (4, 5, 7)).astype("u1")

@@ -43,9 +43,8 @@ def command(
       vvgt info head.html --sharing
       vvgt info --machine
     """
-    from vvgt_cli.commands.inspect import inspect, machine_facts
+    from vvgt_cli.commands.inspect import inspect, machine_facts, what_leaves
     from vvgt_cli.commands.recolor import function_of
-    from vvgt_cli.commands.sharing import what_leaves
     from vvgt_cli.errors import UsageError
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions

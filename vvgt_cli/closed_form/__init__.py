@@ -86,8 +86,7 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
 
 def start_of(form: ClosedForm, options: VbmOptions) -> Start:
     """Return the Gaussians of the method asked for, from a closed form."""
-    from vvgt_cli.closed_form.uniform import uniform_gaussians
-    from vvgt_cli.closed_form.wavelet import wavelet_gaussians
+    from vvgt_cli.closed_form.wavelet import uniform_gaussians, wavelet_gaussians
 
     if options.values:
         leaves = form.cells_of_values()

@@ -1,7 +1,8 @@
-"""The plain wavelet-to-Gaussian bank: one isotropic surrogate an atom, for comparison (`--init wavelet`).
+"""Starts to compare with: a plain wavelet-to-Gaussian bank (`--init wavelet`), and random samples (`--init uniform`).
 
-The Haar pyramid of the extinction is cut where its detail energy is large; each remaining scaling atom (a box of edge
-H) becomes the isotropic Gaussian that the transition bank holds for it: the least-squares fit to the box.
+The bank holds one isotropic surrogate an atom. The Haar pyramid of the extinction is cut where its detail energy is
+large; each remaining scaling atom (a box of edge H) becomes the isotropic Gaussian that the transition bank holds for
+it: the least-squares fit to the box.
 """
 
 from __future__ import annotations
@@ -68,3 +69,24 @@ def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
     means = moments[:, FIRST] / moments[:, [MASS]]
     axes = np.broadcast_to(np.eye(3), (len(ids), 3, 3))
     return make_gaussians(means, variances, axes, opacity, visible_color(moments))
+
+
+def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gaussians:
+    """Draw ``budget`` isotropic Gaussians uniformly where the scene has extinction that some view sees.
+
+    A base cell's extinction is shared by the samples expected in it; sigma is half the mean distance of the samples.
+    """
+    base = np.flatnonzero(tree.children == 0)
+    if not len(base) or budget < 1:
+        base = base[:0]
+    rng = np.random.default_rng(seed)
+    chosen = np.sort(rng.integers(0, max(len(base), 1), budget if len(base) else 0))
+    moments, edge = tree.moments[base[chosen]], np.broadcast_to(tree.edges[0], (len(chosen), 3))
+    centre = moments[:, FIRST] / moments[:, [MASS]]
+    points = centre + edge * (rng.random(centre.shape) - 0.5)
+    volume = len(base) * (edge[0].prod() if len(edge) else 0.0)
+    sigma = 0.5 * (volume / max(len(chosen), 1)) ** (1 / 3)
+    variances = np.full((len(chosen), 3), sigma**2)
+    mass = moments[:, MASS] * len(base) / max(len(chosen), 1)
+    axes = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
+    return make_gaussians(points, variances, axes, peak_opacity(mass, variances, pixel), visible_color(moments))

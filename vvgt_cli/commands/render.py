@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,16 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.commands import render_values
 from vvgt_cli.commands.views_in_blocks import draw_in_blocks
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
-from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians
+from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.blocked import Blocked
+from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.rays import HALO
+from vvgt_cli.field.reader import Box, Scalars
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
@@ -31,8 +34,11 @@ from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.images.movies import RATE, SUFFIXES, movie_ready, write_movie
 from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.volume import Statistics
 from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
@@ -180,25 +186,25 @@ def _volume(
         source = _upright(found.source)
         if request.rule == MIP:
             run.compile(GREATEST, source.kernel_type())
-            return render_in_box(render_values.mip_of(found), source.volume.axes), "MIP in blocks"
+            return render_in_box(mip_of(found), source.volume.axes), "MIP in blocks"
         if request.rule == XRAY:
-            found = found.with_look(render_values.as_xray(source))
+            found = found.with_look(as_xray(source))
             source = found.source
         run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
         draw = draw_in_blocks(found, settings, cameras)
-        return (render_values.absorbed(draw), "X-ray in blocks") if request.rule else (draw, "ray casting in blocks")
+        return (absorbed(draw), "X-ray in blocks") if request.rule else (draw, "ray casting in blocks")
     with run.stage("read") as stage:
         source = _upright(load(asked))
         stage.note = describe_source(source)
     if request.rule == MIP:
         run.compile(GREATEST, source.kernel_type())
-        return render_in_box(render_values.mip_of(source), source.volume.axes), "MIP"
+        return render_in_box(mip_of(source), source.volume.axes), "MIP"
     if request.rule == XRAY:
-        source = render_values.as_xray(source)
+        source = as_xray(source)
     run.compile(source.kernels(RAYCAST), source.kernel_type())
     scene = source.scene()
     draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    return (render_values.absorbed(draw), "X-ray") if request.rule else (draw, "ray casting")
+    return (absorbed(draw), "X-ray") if request.rule else (draw, "ray casting")
 
 
 def _upright(source: Source) -> Source:
@@ -269,3 +275,82 @@ def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[C
 
     size = write_movie(request.output, pictures(), request.overwrite)
     return f"{request.output}: {len(cameras) / RATE:.1f} s, {size / 1e6:.2f} MB"
+
+
+RAYS = 2  # along a pixel's edge
+STEP = 0.25  # voxels between samples
+Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
+
+
+def as_xray(source: Source) -> Source:
+    """Return a volume under the extinction of its X-ray, unlit.
+
+    Raises:
+        UsageError: labels, channels or layers.
+    """
+    source.require_scalar_field()
+    layer = source.layers[0]
+    assert isinstance(layer.tf, TransferFunction)
+    distance = exposed_distance(layer.tf, source.statistics, 2 / source.volume.unit_frame().scale)
+    return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
+
+
+def absorbed(draw: Draw) -> Draw:
+    """Return the function that draws what is absorbed in the pictures of ``draw``."""
+    return lambda camera: grey(draw(camera)[..., 3])
+
+
+def mip_of(field: Blocked | Source) -> Draw:
+    """Return the function that draws the MIP of a volume in blocks or in memory, for cameras in its box frame.
+
+    Raises:
+        UsageError: labels, channels or layers.
+    """
+    source = field.source if isinstance(field, Blocked) else field
+    source.require_scalar_field()
+    if isinstance(field, Blocked):
+        return lambda camera: grey(_greatest(source, _blocks(field), camera))
+    from vvgt_cli.dvr.scene import kernel_values
+
+    values, slope, intercept = kernel_values(source.volume)
+    whole = Box(values, None, _of_range(source.statistics, slope, intercept), np.zeros(3, np.int64))
+    part = whole, whole.begin, np.array(source.volume.dims)
+    return lambda camera: grey(_greatest(source, [part], camera))
+
+
+def _blocks(field: Blocked) -> Iterator[Part]:
+    """Yield the blocks of a volume."""
+    reader, volume = field.reader, field.source.volume
+    assert isinstance(reader, Scalars)
+    optics = _of_range(field.source.statistics, reader.rule.slope, reader.rule.intercept)
+    blocks = Boxes(volume.dims, (field.edge, field.edge, field.edge))
+    for number in range(len(blocks)):
+        lo, hi = blocks.at(number)
+        box = reader.box(np.maximum(lo - HALO, 0), np.minimum(hi + HALO, volume.dims))
+        yield replace(box, optics=optics), lo, hi
+
+
+def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarray:
+    """Return the mean over a pixel of the greatest values along its rays, (h, w) float32 of the range of values."""
+    from vvgt_cli.dvr.march import greatest
+    from vvgt_cli.dvr.render import Box as Frame
+    from vvgt_cli.dvr.render import camera_arrays
+
+    n, frame, dims = RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
+    larger = replace(
+        camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
+        width=n * camera.width, height=n * camera.height,
+    )  # fmt: skip
+    rays = camera_arrays(Frame(np.array(frame.half), np.array(frame.step)), larger)
+    out = np.zeros((larger.height, larger.width), np.float32)
+    for box, lo, hi in parts:
+        faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])
+        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, STEP, out)
+    mean: np.ndarray = out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
+    return mean
+
+
+def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
+    """Return tables whose coordinate goes from 0 to 1 over the range of data values."""
+    width = (statistics.hi - statistics.lo) or 1.0
+    return Optics.linear(1.0)._replace(lo=(statistics.lo - intercept) / slope, inv_width=slope / width)

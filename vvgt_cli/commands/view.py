@@ -12,24 +12,25 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, PageController, plain_name, stored
+from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, Cloud, PageController, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
 from vvgt_cli.conversion.readback import report_agreement
-from vvgt_cli.errors import NoLiveForm, UsageError
+from vvgt_cli.errors import DataError, NoLiveForm, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
 from vvgt_cli.gaussians.formats.choose import NOTHING
-from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
+from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
 from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.page_slices import Slices
+from vvgt_cli.gaussians.formats.sog_images import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
@@ -287,3 +288,30 @@ def slices_in(request: SourceRequest) -> Slices | None:
 def display() -> bool:
     """Return whether a browser would have a screen; without one `webbrowser` may start a text browser."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def streamed_resources(file: str) -> dict[str, Resource]:
+    """Return the resources by name; "" is the page.
+
+    Raises:
+        DataError: not a manifest, or a file that it names is missing.
+    """
+    manifest, folder = read_manifest(file), Path(file).parent
+    resources = {MANIFEST: Resource(JSON, Path(file).read_bytes)}
+    for name in manifest["filenames"]:
+        if not (folder / name).is_file():
+            raise DataError(f"{file}: {folder / name} is missing; expected the whole folder")
+        resources[name] = Resource(JSON, (folder / name).read_bytes)
+        for image in IMAGES:
+            path = (folder / name).with_name(f"{image}.webp")
+            resources[f"{name.removesuffix(META)}{path.name}"] = Resource("image/webp", partial(path.read_bytes))
+    splats, scale = placed(manifest)
+    view = camera(splats)
+    view |= {key: [scale * x for x in view[key]] for key in ("position", "target")}
+    more: dict[str, Any] = {
+        "streamed": True, "camera": view, "outermost": [], "comments": splats.comments,
+        "enlarged": scale,
+    }  # fmt: skip
+    name = Path(file).absolute().parent.name
+    text = page(name, splats, [{"name": name, "file": MANIFEST}], SCRIPT, more)
+    return resources | {"": Resource(HTML, lambda: text.encode("utf-8"))}

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.gaussian_files import is_page
-from vvgt_cli.conversion.live_labels import label_facts, label_fog_field, live_labels, with_labels
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, to_frame_of, to_unit_frame
 from vvgt_cli.conversion.plan import report_target
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
@@ -26,25 +25,26 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
-from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
+from vvgt_cli.errors import DataError, NoLiveForm, NothingVisible, UsageError
 from vvgt_cli.field.field import Field
+from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats.page_live import LiveForm
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, MOST_LABELS, LiveFacts
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import LIVE
+from vvgt_cli.look.fog import THIN, label_fog
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.histogram import UNIT_SHARE
+from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
+from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.types import triple
-
-if TYPE_CHECKING:
-    from vvgt_cli.closed_form import Start
-    from vvgt_cli.field.source import Source
 
 
 def check_live(request: ConvertRequest) -> None:
@@ -281,3 +281,51 @@ def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
     least = np.log(SMALLEST * pixel_width(size))
     widening = np.maximum(least - gaussians.log_scales.max(axis=1).astype(np.float64), 0)
     return replace(gaussians, log_scales=gaussians.log_scales + widening[:, None])
+
+
+def live_labels(source: Source) -> tuple[Label, ...]:
+    """Return the labels that Gaussians can belong to, invisible ones included, which other tables may show.
+
+    Raises:
+        DataError: there are more than `MOST_LABELS`.
+    """
+    table = source.tf
+    assert isinstance(table, LabelTable)
+    found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
+    if len(found) > MOST_LABELS:
+        raise DataError(f"{source.name}: {len(found)} labels; expected at most {MOST_LABELS} with --live")
+    return found
+
+
+def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
+    """Return the header of live Gaussians with these labels."""
+    numbers = [float(label.number) for label in labels]
+    return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
+
+
+def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
+    """Return the field of a label map as one thin fog, whose labels differ in colour."""
+    layer = field.source.layers[0]
+    assert isinstance(layer.tf, LabelTable)
+    voxels = {value: extent.count for value, extent in extents_of(layer.volume).items()}
+    table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
+    return field.with_look(field.source.with_tables([table]))
+
+
+def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
+    """Return the Gaussians of the fog with the rows of their labels, without those outside all labels."""
+    from vvgt_cli.closed_form.labelled import assign_labels
+
+    assert start.leaves is not None
+    frame, source = field.source.volume.unit_frame(), field.source
+    with run.stage("labels") as stage:
+        maps = [(source.layers[0].volume, [label.number for label in labels])]
+        owner, gradient = assign_labels(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
+        known = np.flatnonzero(owner >= 0)
+        gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
+        owner, gradient = owner[known], gradient[known]
+        tau = extinction(np.full(len(known), THIN), 2 * UNIT_SHARE)
+        length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
+        live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, gradient, owner])
+        stage.note = f"{len(np.unique(owner))} of {len(labels)} labels have Gaussians"
+    return replace(gaussians, live=live, harmonics=None)

@@ -14,11 +14,10 @@ from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
+from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
 from vvgt_cli.field.digests import digest, values_digest
-from vvgt_cli.field.drawing import Drawing
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import Bundle, RayFile, composed
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.closed_form.moments import Cells
     from vvgt_cli.field.cells import Reader
+
 
 Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds per step of a ray outside empty space: bonsai-tree in blocks of 128, two threads
@@ -346,3 +346,48 @@ def _gathered(task: CellBlocks) -> Cells:
         lit = np.concatenate(normals)[np.argsort(morton(whole), kind="stable")]
     grid = task.grid
     return Cells(*in_order(whole, moments), grid.cell_edge, np.array(grid.exponent, np.int64), lit)
+
+
+@dataclass
+class Drawing:
+    """A partially rendered picture, which stores only the pixels of its blocks.
+
+    Attributes:
+        key: digest of the picture.
+        camera, settings, blocks: the fields of `Picture`.
+    """
+
+    key: str
+    camera: Camera
+    settings: RenderSettings
+    blocks: Blocks | None
+
+    @cached_property
+    def colors(self) -> np.ndarray:
+        """Colours (n, 4) float32 of the pixels of `pixel_mask`, row by row."""
+        return np.zeros((int(self.pixel_mask().sum()), 4), np.float32)
+
+    def pixel_mask(self) -> np.ndarray:
+        """Return the mask (h, w) of the pixels to render."""
+        shape = self.camera.height, self.camera.width
+        return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
+
+    def image(self) -> np.ndarray:
+        """Return the picture (h, w, 4), zero outside the blocks."""
+        whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
+        whole[self.pixel_mask()] = self.colors
+        return whole
+
+    def first_pass(self) -> list[Rays]:
+        """Return the rays of the first pass."""
+        return first_rays(self.settings, self.pixel_mask())
+
+    def second_pass(self) -> list[Rays]:
+        """Return the rays of the second pass."""
+        return more_rays(self.settings, self.image(), self.pixel_mask())
+
+    def add(self, rays: Rays, shown: np.ndarray) -> None:
+        """Average in the colours that ``rays`` see, (pixels, rays, 4) float64."""
+        offsets, mask, known = rays
+        at = mask[self.pixel_mask()]
+        self.colors[at] = (known * self.colors[at] + shown.sum(axis=1)) / (known + len(offsets))

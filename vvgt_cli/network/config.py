@@ -12,7 +12,7 @@ STAGES = 5  # of the geometry transformer's encoder; its decoder has one fewer
 SCALES = 3  # S of the paper: maps at 1, 2 and 4 times the patch grid
 PARAMETERS = 14  # of a Gaussian: mean 3, log-scale 3, quaternion 4, opacity logit 1, colour 3
 STEP = 13  # of a step in a Gaussian's own frame: centre 3, log-scale 3, turn 3, opacity logit 1, colour 3
-SLOPES = STEP + 9  # see `vvgt_cli.network.slopes.slope_rows`
+SLOPES = STEP + 9  # see `vvgt_cli.network.prepare.slope_rows`
 PATCH = 14  # pixels, DINOv2's
 MOST, DEEPEST = 1 << 16, 1 << 8  # of any number in a configuration; of blocks in a stage
 

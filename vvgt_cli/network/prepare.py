@@ -1,4 +1,8 @@
-"""Input arrays of the network, from Gaussians, cameras and views, in numpy for both torch and onnxruntime."""
+"""Input arrays of the network, from Gaussians, cameras and views, in numpy for both torch and onnxruntime.
+
+Gradients of the image error by each Gaussian, the input of a network that predicts a step, are taken in its own axes,
+``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, so that they mean the same at any size and in any direction.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.network import tables
-from vvgt_cli.network.config import NetworkConfig
-from vvgt_cli.network.damp import damped
-from vvgt_cli.network.slopes import slope_rows
+from vvgt_cli.network.config import STEP, NetworkConfig
+from vvgt_cli.splat.half import halved
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 
@@ -53,7 +56,7 @@ class Prepared:
         return self.views | (self.part() if self.config.has_geometry else {})
 
     def accept(self, rows: np.ndarray, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> Gaussians:
-        """Return the output ``rows`` as Gaussians; steps are damped on the views (`vvgt_cli.network.damp`)."""
+        """Return the output ``rows`` as Gaussians; steps are damped on the views (`damped`)."""
         if self.config.geometry.head != "step":
             return self.restore(rows)
         return damped(self.restore(self.rows), self.restore(rows), cameras, images, rule)[0]
@@ -174,3 +177,114 @@ def filter_matrix(old: int, new: int) -> np.ndarray:
     weights = np.maximum(0, 1 - np.abs(centre[:, None] - np.arange(old)) / max(ratio, 1.0))
     result: np.ndarray = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
     return result
+
+
+VIEWS = 3  # of those that the network has read
+SMALLEST = 1 / 16  # share of a step; below it none is taken
+
+
+def interpolate(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
+    """Return the Gaussians ``share`` of the way; quaternions of norm 1, on the short arc's chord."""
+    mix = lambda a, b: a + np.float32(share) * (b - a)  # noqa: E731
+    fields = {field: mix(array, getattr(end, field)) for field, array in start.arrays().items()}
+    fields["quaternions"] /= np.linalg.norm(fields["quaternions"], axis=1, keepdims=True)
+    return Gaussians(**fields)
+
+
+def damped(
+    start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA
+) -> tuple[Gaussians, float]:
+    """Return the step from ``start`` to ``end`` shortened by halving while that lowers the error, and its share.
+
+    On scenes unlike those it was trained on, a network errs first by the size of its steps. The error is the squared
+    one of RGBA over `VIEWS` of the given views, averaged 2 x 2; the share is 0 if none lowers it.
+    """
+    from vvgt_cli.splat import render
+
+    some = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
+    few, views, rule = halved([cameras[i] for i in some], images[some], rule)
+
+    def error(gaussians: Gaussians) -> float:
+        total = 0.0
+        for camera, view in zip(few, views, strict=True):
+            picture = render(gaussians, camera, rule)
+            total += float(np.square(picture - view, dtype=np.float64).sum())
+        return total
+
+    share, best, lowest = 1.0, end, error(end)
+    while share > SMALLEST:
+        closer = interpolate(start, end, share / 2)
+        now = error(closer)
+        if now >= lowest:
+            break
+        share, best, lowest = share / 2, closer, now
+    return (best, share) if lowest < error(start) else (start, 0.0)
+
+
+FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
+
+
+def own_axes_gradients(
+    quaternions: np.ndarray, axes: np.ndarray, scales: np.ndarray, gradients: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in their order.
+
+    Args:
+        quaternions: (K, 4) of norm 1.
+        axes: (K, 3, 3) their rotations.
+        scales: (K, 3) standard deviations.
+        gradients: by means, log-scales, quaternions, logits and colours.
+    """
+    means, log_scales, turns, logits, colors = gradients
+    along = np.einsum("kij,ki->kj", axes, means) * scales
+    w, x, y, z = quaternions.T
+    a, b, c, d = turns.T
+    # q times (0, e_i) / 2, dotted with the gradient by q
+    spin = np.stack(
+        [w * b - x * a + z * c - y * d, w * c - z * b - y * a + x * d, w * d + y * b - x * c - z * a], axis=1
+    )
+    return np.concatenate([along, log_scales, spin / 2, logits[:, None], colors], axis=1)
+
+
+def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
+    """Return (K, `SLOPES`) float32 of Gaussians with unit quaternions; L is half a view's sum of squared RGBA errors.
+
+    Columns, g_v the (13,) gradient of view v's L in the own axes, n views:
+    - 13: ``sum g / sqrt(n sum g^2)`` in [-1, 1]: the direction, and how far the views agree on it;
+    - 5, one per field: log of ``sqrt(sum g^2 / n)``, its mean over the field, per pixel of blending weight and error;
+    - log of the blending weight per view (pixels), log of the error below it, over that of the scene;
+    - log of the scene's RMS error; log of a pixel's width at the origin, less that of a standard deviation.
+    """
+    from vvgt_cli.gaussians.frames import rotations
+    from vvgt_cli.splat import gather, project, render, render_backward
+
+    g, count = gaussians, len(gaussians)
+    axes, scales = rotations(g.quaternions).astype(np.float32), np.exp(g.log_scales)
+    total, squares = np.zeros((count, STEP), np.float32), np.zeros((count, STEP), np.float32)
+    weights, error = np.zeros((count, 5)), 0.0
+    pixel = float(np.median([np.linalg.norm(c.position) / c.fx for c in cameras]))
+    cameras, images, rule = halved(cameras, images, rule)
+    for camera, view in zip(cameras, images, strict=True):
+        projection = project(g, camera, rule)
+        image = render(g, camera, projection=projection)
+        rest = image - view
+        slope = render_backward(g, camera, projection, image, 2 * rest)
+        fields = slope.means, slope.log_scales, slope.quaternions, slope.opacity_logits, slope.colors
+        own = own_axes_gradients(g.quaternions, axes, scales, fields)
+        total += own
+        squares += own * own
+        size = np.sqrt((rest**2).mean(axis=2))  # (h, w) RMS over RGBA
+        error += float((size**2).mean())
+        gather(projection, np.broadcast_to(size, (4, *size.shape)), weights)
+    n = len(cameras)
+    rms = math.sqrt(error / n) + 1e-6
+    weight = weights[:, 0] / n  # pixels a view
+    per_pixel = np.sqrt(squares / n) / ((weight + 0.1) * rms)[:, None]
+    sizes = [np.log(np.sqrt((per_pixel[:, a:b] ** 2).mean(axis=1)) + 1e-4) for a, b in FIELDS]
+    below = np.log((weights[:, 1] + 1e-3 * rms) / ((weights[:, 0] + 1e-3) * rms))
+    thick = math.log(pixel) - g.log_scales.mean(axis=1)
+    columns = [
+        total / np.sqrt(n * squares + 1e-30), *sizes, np.log(weight + 0.01), below,
+        np.full(count, math.log(rms) + 3.5), thick,
+    ]  # fmt: skip
+    return np.column_stack(columns).astype(np.float32)

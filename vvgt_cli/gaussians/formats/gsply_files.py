@@ -1,4 +1,9 @@
-"""`.spz` (Niantic's, versions 3 and 4) and `.compressed.ply` (PlayCanvas') through gsply."""
+"""`.spz` (Niantic's, versions 3 and 4) and `.compressed.ply` (PlayCanvas') through gsply.
+
+`.spz` of version 4 has the streams of version 3, each compressed by Zstandard, after a plain header and records. The
+layout follows https://github.com/nianticlabs/spz and its extensions/README.md: 32 bytes of header, records (type,
+length, payload) and a table of (compressed, full) sizes. One record holds our comments, another the axes.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,16 @@ import gzip
 import struct
 import tempfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats import spz4
-from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.formats.splats import HARMONICS, ROW_BYTES, Splats, morton_order
 from vvgt_cli.gaussians.header import MIP, TYPES, header_lines
+from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 
 EXTRA = "share"
@@ -98,7 +104,7 @@ def spz(splats: Splats, name: str) -> bytes:
 
 def spz_4(splats: Splats, name: str) -> bytes:
     """Encode columns as `.spz` version 4, with records for the comments and for the axes, which are the `.ply`'s."""
-    return spz4.from_version_3(_version_3(splats, name), splats.comments, name)
+    return from_version_3(_version_3(splats, name), splats.comments, name)
 
 
 def zstandard(source: str) -> None:
@@ -108,7 +114,7 @@ def zstandard(source: str) -> None:
         DataError: gsply or numcodecs is not installed.
     """
     gsply(source)
-    spz4.library(source)
+    library(source)
 
 
 def _version_3(splats: Splats, name: str) -> bytes:
@@ -145,8 +151,8 @@ def read_spz(content: bytes, name: str) -> Splats:
     """
     library = gsply(name)
     comments = _comments(content)
-    if content.startswith(spz4.MAGIC):
-        content, comments = spz4.to_version_3(content, name)
+    if content.startswith(MAGIC):
+        content, comments = to_version_3(content, name)
     with library_errors(name, "an .spz"), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "in.spz"
         path.write_bytes(content)
@@ -167,3 +173,103 @@ def _columns(data: Any, comments: list[str]) -> Splats:
     found = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
     means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in found)
     return Splats(means, log_scales, quaternions, logits, f_dc, f_rest, tuple(comments))
+
+
+MAGIC = b"NGSP"
+COMMENTS, AXES = 0x56560001, 0xADBE0003  # types of records: our comments; SPZ_ADOBE_coordinate_system
+RIGHT_DOWN_FRONT = 6  # of CoordinateSystem: the axes of a 3DGS .ply
+_HEAD = struct.Struct("<4sIIBBBBI12x")  # magic, version, Gaussians, degree, fraction bits, flags, streams, table
+_OLD = struct.Struct("<4sIIBBBx")  # of versions 1 to 3
+_RECORD, _SIZES = struct.Struct("<II"), struct.Struct("<QQ")
+_RECORDS = 2  # flag
+_LEVEL = 12  # of Zstandard
+
+
+def library(source: str) -> Any:
+    """Return the module `numcodecs.zstd`.
+
+    Raises:
+        DataError: the module is not installed.
+    """
+    return need("numcodecs.zstd", "share", source, ".spz of version 4")
+
+
+def _lengths(count: int, degree: int) -> list[int]:
+    """Return the sizes in bytes of centres, opacities, colours, scales, rotations and harmonics."""
+    return [length * count for length in (9, 1, 3, 3, 4, 3 * HARMONICS[degree]) if length]
+
+
+def from_version_3(content: bytes, comments: tuple[str, ...], name: str) -> bytes:
+    """Convert the uncompressed content of version 3 to a file of version 4, which states the axes of a `.ply`."""
+    zstd = library(name)
+    _, _, count, degree, fraction, flags = _OLD.unpack_from(content)
+    records = _RECORD.pack(AXES, 4) + struct.pack("<I", RIGHT_DOWN_FRONT)
+    text = "\n".join(comments).encode("ascii", "replace")
+    records += _RECORD.pack(COMMENTS, len(text)) + text if text else b""
+    packed, sizes, start = [], b"", _OLD.size
+    for length in _lengths(count, degree):
+        packed.append(bytes(zstd.compress(content[start : start + length], _LEVEL)))
+        sizes += _SIZES.pack(len(packed[-1]), length)
+        start += length
+    head = (MAGIC, 4, count, degree, fraction, flags | _RECORDS, len(packed), _HEAD.size + len(records))
+    return b"".join([_HEAD.pack(*head), records, sizes, *packed])
+
+
+def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
+    """Convert a file of version 4 to version 3, compressed by gzip, and return it with our comments.
+
+    Raises:
+        DataError: the file is not valid, has other axes than a `.ply` or exceeds memory, or numcodecs is missing.
+    """
+    try:
+        _, version, count, degree, fraction, flags, streams, table = _HEAD.unpack_from(content)
+    except struct.error:
+        raise DataError(f"{name}: {len(content)} bytes; expected an .spz of version 4, whose header has 32") from None
+    lengths = _lengths(count, degree) if degree in HARMONICS else []
+    if version != 4 or streams != len(lengths) or not _HEAD.size <= table <= len(content) - streams * _SIZES.size:
+        raise DataError(
+            f"{name}: version {version}, degree {degree}, {streams} streams, table at {table} of {len(content)} bytes; "
+            "expected an .spz of version 4 with harmonics of degree 0 to 3"
+        )
+    check_memory(ROW_BYTES * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
+    zstd, start, body = library(name), table + streams * _SIZES.size, []
+    for number, length in enumerate(lengths):
+        size, whole = _SIZES.unpack_from(content, table + number * _SIZES.size)
+        part = content[start : start + size]
+        if whole != length or len(part) != size:
+            raise DataError(f"{name}: stream {number} is {whole} bytes in {len(part)}; expected {length} in {size}")
+        with library_errors(name, "an .spz of version 4"):
+            body.append(_unpacked(zstd, part, length, f"{name}: stream {number}"))
+        start += size
+    comments: list[str] = []
+    for kind, payload in _records(content[_HEAD.size : table] if flags & _RECORDS else b"", name):
+        if kind == COMMENTS:
+            comments = payload.decode("ascii", "replace").splitlines()
+        if kind == AXES and payload[:1] != bytes([RIGHT_DOWN_FRONT]):
+            raise DataError(f"{name}: axes of kind {payload[:1].hex()}; expected right, down, front as in a .ply (06)")
+    front = _OLD.pack(MAGIC, 3, count, degree, fraction, flags & 1)
+    return gzip.compress(front + b"".join(body), 1, mtime=0), comments
+
+
+def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
+    """Decompress a stream.
+
+    Raises:
+        DataError: it has fewer bytes than ``length``, detected by the end of the buffer, which stays unchanged.
+    """
+    for before in (b"\0", b"\xff"):
+        found = bytes(zstd.decompress(part, bytearray(before * length)))
+        if found[-1:] != before:
+            return found
+    raise DataError(f"{name}: truncated; expected {length} bytes by the file's table")
+
+
+def _records(zone: bytes, name: str) -> Iterator[tuple[int, bytes]]:
+    start = 0
+    while start < len(zone):
+        left = len(zone) - start
+        kind, length = _RECORD.unpack_from(zone, start) if left >= _RECORD.size else (0, left)
+        if _RECORD.size + length > left:
+            raise DataError(f"{name}: a record of {length} bytes; expected at most {left}, which remain in the file")
+        start += _RECORD.size + length
+        yield kind, zone[start - length : start]

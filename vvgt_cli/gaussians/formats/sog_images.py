@@ -22,9 +22,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.codebooks import LARGEST_PALETTE, SIZE, codebook, palette, places_in
 from vvgt_cli.gaussians.formats.splats import DEGREES, HARMONICS, Splats, logits_of, opacities_of
-from vvgt_cli.gaussians.formats.turns import nearest_turn
 from vvgt_cli.version import VERSION
 
 MOST = 1 << 26  # Gaussians in one set of images
@@ -216,3 +214,115 @@ def _pixels(
             raise DataError(f"{what} is of {image.width} x {image.height} px; expected {wide}{needed} px or a few more")
         pixels: np.ndarray = np.array(image.convert("RGBA")).reshape(-1, 4)[:needed]
         return pixels
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the Hamilton product of quaternions (..., 4), (w, x, y, z)."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def _quarters() -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternions (24, 4) and the permutations of the scales that go with them (24, 3)."""
+    half = np.sqrt(0.5)
+    about, axes = [np.array([half, half, 0, 0]), np.array([half, 0, half, 0])], [[0, 2, 1], [2, 1, 0]]
+    found, orders = [np.array([1.0, 0, 0, 0])], [[0, 1, 2]]
+    for k in range(24):
+        for quarter, swapped in zip(about, axes, strict=True):
+            turned = _product(found[k], quarter)
+            if all(abs(turned @ other) < 0.999 for other in found):
+                found.append(turned)
+                orders.append([orders[k][axis] for axis in swapped])
+    return np.array(found), np.array(orders)
+
+
+QUARTERS, ORDERS = _quarters()
+_AT_ONCE = 1 << 16  # Gaussians
+
+
+def nearest_turn(quaternions: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same ellipsoids with the smallest rotations (largest w), whose numbers are more alike.
+
+    Args:
+        quaternions: (K, 4), (w, x, y, z), of norm 1.
+        log_scales: (K, 3).
+
+    Returns:
+        quaternions, float64; log-scales in the type of ``log_scales``.
+    """
+    turned, scaled = np.empty((len(quaternions), 4)), np.empty_like(log_scales)
+    for start in range(0, len(quaternions), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        candidates = _product(quaternions[part, None].astype(np.float64), QUARTERS)  # (k, 24, 4)
+        best = np.abs(candidates[..., 0]).argmax(axis=1)
+        turned[part] = candidates[np.arange(len(best)), best]
+        scaled[part] = np.take_along_axis(log_scales[part], ORDERS[best], axis=1)
+    return turned, scaled
+
+
+SIZE = 256  # values of a codebook, indexed by a byte
+BINS = 8192  # of the histogram that is divided into intervals
+LARGEST_PALETTE = 1 << 16  # rows, indexed by two bytes
+
+
+def codebook(values: np.ndarray) -> np.ndarray:
+    """Return `SIZE` values (float32, ascending) that represent any number of finite ones.
+
+    Their histogram is divided into intervals with the smallest squared error, where a bin is weighted by the square
+    root of its count. Equal weights would make larger files, and full counts would quantise rare values (large
+    Gaussians) coarsely.
+    """
+    flat = values.ravel().astype(np.float64)
+    low, high = float(flat.min()), float(flat.max())
+    places = np.minimum((flat - low) / ((high - low) or 1.0) * BINS, BINS - 1).astype(np.int64)
+    counts, sums = np.bincount(places, minlength=BINS), np.bincount(places, flat, BINS)
+    some = counts > 0
+    means, weights = sums[some] / counts[some], np.sqrt(counts[some])
+    if len(means) > SIZE:
+        means = best_intervals(means, weights, SIZE)
+    return np.concatenate([means, np.full(SIZE - len(means), means[-1])]).astype(np.float32)
+
+
+def places_in(book: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the index of the nearest value of a codebook, uint8 in the shape of ``values``."""
+    book = book.astype(np.float64)
+    places: np.ndarray = np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
+    return places
+
+
+def best_intervals(means: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+    """Return the means (count,) float64 of the intervals of ascending numbers (n > count,) with least squared error."""
+    from vvgt_cli.gaussians.formats.codebook_kernels import divide
+
+    shifted = means - means.mean()  # avoids cancellation in the sums of squares
+    sums = np.zeros((3, len(means) + 1))
+    sums[:, 1:] = np.cumsum([weights, weights * shifted, weights * shifted**2], axis=1)
+    cuts = np.zeros((count + 1, len(means) + 1), np.int32)
+    divide(sums, cuts)
+    found, end = np.empty(count, np.float64), len(means)
+    for k in range(count, 0, -1):
+        start = int(cuts[k, end])
+        found[k - 1] = (sums[1, end] - sums[1, start]) / (sums[0, end] - sums[0, start])
+        end = start
+    found += means.mean()
+    return found
+
+
+def palette(points: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cluster ``points`` (n, d) into at most ``most`` rows.
+
+    Returns:
+        rows (m, d) float32; (n,) int32, the row of each point.
+    """
+    from vvgt_cli.gaussians.formats.codebook_kernels import cut_clusters
+
+    rows, labels = cut_clusters(np.ascontiguousarray(points, np.float32), min(most, len(points)))
+    return rows, labels

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import os
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, distributed, nn
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
@@ -20,8 +24,6 @@ from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, 
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.training.config import TrainConfig, config_text, lists, read_config
 from vvgt_cli.network.training.lpips import Lpips, load_lpips
-from vvgt_cli.network.training.parallel import World, world
-from vvgt_cli.network.training.record import Recorder
 from vvgt_cli.network.training.sample import Feeder, accumulate_gradients, score_scene
 from vvgt_cli.network.training.scenes import TrainingScene, make_scenes, prepare_scenes
 from vvgt_cli.progress import Console
@@ -232,3 +234,150 @@ def commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return found.stdout.strip() or "unknown"
+
+
+@dataclass(frozen=True)
+class World:
+    """A process of a group.
+
+    Attributes:
+        rank: its number, from 0.
+        size: number of processes.
+        device: of its network.
+    """
+
+    rank: int
+    size: int
+    device: torch.device
+
+    @property
+    def first(self) -> bool:
+        """Return whether this process writes and prints."""
+        return self.rank == 0
+
+    def total(self, values: Iterable[float]) -> list[float]:
+        """Return the sums over all processes."""
+        tensor = torch.tensor(list(values), dtype=torch.float64, device=self.device)
+        if self.size > 1:
+            distributed.all_reduce(tensor)
+        return [float(value) for value in tensor.cpu()]
+
+    def add_gradients(self, network: nn.Module) -> None:
+        """Replace every parameter's gradient by the sum over all processes; a missing one counts as zero.
+
+        One sum per step replaces torch's DistributedDataParallel: scenes come one at a time, several per step, and a
+        skipped scene must not leave the others waiting.
+        """
+        grads: list[Tensor] = []
+        for parameter in network.parameters():
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            grads.append(parameter.grad)
+        if self.size == 1:
+            return
+        flat = torch.cat([grad.reshape(-1) for grad in grads])
+        distributed.all_reduce(flat)
+        for grad, part in zip(grads, flat.split([grad.numel() for grad in grads]), strict=True):
+            grad.copy_(part.view_as(grad))
+
+    def wait(self) -> None:
+        """Wait until all processes arrive."""
+        if self.size > 1:
+            distributed.barrier()
+
+
+@contextmanager
+def world() -> Iterator[World]:
+    """Yield the group of torchrun's environment, one process without it; gloo on CPUs, NCCL on GPUs."""
+    size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
+    cuda = torch.cuda.is_available()
+    device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if cuda else torch.device("cpu")
+    if size == 1:
+        yield World(0, 1, device)
+        return
+    distributed.init_process_group("nccl" if cuda else "gloo")
+    try:
+        yield World(rank, size, device)
+    finally:
+        distributed.destroy_process_group()
+
+
+MESSAGE_SECONDS = 20.0  # seconds
+
+
+class Table:
+    """A CSV file that grows; a resumed run removes the rows after its checkpoint."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        """Remove rows after ``step``."""
+        self.path = path
+        if not path.exists():
+            return
+        with path.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        kept = [row for row in rows if int(row["step"]) <= step]
+        with atomic_write(path, overwrite=True) as temporary, temporary.open("w", newline="") as stream:
+            if rows:
+                writer = csv.DictWriter(stream, list(rows[0]))
+                writer.writeheader()
+                writer.writerows(kept)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Append a row; all rows have the same columns."""
+        empty = not self.path.exists() or not self.path.stat().st_size
+        with self.path.open("a", newline="") as stream:
+            writer = csv.DictWriter(stream, list(row))
+            if empty:
+                writer.writeheader()
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+
+
+class Recorder:
+    """Records of a run: ``metrics.csv`` (row per step), ``held.csv`` (row per validation), TensorBoard, messages."""
+
+    def __init__(self, folder: Path, step: int, steps: int, console: Console) -> None:
+        """Open the tables and TensorBoard for a run that continues after ``step``."""
+        self.metrics, self.held = Table(folder / "metrics.csv", step), Table(folder / "held.csv", step)
+        self.board = _board(folder, step, console)
+        self.console, self.first, self.steps = console, step, steps
+        self.began = self.reported = time.monotonic()
+
+    def step(self, row: dict[str, Any]) -> None:
+        """Record a step; print a line with the remaining time every `MESSAGE_SECONDS` seconds."""
+        self.metrics.add(row)
+        self._plot("train", row)
+        now, done = time.monotonic(), row["step"]
+        if now - self.reported >= MESSAGE_SECONDS or done == self.steps:
+            self.reported = now
+            left = (now - self.began) / max(done - self.first, 1) * (self.steps - done)
+            self.console.message(
+                f"step {done} of {self.steps}: loss {row['loss']:.4f}, gain {row['gain']:+.3f} dB, "
+                f"{row['skipped']} skipped, {left / 60:.1f} minutes left"
+            )
+
+    def validation(self, row: dict[str, Any]) -> None:
+        """Record the scores of the held-out scenes."""
+        self.held.add(row)
+        self._plot("held", row)
+        found = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)
+        self.console.message(f"step {row['step']}, held out: {found}")
+
+    def _plot(self, group: str, row: dict[str, Any]) -> None:
+        if self.board is not None:
+            for key, value in row.items():
+                if key != "step":
+                    self.board.add_scalar(f"{group}/{key}", value, row["step"])
+
+    def close(self) -> None:
+        """Flush TensorBoard."""
+        if self.board is not None:
+            self.board.close()
+
+
+def _board(folder: Path, step: int, console: Console) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        console.message("tensorboard is not installed: metrics go to CSV only")
+        return None
+    return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

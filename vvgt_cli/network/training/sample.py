@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.images.metrics import psnr
+from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA, psnr
 from vvgt_cli.network.model import Vvgt
-from vvgt_cli.network.prepare import Prepared, prepare
+from vvgt_cli.network.prepare import Prepared, prepare, unpack
 from vvgt_cli.network.runtime import views_of_round
-from vvgt_cli.network.training.config import TrainConfig
-from vvgt_cli.network.training.losses import decibels, view_loss
+from vvgt_cli.network.training.config import LossConfig, TrainConfig
 from vvgt_cli.network.training.lpips import Lpips
 from vvgt_cli.network.training.scenes import TrainingScene, as_float
-from vvgt_cli.network.training.splatter import splat
-from vvgt_cli.splat import render
+from vvgt_cli.splat import project, render, render_backward
+from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 @dataclass
@@ -128,3 +131,92 @@ def mean_psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarra
     """Return the mean PSNR over views; images uint16."""
     pairs = zip(cameras, images, strict=True)
     return float(np.mean([psnr(as_float(view)[..., :3], render(gaussians, c)[..., :3]) for c, view in pairs]))
+
+
+TINY = 1e-10  # squared error of 100 dB
+
+
+def view_loss(
+    picture: Tensor, target: Tensor, before: Tensor | None, config: LossConfig, lpips: Lpips | None = None
+) -> Tensor:
+    """Return the weighted sum of the terms.
+
+    Args:
+        picture: (h, w, 4) premultiplied RGBA.
+        target: of the same shape.
+        before: picture of the Gaussians that the network was given; for ``decibel``.
+        config: weights; a term of weight 0 is not computed.
+        lpips: network of the ``lpips`` term.
+    """
+    total = picture.new_zeros(())
+    if config.l1:
+        total = total + config.l1 * (picture - target).abs().mean()
+    if config.ssim:
+        total = total + config.ssim * (1 - ssim(picture[..., :3], target[..., :3]))
+    if config.decibel:
+        assert before is not None
+        total = total - config.decibel * decibels(picture, target, before) / 10
+    if config.lpips:
+        assert lpips is not None
+        total = total + config.lpips * lpips(picture[..., :3], target[..., :3])
+    return total
+
+
+def decibels(picture: Tensor, target: Tensor, before: Tensor) -> Tensor:
+    """Return the gain in PSNR over ``before``, RGB, images (h, w, 4)."""
+    errors = [((image - target)[..., :3] ** 2).mean() + TINY for image in (before, picture)]
+    return 10 / math.log(10) * torch.log(errors[0] / errors[1])
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Return the mean SSIM of (h, w, 3), over windows inside the image as in `vvgt_cli.images.metrics.ssim`."""
+    x = torch.arange(-RADIUS, RADIUS + 1, dtype=a.dtype, device=a.device)
+    kernel = torch.exp(-0.5 * (x / SIGMA) ** 2)
+    kernel = kernel / kernel.sum()
+    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)  # (3, h, w)
+    planes = torch.cat([a, b, a * a, b * b, a * b])[:, None]  # (15, 1, h, w)
+    planes = functional.conv2d(functional.conv2d(planes, kernel[None, None, :, None]), kernel[None, None, None, :])
+    m, n, mm, nn, mn = planes[:, 0].chunk(5)
+    light = (2 * m * n + C1) / (m * m + n * n + C1)
+    shape = (2 * (mn - m * n) + C2) / (mm - m * m + nn - n * n + C2)
+    return (light * shape).mean()
+
+
+class Splat(torch.autograd.Function):
+    """Autograd of `vvgt_cli.splat.render` and `render_backward`; rows as in `vvgt_cli.network.prepare.pack`."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, camera: Camera) -> Tensor:
+        """Return the picture (height, width, 4) of ``rows`` (K, 14)."""
+        gaussians = unpack(rows.detach().float().cpu().numpy())
+        projection = project(gaussians, camera)
+        image = render(gaussians, camera, projection=projection)
+        ctx.kept = gaussians, camera, projection, image
+        return torch.from_numpy(image).to(rows.device)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        """Return the gradient by the rows."""
+        gaussians, camera, projection, image = ctx.kept
+        g = render_backward(gaussians, camera, projection, image, grads[0].float().cpu().numpy())
+        fields = g.means, g.log_scales, g.quaternions, g.opacity_logits[:, None], g.colors
+        return torch.from_numpy(np.concatenate(fields, axis=1)).to(grads[0].device), None
+
+
+def splat(rows: Tensor, camera: Camera) -> Tensor:
+    """Return the picture (height, width, 4) float32 of Gaussians (K, 14), premultiplied; rows must be finite.
+
+    On a CUDA device gsplat (extra ``cuda``) draws it if installed, else the numba kernels on the host.
+    """
+    if rows.is_cuda and importlib.util.find_spec("gsplat"):
+        return gsplat_picture(rows, camera)
+    picture: Tensor = Splat.apply(rows, camera)
+    return picture
+
+
+def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
+    """`splat` by gsplat, differentiable; see `vvgt_cli.splat.by_gsplat.picture` for where pictures differ."""
+    means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
+    opacity = capped(logits[:, 0].sigmoid())
+    drawn = picture(means, opacity, colors.clamp(min=0), camera, quats=quaternions, scales=log_scales.exp())
+    return torch.cat(drawn, dim=-1)

@@ -2,11 +2,17 @@
 
 libCZI (pylibCZIrw) is not used, as damaged files can end the process in it, and czifile of 2019, as it knows no
 Zstandard (docs/log/readers.md).
+
+Format: "ZEN File Format for CZI", version 1.2.2, chapter 3 (segments, directory entries of schema DV); Zstandard as
+https://github.com/ZEISS/libczi has it. All sizes are compared with the file; tiles are unpacked to their size and no
+further.
 """
 
 from __future__ import annotations
 
 import math
+import struct
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,12 +20,181 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.libraries import library_errors
-from vvgt_cli.volume.microscopy.image import Box, Color, Picture, choose_image, hex_color, picture_volume, safe_xml
-from vvgt_cli.volume.microscopy.zeiss_tiles import PIXELS, SPARSE, Tile, pixels_of, tiles_of
+from vvgt_cli.volume.blocks import check_memory, size_text
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy.image import (
+    EXTRA,
+    MAX_XML,
+    Bounded,
+    Box,
+    Color,
+    Picture,
+    choose_image,
+    hex_color,
+    picture_volume,
+    safe_xml,
+)
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
+
+SEGMENT = struct.Struct("<16sqq")  # name, bytes set aside, bytes used
+HEADER = struct.Struct("<iiii16s16siqqiq")  # the 8th and 9th: where directory and metadata are
+ENTRY, DIMENSION = struct.Struct("<2siqiiB5si"), struct.Struct("<4siifi")
+DATA = struct.Struct("<iiq")  # of a tile: bytes of metadata, attachment, pixels
+LISTING, DETAILS = 128, 256  # bytes before the entries of a directory; of a tile before its metadata, at least
+PIXELS = {
+    0: ("uint8", 1), 1: ("uint16", 1), 2: ("float32", 1), 3: ("uint8", 3), 4: ("uint16", 3), 8: ("float32", 3),
+    9: ("uint8", 4), 12: ("int32", 1), 13: ("float64", 1),
+}  # fmt: skip
+NONE, JPEG_XR, ZSTD, ZSTD_HEADED = 0, 4, 5, 6
+OTHERS = {1: "JPEG", 2: "LZW"}
+MOST = 1 << 31  # pixels from the first to the last of an axis
+SPARSE = 1000  # times as many pixels as all tiles have
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile of the finest level.
+
+    Attributes:
+        at: first index along axes such as C, Z, T and S; of tiles above each other M counts up.
+        x, y, width, height: pixels.
+        pixel, compression: numbers of the format.
+        place, size: of its bytes in the file.
+    """
+
+    at: dict[str, int]
+    x: int
+    y: int
+    width: int
+    height: int
+    pixel: int
+    compression: int
+    place: int
+    size: int
+
+
+def tiles_of(path: Path) -> tuple[list[Tile], str]:
+    """Read the tiles and the metadata, XML.
+
+    Raises:
+        DataError: segments that reach beyond the file, or numbers that cannot be.
+    """
+    size = path.stat().st_size
+    with Bounded(path) as file:
+
+        def take(form: struct.Struct, place: int, what: str) -> tuple[Any, ...]:
+            _fits(path, size, place, form.size, what)
+            file.seek(place)
+            return form.unpack(file.read(form.size))
+
+        head = take(HEADER, SEGMENT.size, "its header")
+        listing, metadata, xml = head[7], head[8], ""
+        if metadata:
+            (length,) = take(struct.Struct("<i"), metadata + SEGMENT.size, "metadata")
+            _fits(path, size, metadata + SEGMENT.size + DETAILS, length, "metadata")
+            if length > MAX_XML:
+                raise DataError(f"{path}: metadata of {size_text(length)}; expected at most {size_text(MAX_XML)}")
+            file.seek(metadata + SEGMENT.size + DETAILS)
+            xml = file.read(length).rstrip(b"\0").decode("utf-8", "replace")
+        name, _, _ = take(SEGMENT, listing, "a directory of tiles")
+        (count,) = take(struct.Struct("<i"), listing + SEGMENT.size, "a directory of tiles")
+        if name.rstrip(b"\0") != b"ZISRAWDIRECTORY":
+            raise DataError(f"{path}: no directory of tiles where its header says; check that the CZI file is whole")
+        _fits(path, size, listing, count * ENTRY.size, "the directory of tiles")
+        place = listing + SEGMENT.size + LISTING
+        found = []
+        for _ in range(count):
+            _, pixel, start, part, compression, _, _, axes = take(ENTRY, place, "an entry of the directory")
+            place += ENTRY.size
+            _fits(path, size, place, axes * DIMENSION.size, "an entry of the directory")
+            dimensions = [take(DIMENSION, place + k * DIMENSION.size, "an axis of a tile") for k in range(axes)]
+            place += axes * DIMENSION.size
+            if part:
+                raise DataError(f"{path}: tiles in other files (part {part}); expected one file: export it as one")
+            spans = {
+                a.rstrip(b"\0").decode("ascii", "replace"): (first, n, n if kept == 0 else kept)
+                for a, first, n, _, kept in dimensions
+            }
+            if any(n != kept for _, n, kept in spans.values()):
+                continue  # of a coarser level
+            lengths = take(DATA, start + SEGMENT.size, "a tile")
+            begin = start + SEGMENT.size + max(DETAILS, DATA.size + ENTRY.size + axes * DIMENSION.size) + lengths[0]
+            _fits(path, size, begin, lengths[2], "a tile")
+            _fits(path, size, start, min(lengths), "a tile")
+            found.append(_tile(spans, (pixel, compression, begin, lengths[2]), path))
+    if not found:
+        raise DataError(f"{path}: no tiles; expected at least one")
+    return found, xml
+
+
+def _tile(spans: dict[str, tuple[int, int, int]], facts: tuple[int, int, int, int], path: Path) -> Tile:
+    if not {"X", "Y"} <= set(spans) or any(not (1 <= n < MOST and abs(k) < MOST) for k, n, _ in spans.values()):
+        raise DataError(f"{path}: a tile of {str(spans)[:200]}; expected X and Y of at least one pixel")
+    (x, width, _), (y, height, _) = spans["X"], spans["Y"]
+    at = {a: first for a, (first, _, _) in spans.items() if a not in "XY"}
+    return Tile(at, x, y, width, height, *facts)
+
+
+def _fits(path: Path, size: int, place: int, length: int, what: str) -> None:
+    if not (place >= 0 and 0 <= length <= size - place):
+        raise DataError(f"{path}: {what} of {length} bytes at byte {place} of {size}; check that the CZI file is whole")
+
+
+def pixels_of(tile: Tile, path: Path) -> np.ndarray:
+    """Read a tile, (height, width, samples); samples of colours are blue first.
+
+    Raises:
+        DataError: a compression that is not known, a library that is missing, damage.
+    """
+    kind, samples = PIXELS[tile.pixel]
+    shape, dtype = (tile.height, tile.width, samples), np.dtype(kind).newbyteorder("<")
+    need_bytes = tile.height * tile.width * samples * dtype.itemsize
+    if tile.compression == NONE:
+        if tile.size < need_bytes:
+            raise DataError(
+                f"{path}: a tile of {tile.size} bytes; {tile.width} x {tile.height} pixels need {need_bytes}"
+            )
+        return np.memmap(path, dtype, "r", tile.place, shape)
+    check_memory(2 * need_bytes, f"{path}: a tile of {tile.width} x {tile.height}")
+    with Bounded(path) as file:
+        file.seek(tile.place)
+        data = file.read(tile.size)
+    if tile.compression in (ZSTD, ZSTD_HEADED):
+        data = _zstd(data, need_bytes, tile.compression == ZSTD_HEADED, path)
+    elif tile.compression == JPEG_XR:
+        return _jpeg_xr(data, shape, dtype, path)
+    else:
+        name = OTHERS.get(tile.compression, f"number {tile.compression}")
+        raise DataError(f"{path}: compression {name}; expected none, Zstandard or JPEG XR: export it with one of them")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _zstd(data: bytes, size: int, headed: bool, path: Path) -> bytes:
+    """Decompress Zstandard data, behind a header that may say that high bytes follow all low ones."""
+    codec = need("numcodecs.zstd", EXTRA, str(path), "CZI with Zstandard")
+    split = False
+    if headed:
+        length = data[0]
+        if length not in (1, 3):
+            raise DataError(f"{path}: a Zstandard head of {length} bytes; expected 1 or 3; is the file whole?")
+        split = length == 3 and data[1] == 1 and bool(data[2] & 1)
+        data = data[length:]
+    out = bytearray(size)
+    codec.decompress(data, out)
+    return np.frombuffer(out, np.uint8).reshape(2, -1).T.tobytes() if split else bytes(out)
+
+
+def _jpeg_xr(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, path: Path) -> np.ndarray:
+    try:
+        import imagecodecs
+    except ImportError:
+        raise DataError(f"{path}: JPEG XR, which needs imagecodecs; try: pip install imagecodecs") from None
+    if shape[2] > 1:
+        raise DataError(f"{path}: colours in JPEG XR, whose order is not known here; export them as Zstandard")
+    return np.asarray(imagecodecs.jpegxr_decode(data)).reshape(shape).astype(dtype, copy=False)
+
 
 MICROMETRE = 1e-6
 TILE = 512  # pixels along the edge of what is read together, at least

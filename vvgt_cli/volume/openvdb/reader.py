@@ -1,19 +1,28 @@
 """OpenVDB ``.vdb``, format versions 222 to 224: the active bounding box of one grid, bit for bit as OpenVDB reads it.
 
 Read here because no wheel of OpenVDB exists; its own Python module, where a system has it, reads fewer types.
+
+A tree's active bounding box becomes a `BrickArray`, a (nz, ny, nx) array kept as those 8^3 bricks that vary (leaves, as
+they are), beside one value for every other brick (tiles). It stands where a `Volume` has its array. Slabs of z are put
+together when they are asked for; whoever needs the whole array gets it laid out once, in memory that takes no page
+where all is zero.
 """
 
 from __future__ import annotations
 
+import math
 import mmap
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.components import choose
+from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import choose, select_component
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.cursor import Cursor
-from vvgt_cli.volume.openvdb.layout import bounding_box, brick_array
-from vvgt_cli.volume.openvdb.tree import Tree, TreeReader
+from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
@@ -86,3 +95,236 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
         placement.direction,
         volume_name(path),
     )
+
+
+def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Find the first and last active voxel, (3,) int64 each (x, y, z).
+
+    Raises:
+        DataError: none is active.
+    """
+    lo, hi = [], []
+    for node in tree.nodes:
+        for axis in range(3):
+            if axis == 0 and not node.active.any():
+                break
+            where = np.flatnonzero(node.active.any(axis=tuple({0, 1, 2} - {axis})))
+            ends = node.origin[axis] + np.array([where[0], where[-1] + 1]) * node.step
+            lo.append((axis, int(ends[0])))
+            hi.append((axis, int(ends[1]) - 1))
+    used = np.flatnonzero(tree.masks.any(axis=1))
+    if len(used):
+        bytes_xy = tree.masks[used].reshape(-1, 8, 8)  # by x, y: bit z
+        by_z = np.unpackbits(np.bitwise_or.reduce(bytes_xy, axis=(1, 2))[:, None], axis=1, bitorder="little")
+        marks: list[np.ndarray] = [np.any(bytes_xy, axis=2), np.any(bytes_xy, axis=1), by_z.view(bool)]
+        for axis, on in enumerate(marks):
+            first = on.argmax(axis=1)
+            last = EDGE - 1 - on[:, ::-1].argmax(axis=1)
+            lo.append((axis, int((tree.origins[used, axis] + first).min())))
+            hi.append((axis, int((tree.origins[used, axis] + last).max())))
+    if not lo:
+        raise DataError(f"{name}: the grid has no active voxel; expected at least one")
+    return (
+        np.array([min(v for a, v in lo if a == axis) for axis in range(3)], np.int64),
+        np.array([max(v for a, v in hi if a == axis) for axis in range(3)], np.int64),
+    )
+
+
+def brick_array(
+    tree: Tree, lo: np.ndarray, hi: np.ndarray, component: int | str | None, source: str, label: str
+) -> BrickArray:
+    """Lay out the voxels ``lo`` to ``hi`` (3,) (x, y, z), both included; of vectors one component.
+
+    Raises:
+        DataError: more than the free memory, or a box that is too large.
+        UsageError: vectors and no component chosen.
+    """
+    tail = tree.background.shape if len(tree.background) > 1 else ()
+    first, count = brick_grid(lo, hi, tree.background.nbytes, source)
+    shape = tuple(int(n) for n in count[::-1])
+    fill = np.empty((*shape, *tail), tree.background.dtype)
+    fill[...] = tree.background if tail else tree.background[0]
+    which = np.full(shape, -1, np.int32)
+    for node in tree.nodes:
+        _paint(fill, node, first, tree.background)
+    place = (tree.origins // EDGE - first)[:, ::-1]  # z, y, x
+    inside = ((place >= 0) & (place < shape)).all(axis=1)
+    rows = np.flatnonzero(inside)
+    which[tuple(place[rows].T)] = rows
+    bricks = tree.leaves
+    if not tail:
+        fill, bricks = fill[..., None], bricks[..., None]
+    fill = _choose(fill, component, source, label)
+    cubes = bricks.reshape(-1, EDGE, EDGE, *bricks.shape[4:])
+    bricks = _choose(cubes, component, source, label).reshape(-1, EDGE, EDGE, EDGE)
+    z, y, x = (int(v) for v in (lo - first * EDGE)[::-1])
+    return BrickArray(fill, which, bricks, (z, y, x), [int(b - a) + 1 for a, b in zip(lo[::-1], hi[::-1], strict=True)])
+
+
+def _choose(values: np.ndarray, component: int | str | None, source: str, label: str) -> np.ndarray:
+    return select_component(values, component, source, label=label)[0]
+
+
+def _paint(fill: np.ndarray, node: Node, first: np.ndarray, background: np.ndarray) -> None:
+    """Write a node's tiles into the bricks (z, y, x, ...) that they cover."""
+    corner = node.origin // EDGE - first  # in bricks, x, y, z
+    size = np.array(fill.shape[2::-1])  # x, y, z
+    width = node.step // EDGE  # bricks along a tile
+    n = len(node.child)
+    begin = np.maximum(-corner // width, 0)  # tiles that overlap the bricks
+    end = np.minimum(-((corner - size) // width), n)
+    if (begin >= end).any():
+        return
+    part = tuple(slice(int(b), int(e)) for b, e in zip(begin, end, strict=True))
+    values, child = node.values[part], node.child[part]
+    if width == 1:
+        x, y, z = (corner + begin).tolist()
+        dx, dy, dz = child.shape
+        # children are painted too, with values of no meaning: they are leaves, which come before the fill
+        fill[z : z + dz, y : y + dy, x : x + dx] = values.swapaxes(0, 2)
+        return
+    same = values.view(np.uint8).reshape(*child.shape, -1) == background.view(np.uint8)
+    for entry in np.argwhere(~child & ~same.all(axis=-1)):
+        at = corner + (begin + entry) * width
+        x0, y0, z0 = np.maximum(at, 0).tolist()
+        x1, y1, z1 = np.minimum(at + width, size).tolist()
+        fill[z0:z1, y0:y1, x0:x1] = values[tuple(entry)]
+
+
+EDGE = 8  # voxels along a brick
+MAX_VOXELS = 1 << 36  # 4096^3: the box alone, not what is in it, decides how long a walk through it takes
+
+
+class BrickArray:
+    """An array of bricks; attributes that are not listed below are those of the whole array, laid out for them.
+
+    Attributes:
+        shape: (nz, ny, nx).
+        dtype: of the values.
+    """
+
+    ndim = 3
+
+    def __init__(
+        self, fill: np.ndarray, which: np.ndarray, bricks: np.ndarray, first: tuple[int, int, int], shape: Any
+    ) -> None:
+        """Take the parts as they are.
+
+        Args:
+            fill: (bz, by, bx) value of the bricks that do not vary.
+            which: (bz, by, bx) int32 row of ``bricks``, -1 where there is none.
+            bricks: (n, 8, 8, 8) values by x, y, z.
+            first: voxels (z, y, x) of the first bricks that lie before the array.
+            shape: of the array.
+        """
+        self.shape: tuple[int, int, int] = tuple(shape)
+        self.dtype = fill.dtype
+        self.size = math.prod(self.shape)
+        self.nbytes = self.size * self.dtype.itemsize
+        self._fill, self._which, self._bricks, self._first = fill, which, bricks, first
+        self._layer: tuple[int, np.ndarray] | None = None
+        self._whole: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        """Return the number of slices."""
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Return a slice, a range of slices, or any other part of the array laid out."""
+        if isinstance(key, int | np.integer):
+            z = int(key) + (len(self) if key < 0 else 0)
+            if not 0 <= z < len(self):
+                raise IndexError(f"slice {key} of {len(self)}")
+            result: np.ndarray = self._slices(z, z + 1)[0]
+            return result
+        if isinstance(key, slice) and key.step in (None, 1):
+            start, stop, _ = key.indices(len(self))
+            return self._slices(start, max(start, stop))
+        picked: np.ndarray = self.whole()[key]
+        return picked
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the array laid out."""
+        return np.array(self.whole(), dtype, copy=copy) if copy else np.asarray(self.whole(), dtype)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the array laid out."""
+        if name.startswith("_"):  # protocols that numpy and copy ask for
+            raise AttributeError(name)
+        return getattr(self.whole(), name)
+
+    def whole(self) -> np.ndarray:
+        """Return the array in memory, C-contiguous; pages are taken only where something differs from zero.
+
+        Raises:
+            DataError: more than the free memory.
+        """
+        if self._whole is None:
+            check_memory(self.nbytes, f"{' x '.join(map(str, reversed(self.shape)))} voxels laid out")
+            out = _blank(self.shape, self.dtype)
+            for z in range(0, len(self), EDGE):
+                slab = self._slices(z, min(z + EDGE, len(self)))
+                target = out[z : z + EDGE]
+                # bytes, not values: minus zero is something
+                rows = slab.view(np.uint8).any(axis=2)
+                target[rows] = slab[rows]
+            out.flags.writeable = False
+            self._whole, self._layer, self._bricks = out, None, self._bricks[:0]  # the parts are not needed any more
+        return self._whole
+
+    def _slices(self, start: int, stop: int) -> np.ndarray:
+        """Return slices start to stop, (stop - start, ny, nx), C-contiguous."""
+        if self._whole is not None:
+            return self._whole[start:stop]
+        out = np.empty((stop - start, *self.shape[1:]), self.dtype)
+        z0, y0, x0 = self._first
+        z = start
+        while z < stop:
+            at, inside = divmod(z + z0, EDGE)
+            n = min(EDGE - inside, stop - z)
+            layer = self._brick_layer(at)[inside : inside + n]
+            out[z - start : z - start + n] = layer[:, y0 : y0 + self.shape[1], x0 : x0 + self.shape[2]]
+            z += n
+        return out
+
+    def _brick_layer(self, at: int) -> np.ndarray:
+        """Return the values (8, 8 by, 8 bx) of one layer of bricks, and keep it, as slabs are thinner than bricks."""
+        if self._layer is None or self._layer[0] != at:
+            by, bx = self._which.shape[1:]
+            out = np.empty((EDGE, by, EDGE, bx, EDGE), self.dtype)
+            out[:] = self._fill[at][None, :, None, :, None]
+            j, i = np.nonzero(self._which[at] >= 0)
+            # bricks are (n, x, y, z); indices apart put n first: (n, z, y, x)
+            out[:, j, :, i, :] = self._bricks[self._which[at, j, i]].transpose(0, 3, 2, 1)
+            self._layer = (at, out.reshape(EDGE, by * EDGE, bx * EDGE))
+        return self._layer[1]
+
+
+def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return first brick and number of bricks, (3,) each, that hold the voxels ``lo`` to ``hi`` (3,), both included.
+
+    Raises:
+        DataError: a box that is too large to be walked through, or tables beyond the free memory.
+    """
+    size = [int(b) - int(a) + 1 for a, b in zip(lo, hi, strict=True)]
+    if math.prod(size) > MAX_VOXELS:
+        raise DataError(
+            f"{source}: active voxels span {' x '.join(map(str, size))}; expected no more than 4096^3 in all; crop or "
+            "resample the grid first"
+        )
+    first = np.asarray(lo, np.int64) // EDGE
+    count = np.asarray(hi, np.int64) // EDGE - first + 1
+    n = [int(c) for c in count]
+    # the tables, and two layers of bricks laid out as slabs are put together
+    check_memory(math.prod(n) * (itemsize + 4) + 2 * n[0] * n[1] * EDGE**3 * itemsize, source)
+    return first, count
+
+
+def _blank(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Make zeros in private anonymous memory of small pages: one row that is written must not take 2 MiB."""
+    if not (hasattr(mmap, "MAP_PRIVATE") and hasattr(mmap, "MADV_NOHUGEPAGE")):
+        return np.zeros(shape, dtype)
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
+    memory = mmap.mmap(-1, max(math.prod(shape) * dtype.itemsize, 1), flags=flags)
+    memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype, math.prod(shape)).reshape(shape)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import glob
+import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,12 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.headers import MAX_HEADER, Fields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
-from vvgt_cli.volume.tiff.pictures import picture_planes
 from vvgt_cli.volume.tiff.reader import read_tiff
-from vvgt_cli.volume.tiff.scan_logs import log_spacing
-from vvgt_cli.volume.tiff.slice_names import by_number, in_order, listed
 from vvgt_cli.volume.tiff.stored import lazy_files
 from vvgt_cli.volume.types import Volume
 
@@ -115,3 +116,195 @@ def read_folder(folder: Path, options: ReadOptions) -> Volume:
 def read_picture(path: Path, options: ReadOptions) -> Volume:
     """Read one picture as one slice, as `read_slices`."""
     return read_slices([path], options, str(path), volume_name(path))
+
+
+_SAMPLED = 9  # pictures of a stack that tell whether it is in colour
+
+
+def picture_planes(files: list[Path], options: ReadOptions, source: str) -> Callable[[Path], np.ndarray]:
+    """Return what reads one of the pictures of a stack as (1, y, x).
+
+    Their components are those of the richest of a few of them: red, green and blue that are equal count as one, and
+    opacity as none if it is full.
+
+    Raises:
+        DataError: a damaged picture, or one with more components than those few.
+        UsageError: colours and no component chosen (`SeveralComponents`).
+    """
+    picks = {files[round(k * (len(files) - 1) / (_SAMPLED - 1))] for k in range(_SAMPLED)}
+    count = max(_simplest(read_pixels(path)).shape[2] for path in picks)
+
+    def plane(path: Path) -> np.ndarray:
+        pixels = read_pixels(path) if count > 1 else _simplest(read_pixels(path))
+        pixels = np.repeat(pixels, count, axis=2) if pixels.shape[2] == 1 else pixels
+        if pixels.shape[2] < count or (count == 1 and pixels.shape[2] > 1):
+            has = f"{path}: {pixels.shape[2]} components (colours, opacity)"
+            raise DataError(f"{has}; expected {count} as in other pictures of {source}: convert it, or leave it out")
+        return select_component(pixels[None, ..., :count], options.component, source, color=True)[0]
+
+    return plane
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """Return the pixels of a picture, (rows, columns, samples) uint8 or uint16, turned as its Exif orientation says.
+
+    Palettes are expanded, greys of fewer bits scaled to 8; colours are neither managed nor multiplied by opacity. The
+    fourth byte of a BMP's pixels is dropped: most programs leave it 0.
+
+    Raises:
+        DataError: no picture, or a damaged one; not enough memory.
+    """
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    config.attribute("oiio:RawColor", 1)
+    image = oiio.ImageInput.open(str(path), config)
+    kind, pixels, error = ("", None, oiio.geterror()) if image is None else (image.format_name(), None, "")
+    if image is not None and kind in KINDS:
+        spec = image.spec()
+        check_memory(spec.image_bytes(), str(path))
+        pixels = image.read_image(0, 0, 0, spec.nchannels, spec.format)
+        error = image.geterror()  # also where a JPEG is cut short, whose rest is grey
+    if pixels is None or error:
+        text = " ".join(error.split())[:200] or f"content: {kind}"
+        raise DataError(f"{path}: cannot be read ({text}); expected a whole PNG, BMP or JPEG picture")
+    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)[..., : 3 if kind == "bmp" else None]
+    turn = spec.get_int_attribute("Orientation", 1)
+    pixels = pixels.swapaxes(0, 1) if turn > 4 else pixels
+    return pixels[:: -1 if turn in (3, 4, 7, 8) else 1, :: -1 if turn in (2, 3, 6, 7) else 1]
+
+
+def _simplest(pixels: np.ndarray) -> np.ndarray:
+    """Return pixels without opacity that is full everywhere, and as grey if red, green and blue are equal."""
+    if pixels.shape[2] in (2, 4) and (pixels[..., -1] == np.iinfo(pixels.dtype).max).all():
+        pixels = pixels[..., :-1]
+    return pixels[..., :1] if pixels.shape[2] == 3 and (pixels[..., 1:] == pixels[..., :1]).all() else pixels
+
+
+_SUFFIXES = (".log", ".xtekct", ".xtekvolume")
+_SIZES = {  # field of the size along x: of those along y and z, of the pixels along x and y, and the unit
+    "xtekct/voxelsizex": ("xtekct/voxelsizey", "xtekct/voxelsizez", "xtekct/voxels{}", "xy", "mm"),
+    "reconstruction/pixel size (um)": ("", "", "reconstruction/result image {} (pixels)", ("width", "height"), "um"),
+    "acquisition/image pixel size (um)": ("", "", "", "xy", "um"),
+}
+Spacing = tuple[float, float, float]
+
+
+def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | None) -> tuple[Spacing, str] | None:
+    """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None, and a warning, if unsure.
+
+    Slices must have the ``size`` (x, y) in pixels that the log states. Their distance goes by the ``step`` of their
+    numbers, or the log's. Sizes that are ``given`` replace the log's. Of several logs that one counts whose name is the
+    longest that the name of the ``first`` slice begins with.
+
+    Raises:
+        DataError: a size in the log is no number.
+    """
+    paths = [path for path in sorted(first.parent.iterdir()) if path.suffix.lower() in _SUFFIXES and path.is_file()]
+    logs = [log for path in paths if (log := _fields(path)).keys() & _SIZES.keys()]
+    own = [log for log in logs if first.name.startswith(Path(log.name).stem)]
+    if not logs:
+        return None
+    log = max(own or logs, key=lambda log: len(Path(log.name).stem))
+    along_x = next(key for key in _SIZES if key in log)
+    along_y, along_z, pixels, axes, unit = _SIZES[along_x]
+    unit = log.get("xtekct/units") or unit
+    if given is not None:
+        return given, unit
+    x, y, z = (log.floats(key, log.need(key), 1)[0] for key in (along_x, along_y or along_x, along_z or along_x))
+    stated = [log[key] for axis in axes if (key := pixels.format(axis)) in log]
+    between = "reconstruction/section to section step"
+    z *= max(step, log.floats(between, log.get(between, "1"), 1)[0])
+    if not own and len({tuple(map(log.get, _SIZES)) for log in logs}) > 1:
+        problem = f"one of {len(logs)} logs, none named as the slices"
+    elif stated and stated != [*map(str, size)]:
+        problem = f"for {' x '.join(stated)} pixels, not for {size[0]} x {size[1]} (binned or cut out?)"
+    else:
+        return (x, y, z), unit
+    warnings.warn(f"{log.name}: voxel sizes {x:g} {y:g} {z:g} {unit} not used: {problem}; try --spacing", stacklevel=2)
+    return None
+
+
+def _fields(path: Path) -> Fields:
+    """Return the fields of a log, ``section/key`` in lower case."""
+    fields, section = Fields(str(path)), ""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for line in file.read(MAX_HEADER).splitlines():
+            key, equals, value = line.partition("=")
+            section = line.strip().strip("[]").lower() if line.startswith("[") else section
+            fields.update({f"{section}/{key.strip().lower()}": value.strip()} if equals else {})
+    return fields
+
+
+_SHOWN = 3  # numbers or files that a message names
+
+
+def by_number(path: Path) -> list[tuple[int, str]]:
+    """Return the sorting key of a file name: runs of digits count by value."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name) if part]
+
+
+def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
+    """Return the files of a numbered series, sorted by the number that differs in every name, and its step.
+
+    Files that are sorted by `by_number` but have no numbers in common stay in that order. Warnings name files that are
+    skipped and numbers that are missing.
+
+    Raises:
+        DataError: several numbers vary independently (channels, times, positions), or several series count alike.
+    """
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path in files:
+        groups.setdefault(tuple(re.split(r"\d+", path.name.lower())), []).append(path)
+    main = max(groups.values(), key=len)
+    alone = [group[0] for group in groups.values() if len(group) == 1]
+    series = [path for group in groups.values() if len(group) > 1 for path in group]
+    texts = [re.findall(r"\d+", path.name) for path in series]
+    columns = [tuple(map(int, column)) for column in zip(*texts, strict=False)]
+    if len(alone) >= len(main) or not columns:
+        return files, 1
+    if alone:
+        warnings.warn(f"{source}: skipped {listed(alone)}: not numbered as the other slices", stacklevel=2)
+    parts = re.split(r"(\d+)", main[0].name)
+    for k in (k for k in range(len(columns) - 1) if parts[2 * k + 2] == "."):  # decimals: 0.5, 1.0, 1.5
+        places = [float(f"{text[k]}.{text[k + 1]}") for text in texts]
+        if len(_steps(places)) == 1:
+            return [path for _, path in sorted(zip(places, series, strict=True))], 1
+    counting = [column for column in columns if len(set(column)) == len(series)]
+    if not counting:
+        _refuse(main[0], series, columns, source)
+        return sorted(series, key=by_number), 1
+    numbers = min(counting, key=lambda column: (len(_steps(column)) > 1, max(column) - min(column)))
+    step = int(min(_steps(numbers)))
+    gaps = [n for a, b in pairwise(sorted(numbers)) for n in range(a + step, min(b, a + 5 * step), step)]
+    if gaps:
+        warnings.warn(f"{source}: no slices numbered {listed(gaps)}; read as if evenly spaced", stacklevel=2)
+    return [path for _, path in sorted(zip(numbers, series, strict=True))], step
+
+
+def listed(items: Sequence[Path | int]) -> str:
+    """Return the first few numbers, or names of files, and that there are more."""
+    return ", ".join(str(getattr(i, "name", i)) for i in items[:_SHOWN]) + (", ..." if len(items) > _SHOWN else "")
+
+
+def _steps(numbers: Sequence[float]) -> set[float]:
+    return {round(b - a, 9) for a, b in pairwise(sorted(numbers))}
+
+
+def _refuse(first: Path, series: list[Path], columns: list[tuple[int, ...]], source: str) -> None:
+    """Raise `DataError` if the numbers in names fill more than half of a grid; warn if not: clock times do not."""
+    parts = re.split(r"(\d+)", first.name)
+    labels = [(re.findall(r"([A-Za-z]+)[-_= ]?$", part) or ["number"])[0] for part in parts[::2]]
+    sizes = {k: len(set(column)) for k, column in enumerate(columns) if len(set(column)) > 1}
+    ranges = ", ".join(f"{labels[k]} {min(columns[k])} to {max(columns[k])}" for k in sizes)
+    text = f"{source}: no one number counts the slices in the names of its {len(series)} files ({ranges})"
+    if 2 * len(series) <= math.prod(sizes.values()):
+        warnings.warn(f"{text}; they are in the order of the first", stacklevel=3)
+        return
+    at = 1 + 2 * max(sizes, key=lambda k: (labels[k].lower() in ("z", "slice", "section"), sizes[k]), default=0)
+    before, after = (glob.escape("".join(some)) for some in (parts[:at], parts[at + 1 :]))
+    wide, narrow = (f"{before}{digits}{after}" for digits in ("*", "[0-9]" * len(parts[at])))
+    matched = {tuple(re.split(r"\d+", path.name)) for path in series if path.match(wide)}
+    way_out = Path(glob.escape(str(first.parent))) / (wide if len(matched) == 1 else narrow)
+    raise DataError(f"{text}, so they look like several stacks; give one, as '{way_out}'")
