@@ -34,7 +34,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.images.metrics import score_views
 from vvgt_cli.refine import LOSS_3DGS, OptimizeOptions, optimize
-from vvgt_cli.score.checks import Views
+from vvgt_cli.score.views import Views
 from vvgt_cli.splat import render
 
 K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72

@@ -39,15 +39,14 @@ from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.metrics import score_views, ssim
 from vvgt_cli.network.card import find_model
+from vvgt_cli.network.prepare import halved
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.network.training.config import read_config
 from vvgt_cli.network.training.scenes import as_float, prepare_scenes
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
-from vvgt_cli.splat.half import halved
-from vvgt_cli.synth.analytic import volume_of
-from vvgt_cli.synth.shapes import make_shape
+from vvgt_cli.synth.shapes import make_shape, volume_of
 from vvgt_cli.synth.turbulence import TURNOVER, Solver, fields, flow_of, run
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 

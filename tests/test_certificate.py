@@ -18,9 +18,8 @@ from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats import SUFFIXES, read_splats
-from vvgt_cli.gaussians.header import parse_header
+from vvgt_cli.gaussians.header import Certificate, parse_header
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 

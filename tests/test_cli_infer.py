@@ -22,8 +22,8 @@ from vvgt_cli.network.card import ModelCard
 from vvgt_cli.network.prepare import prepare
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.progress import Console
-from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.views import Views
 
 DARK = 0.2
 BRIGHTER, DARKER = (*[0.0] * 11, *[DARK] * 3), (*[0.0] * 11, *[-DARK] * 3)

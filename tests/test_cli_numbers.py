@@ -11,7 +11,7 @@ import pytest
 
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.errors import UsageError
-from vvgt_cli.synth.analytic import blob
+from vvgt_cli.synth.shapes import blob
 from vvgt_cli.volume.plain.raw import guess_dims
 
 FORMS = (

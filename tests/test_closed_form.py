@@ -17,7 +17,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume import Volume
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
@@ -34,7 +34,7 @@ def start(scene: Scene, count: int = 1500, method: str = "vbm", size: int = SIZE
 
 
 def noise(size=(28, 20, 24), seed: int = 2) -> Volume:
-    return analytic.random_field(size, cycles=4, seed=seed)
+    return shapes.random_field(size, cycles=4, seed=seed)
 
 
 # ---- invariants
@@ -190,7 +190,7 @@ def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPa
     """A function that shows no voxel, only what lies between them, still keeps the bound."""
     from vvgt_cli.closed_form.moments import base_cells, exponents
 
-    scene = scene_of(analytic.checkerboard(32, 32), Tent(0.5, 0.1))
+    scene = scene_of(shapes.checkerboard(32, 32), Tent(0.5, 0.1))
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 5000)
     level = base_level(scene, 400, 10**6)
     assert len(base_cells(scene, exponents(scene.step, level)).index) <= 5000
@@ -199,7 +199,7 @@ def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPa
 def test_coarse_cells_still_make_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 200)
     cameras = default_views("test", 3, size=SIZE)
-    scene = scene_of(analytic.blob(32, 0.3), Ramp(0.4))
+    scene = scene_of(shapes.blob(32, 0.3), Ramp(0.4))
     assert score(start(scene), cameras, render_views(scene, cameras)) > 27
 
 
@@ -225,7 +225,7 @@ EXTREMES = {
     "nan": (Volume(with_bad(np.nan)), Tent()),
     "wholly opaque, huge depth": (Volume(ones(12, 12, 12)), Above(1.0), 1e-9),
     "barely there": (Volume(ones(12, 12, 12)), Ramp(1e-12)),
-    "checkerboard": (analytic.checkerboard(16, 16), Above(1.0)),
+    "checkerboard": (shapes.checkerboard(16, 16), Above(1.0)),
     "1e30": (Volume(np.array(noise((12, 10, 9)).data) * np.float32(1e30)), Ramp(0.5, 0, 1e30)),
 }
 
@@ -277,17 +277,17 @@ def quality(scene: Scene, count: int, size: int) -> dict[str, tuple[float, float
 # floors about 1 dB below what was measured: (initialise, backproject) of each method
 SCENES = {
     "blob": (
-        lambda: scene_of(analytic.blob(32, 0.3), Ramp(0.3)),
+        lambda: scene_of(shapes.blob(32, 0.3), Ramp(0.3)),
         1500,
         {"vbm": (44.5, 46), "wavelet": (34, 41), "uniform": (29.5, 32)},
     ),
     "field": (
-        lambda: scene_of(analytic.random_field(28, cycles=4), Tent(0.5, 0.15, 0.5)),
+        lambda: scene_of(shapes.random_field(28, cycles=4), Tent(0.5, 0.15, 0.5)),
         5000,
         {"vbm": (36.3, 37), "wavelet": (34, 34.5), "uniform": (30.2, 30.7)},
     ),
     "ball": (
-        lambda: scene_of(analytic.sphere(32, 0.7), Above(1.0)),
+        lambda: scene_of(shapes.sphere(32, 0.7), Above(1.0)),
         3000,
         {"vbm": (30.5, 32.5), "wavelet": (17.9, 18.8), "uniform": (16.4, 17.2)},
     ),

@@ -17,7 +17,7 @@ from vvgt_cli.closed_form.tree import select, split_score
 from vvgt_cli.dvr import RenderSettings, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 
 BUDGET = 300
 
@@ -78,12 +78,12 @@ def test_cells_go_where_the_error_is(tree) -> None:
 
 def half_busy() -> np.ndarray:
     """Values (32, 32, 32) that are smooth in one half, and vary eight times as fast in the other."""
-    calm, busy = (analytic.random_field(32, cycles=cycles, seed=1).data for cycles in (1, 8))
+    calm, busy = (shapes.random_field(32, cycles=cycles, seed=1).data for cycles in (1, 8))
     return np.concatenate([calm[..., :16], busy[..., 16:]], axis=-1)
 
 
 def test_other_views_are_nearer_after_a_second_cut() -> None:
-    scene = scene_of(analytic.volume_of(half_busy(), "half busy"), Ramp(k=0.3))
+    scene = scene_of(shapes.volume_of(half_busy(), "half busy"), Ramp(k=0.3))
     start = initialise(scene, VbmOptions(max_gaussians=1500, size=200))
     rule = INRIA.at(0.5)
     cameras, others = default_views("train", 12, size=100), default_views("test", 4, size=200)
@@ -104,9 +104,9 @@ def test_the_least_seen_go_first() -> None:
 
 
 def test_hidden_cells_are_left_out_and_others_cut_for_them() -> None:
-    rough = analytic.random_field(40, cycles=10, seed=2).data
-    ball = np.where(analytic.sphere(40, hard=True).data > 0, 0.2 + 0.8 * rough, 0).astype(np.float32)
-    scene = scene_of(analytic.volume_of(ball, "rough ball"), Ramp(k=4.0))
+    rough = shapes.random_field(40, cycles=10, seed=2).data
+    ball = np.where(shapes.sphere(40, hard=True).data > 0, 0.2 + 0.8 * rough, 0).astype(np.float32)
+    scene = scene_of(shapes.volume_of(ball, "rough ball"), Ramp(k=4.0))
     start = initialise(scene, VbmOptions(max_gaussians=3000, size=200))
     rule, cameras = INRIA.at(0.5), default_views("train", 12, size=100)
     found = cut_by_error(start, cameras, render_views(scene, cameras, RenderSettings(samples=1)), rule)
@@ -121,7 +121,7 @@ def test_hidden_cells_are_left_out_and_others_cut_for_them() -> None:
 
 
 def test_where_nearly_all_is_seen_all_cells_stay(monkeypatch) -> None:
-    scene = scene_of(analytic.volume_of(half_busy(), "half busy"), Ramp(k=0.3))
+    scene = scene_of(shapes.volume_of(half_busy(), "half busy"), Ramp(k=0.3))
     start = initialise(scene, VbmOptions(max_gaussians=1500, size=200))
     rule, cameras = INRIA.at(0.5), default_views("train", 12, size=100)
     weights = blending_weights(start.gaussians, cameras, rule)

@@ -15,7 +15,7 @@ from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.bricks import ranges_of
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.look.tables import Optics, extinction
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume import Volume
 
 
@@ -88,7 +88,7 @@ def dense(cells: Cells, like: np.ndarray) -> np.ndarray:
 
 
 def rough(dims: tuple[int, int, int], spacing=(1.0, 1.0, 1.0), dtype=np.float32) -> Volume:
-    data = analytic.random_field(dims, cycles=3, seed=4).data
+    data = shapes.random_field(dims, cycles=3, seed=4).data
     return Volume((data * 255).astype(dtype) if dtype is not np.float32 else data, spacing)
 
 
@@ -169,7 +169,7 @@ def test_mass_is_the_same_at_any_level(level: int) -> None:
 
 def test_a_mean_over_the_spread_beats_points() -> None:
     """A step function: mass within 0.3 % of that of 12 points a voxel edge, at 2."""
-    scene = scene_of(analytic.sphere(24, 0.6), Above(0.8))
+    scene = scene_of(shapes.sphere(24, 0.6), Above(0.8))
     exact = base_cells(scene, np.zeros(3, np.int64), points_per_voxel=12).moments[:, 0].sum()
     mass = base_cells(scene, np.zeros(3, np.int64)).moments[:, 0].sum()
     assert mass == pytest.approx(exact, rel=3e-3)
@@ -181,7 +181,7 @@ def test_blob_mass_converges_with_order_2() -> None:
     exact = k * (math.sqrt(2 * math.pi) * sigma * math.erf(1 / (sigma * math.sqrt(2)))) ** 3
     errors = []
     for n in sizes:
-        scene = scene_of(analytic.blob(int(n), sigma), Ramp(k), 1.0)
+        scene = scene_of(shapes.blob(int(n), sigma), Ramp(k), 1.0)
         errors.append(abs(base_cells(scene, np.zeros(3, np.int64)).moments[:, 0].sum() - exact) / exact)
     order = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
     assert order == pytest.approx(2, abs=0.2)
@@ -191,7 +191,7 @@ def test_blob_mass_converges_with_order_2() -> None:
 def test_blob_moments() -> None:
     """Trilinear interpolation keeps the mass and adds h^2/6 to the variance; colours follow the extinction."""
     n, sigma, k = 40, 0.2, 3.0
-    scene = scene_of(analytic.blob(n, sigma), Ramp(k), 1.0)
+    scene = scene_of(shapes.blob(n, sigma), Ramp(k), 1.0)
     total = base_cells(scene, np.zeros(3, np.int64)).moments.sum(axis=0)
     mass = k * (2 * math.pi * sigma**2) ** 1.5
     assert total[0] == pytest.approx(mass, rel=2e-4)
@@ -205,7 +205,7 @@ def test_blob_moments() -> None:
 @pytest.mark.parametrize("level", [-2, 0, 2])
 def test_slab_mass(level: int) -> None:
     """Linear extinction in a slab that ends between voxels: trilinear interpolation keeps its integral exactly."""
-    scene = scene_of(analytic.slab((9, 10, 31), 0.77), Ramp(5.0), 1.0)
+    scene = scene_of(shapes.slab((9, 10, 31), 0.77), Ramp(5.0), 1.0)
     half = scene.half
     cells = base_cells(scene, np.full(3, level))
     assert cells.moments[:, 0].sum() == pytest.approx(5.0 * 0.77 * 4 * half[0] * half[1], rel=1e-6)

@@ -23,7 +23,7 @@ from vvgt_cli.gaussians.constants import MAX_ALPHA, MIN_ALPHA
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.splat import render
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume import Volume
 
 
@@ -171,9 +171,9 @@ def surfaces(volume: Volume, tf=None):
 
 
 def test_a_field_of_wider_cells_holds_their_means(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, fine = surfaces(analytic.sphere(16, 0.6))
+    _, fine = surfaces(shapes.sphere(16, 0.6))
     monkeypatch.setattr("vvgt_cli.closed_form.surface_offset.MAX_FIELD", fine.field.size // 8)
-    _, wide = surfaces(analytic.sphere(16, 0.6))
+    _, wide = surfaces(shapes.sphere(16, 0.6))
     nz, ny, nx = wide.field.shape
     assert 2 * np.array(wide.field.shape) == pytest.approx(fine.field.shape)
     means = fine.field.reshape(nz, 2, ny, 2, nx, 2).mean(axis=(1, 3, 5))
@@ -190,7 +190,7 @@ def moved(opaque, points: np.ndarray, sigma: float, reach: float = 2.0, pixel: f
 
 
 def test_inset_of_a_ball_is_radial() -> None:
-    scene, opaque = surfaces(analytic.sphere(40, 0.6))
+    scene, opaque = surfaces(shapes.sphere(40, 0.6))
     assert opaque.any
     rng = np.random.default_rng(0)
     ray = rng.standard_normal((400, 3))
@@ -209,7 +209,7 @@ def test_inset_of_a_ball_is_radial() -> None:
 
 
 def test_inset_leaves_the_inside_alone() -> None:
-    _, opaque = surfaces(analytic.sphere(40, 0.6))
+    _, opaque = surfaces(shapes.sphere(40, 0.6))
     deep = np.random.default_rng(0).uniform(-0.2, 0.2, (100, 3))
     np.testing.assert_array_equal(moved(opaque, deep, 0.03), 0)
     np.testing.assert_array_equal(moved(opaque, np.full((1, 3), 0.95), 0.03), 0)  # no body near
@@ -238,7 +238,7 @@ def test_inset_stops_in_the_middle_of_a_plate(voxels: int) -> None:
 
 
 def test_covariances_are_flattened_along_the_normal_of_a_surface() -> None:
-    _, opaque = surfaces(analytic.sphere(40, 0.6))
+    _, opaque = surfaces(shapes.sphere(40, 0.6))
     ray = np.random.default_rng(0).standard_normal((400, 3))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     cov = np.broadcast_to(np.eye(3), (400, 3, 3)).copy()
@@ -251,7 +251,7 @@ def test_covariances_are_flattened_along_the_normal_of_a_surface() -> None:
 
 def test_filled_cells_lie_flat_under_a_surface() -> None:
     """The shortest axis is the normal of an opaque ball, whose filled cells have no axes of their own."""
-    form = closed_form(scene_of(analytic.sphere(40, 0.6), Above(1.0)), 6000, 400)
+    form = closed_form(scene_of(shapes.sphere(40, 0.6), Above(1.0)), 6000, 400)
     splats = form.gaussians()
     scales = np.exp(splats.log_scales.astype(np.float64))
     shortest = rotations(splats.quaternions)[np.arange(len(splats)), :, scales.argmin(axis=1)]
@@ -264,7 +264,7 @@ def test_filled_cells_lie_flat_under_a_surface() -> None:
 
 def test_translucent_scenes_have_no_surfaces() -> None:
     for tf in (Ramp(0.5), Tent()):
-        _, opaque = surfaces(analytic.random_field(24, cycles=4), tf)
+        _, opaque = surfaces(shapes.random_field(24, cycles=4), tf)
         assert not opaque.any
 
 
@@ -272,7 +272,7 @@ def test_translucent_scenes_have_no_surfaces() -> None:
 def test_silhouette_of_a_ball(radius: float) -> None:
     """The alpha = 0.5 contour of an opaque ball in its splats: within 1 px of the ray caster's, in every direction."""
     size = 128
-    scene = scene_of(analytic.sphere(40, radius), Above(1.0))
+    scene = scene_of(shapes.sphere(40, radius), Above(1.0))
     splats = closed_form(scene, 6000, size).gaussians(style=ROUND)
     for camera in default_views("test", 3, size=size):
         truth, ours = render_view(scene, camera)[..., 3], render(splats, camera)[..., 3]

@@ -17,7 +17,7 @@ from vvgt_cli.closed_form.moments import base_cells, morton
 from vvgt_cli.closed_form.tree import PLAIN, Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.closed_form.visibility import Visibility, march, visibility
 from vvgt_cli.dvr import Scene
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume import Volume
 
 FAR = 200.0  # rays of a camera this far away are parallel to 0.3 degrees
@@ -30,7 +30,7 @@ def far_view(axis: int, sign: float = 1.0):
 
 
 def some_tree(size=(20, 13, 17), tf=None, level: int = 0, seed: int = 1) -> Tree:
-    scene = scene_of(analytic.random_field(size, cycles=4, seed=seed), tf or Tent())
+    scene = scene_of(shapes.random_field(size, cycles=4, seed=seed), tf or Tent())
     cells = base_cells(scene, np.full(3, level))
     return build_tree(cells, visibility(scene, cells, default_views("train", 6, size=48)), scene.step)
 
@@ -194,7 +194,7 @@ def boxes_cover(leaves: Leaves, tree: Tree) -> np.ndarray:
 @pytest.fixture(scope="module")
 def coarse() -> tuple[Scene, Visibility, Tree]:
     """Base cells of two voxels, so that there is something below."""
-    scene = scene_of(analytic.random_field((20, 13, 17), cycles=4, seed=1), Tent())
+    scene = scene_of(shapes.random_field((20, 13, 17), cycles=4, seed=1), Tent())
     cells = base_cells(scene, np.full(3, 1))
     seen = visibility(scene, base_cells(scene, np.zeros(3, np.int64)), default_views("train", 6, size=48))
     return scene, seen, build_tree(cells, seen, scene.step)
@@ -280,7 +280,7 @@ def test_hidden_cells_are_dropped() -> None:
 def test_slab_transmittance(both: bool) -> None:
     """Homogeneous matter seen along z: layer [a, b] is seen with (exp(-k a) - exp(-k b)) / (k (b - a))."""
     n, k = 12, 1.5
-    scene = scene_of(analytic.constant((48, 48, n)), Ramp(k), 1.0)
+    scene = scene_of(shapes.constant((48, 48, n)), Ramp(k), 1.0)
     step = scene.step[2]
     cameras = [far_view(2), far_view(2, -1.0)] if both else [far_view(2)]
     seen = visibility(scene, base_cells(scene, np.zeros(3, np.int64)), cameras)
@@ -297,7 +297,7 @@ def test_slab_transmittance(both: bool) -> None:
 
 @pytest.mark.parametrize("tf", [Ramp(0.3), Tent(), Above(1.0)], ids=lambda tf: tf.name)
 def test_visibility_is_a_transmittance(tf) -> None:
-    scene = scene_of(analytic.random_field((30, 21, 26), cycles=4), tf)
+    scene = scene_of(shapes.random_field((30, 21, 26), cycles=4), tf)
     seen = visibility(scene, base_cells(scene, np.zeros(3, np.int64)), default_views("train", 6, size=64))
     for field in (seen.mean, seen.largest):
         assert field.dtype == np.float32
@@ -309,7 +309,7 @@ def test_visibility_is_a_transmittance(tf) -> None:
 
 
 def test_visibility_repeats_and_coarsens(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = scene_of(analytic.random_field((30, 21, 26), cycles=4), Tent())
+    scene = scene_of(shapes.random_field((30, 21, 26), cycles=4), Tent())
     cells, cameras = base_cells(scene, np.zeros(3, np.int64)), default_views("train", 6, size=64)
     first, second = visibility(scene, cells, cameras), visibility(scene, cells, cameras)
     assert first.mean.tobytes() == second.mean.tobytes()
@@ -375,7 +375,7 @@ def test_visibility_lookup() -> None:
 @pytest.mark.parametrize("dims", [(512, 512, 1), (1024, 700, 1), (3, 256, 256), (96, 96, 96)])
 def test_no_cell_is_lost_between_the_rays(dims: tuple[int, int, int]) -> None:
     """A faint volume is seen everywhere by the default views, however fine its voxels are."""
-    scene = scene_of(analytic.constant(dims), Ramp(0.05), 1.0)
+    scene = scene_of(shapes.constant(dims), Ramp(0.05), 1.0)
     cells = base_cells(scene, np.zeros(3, np.int64))
     seen = visibility(scene, cells, default_views("train", size=200))
     assert (seen.largest > 0.5).mean() > 0.995
@@ -388,7 +388,7 @@ def test_detail_energy_reaches_up(tree: Tree) -> None:
     energy = detail_energy(tree)
     assert (energy[tree.children == 0] == 0).all()
     assert (energy[tree.parent] >= energy).all()
-    scene = scene_of(analytic.blob(16, 0.3), Ramp(0.3))
+    scene = scene_of(shapes.blob(16, 0.3), Ramp(0.3))
     cells = base_cells(scene, np.zeros(3, np.int64))
     blob = build_tree(cells, visibility(scene, cells, default_views("train", 6, size=48)), scene.step)
     assert len(select(blob, 500, detail_energy(blob))) > 200

@@ -17,8 +17,8 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.look.readers import minimal
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views, render_check_views
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.views import Views, render_check_views
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 

@@ -13,7 +13,7 @@ from tests.test_scale import FIT, bodies
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.conversion.shards.score import scored_views
+from vvgt_cli.conversion.shards.run import scored_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, Box, camera_arrays
 from vvgt_cli.field.block_store import BlockStore
@@ -204,7 +204,7 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     assert vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64").code == 0
-    monkeypatch.setattr("vvgt_cli.conversion.shards.score.A_GAUSSIAN", 1 << 40)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.run.A_GAUSSIAN", 1 << 40)
     run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
     assert run.code == 0
     assert "skipped: test views" in run.err

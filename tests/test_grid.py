@@ -19,7 +19,7 @@ from vvgt_cli.dvr.layout import Texels
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.splat import render
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume import Volume
 
 FINE = RenderSettings(step=0.0625, samples=1)
@@ -174,7 +174,7 @@ def test_units_of_length_do_not_matter() -> None:
 
 @pytest.mark.parametrize("tf", [Ramp(0.5), Tent(0.5, 0.3, 0.5)], ids=["linear", "tent"])
 def test_a_scalar_scene_as_a_grid_converges_to_it(tf) -> None:
-    volume = analytic.random_field((12, 11, 10), cycles=2, seed=3)
+    volume = shapes.random_field((12, 11, 10), cycles=2, seed=3)
     cameras = default_views("test", 3, size=48)
     scalar = scene_of(volume, tf)
     views, mass = render_views(scalar, cameras), base_cells(scalar, np.zeros(3, np.int64)).moments[:, 0].sum()

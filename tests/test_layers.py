@@ -21,7 +21,7 @@ from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import distinct
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
-from vvgt_cli.volume.cut import crop, masked, parse_crop
+from vvgt_cli.volume.options import crop, masked, parse_crop
 
 TURNED = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 

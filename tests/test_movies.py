@@ -12,12 +12,12 @@ from PIL import Image
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.commands.render import write_movie
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.images.metrics import psnr
-from vvgt_cli.images.movies import write_movie
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.splat import render
 

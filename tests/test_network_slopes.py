@@ -12,9 +12,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
-from vvgt_cli.network.prepare import STEP, own_axes_gradients, pack, slope_rows, unpack
+from vvgt_cli.network.prepare import STEP, halved, own_axes_gradients, pack, slope_rows, unpack
 from vvgt_cli.splat import render, render_reference
-from vvgt_cli.splat.half import halved
 
 
 def stepped(g, step):

@@ -15,7 +15,7 @@ from vvgt_cli.network.prepare import pack, prepare, view_arrays
 
 torch = pytest.importorskip("torch")
 
-from vvgt_cli.network import epipolar, layers, model  # noqa: E402
+from vvgt_cli.network import layers, model  # noqa: E402
 from vvgt_cli.network.export import randomised  # noqa: E402
 from vvgt_cli.network.model import NeighbourConv, Vvgt  # noqa: E402
 
@@ -106,7 +106,7 @@ def test_rope_makes_products_depend_on_the_difference_of_places():
 
 def naive_epipolar(module, x, points, matrices, eyes, maps):
     """Eq. 7 with all keys of a token side by side, one token at a time, torch's own bilinear sampling."""
-    uv, seen = epipolar.project(points, matrices)
+    uv, seen = layers.project(points, matrices)
     bias = module.bias(points, eyes, seen)
     query = module.query(module.norm(x))
     out = torch.zeros_like(x)
@@ -133,7 +133,7 @@ def naive_epipolar(module, x, points, matrices, eyes, maps):
 
 def epipolar_case(points):
     torch.manual_seed(1)
-    module = randomised(epipolar.EpipolarCrossAttention(16, 8, 2, 8))
+    module = randomised(layers.EpipolarCrossAttention(16, 8, 2, 8))
     views = tensors(view_arrays(default_views("train", 4, size=40)))
     maps = [torch.randn(4, 3 * f, 3 * f, 2, 8) for f in (1, 2, 4)]
     return module, torch.randn(len(points), 16), points, views["matrices"], views["eyes"], maps
@@ -144,7 +144,7 @@ def test_epipolar_attention_against_a_materialised_twin():
     points = torch.cat([points, torch.tensor([[0.0, 0.0, 40.0], [0.0, 0.0, 2.99]])])  # seen by few or none
     module, *rest = epipolar_case(points)
     with torch.no_grad():
-        seen = epipolar.project(points, rest[2])[1]
+        seen = layers.project(points, rest[2])[1]
         assert 0 < seen.float().mean() < 1
         assert not seen[:, -2].any()
         assert torch.allclose(module(*rest), naive_epipolar(module, *rest), atol=1e-5)
@@ -167,7 +167,7 @@ def test_the_bias_orders_views_by_distance():
 def test_projection_against_the_cameras():
     cameras = default_views("test", size=50)
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3)).astype(np.float32)
-    uv, seen = epipolar.project(torch.from_numpy(points), tensors(view_arrays(cameras))["matrices"])
+    uv, seen = layers.project(torch.from_numpy(points), tensors(view_arrays(cameras))["matrices"])
     for i, c in enumerate(cameras):
         x, y, z = (points @ c.rotation.T + c.translation).T
         u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy

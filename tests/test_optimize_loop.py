@@ -13,13 +13,13 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
+from vvgt_cli.network.prepare import halved
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.judge import FALLEN, Judge
 from vvgt_cli.refine.loop import spread_views
 from vvgt_cli.refine.shared import NONE
 from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.splat import render
-from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
 
 NO_FLOORS = np.full(13, 1e-15, np.float32)

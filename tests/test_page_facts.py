@@ -17,11 +17,10 @@ import pytest
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import with_place
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats.page_file import camera, html, outermost, upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
-from vvgt_cli.gaussians.legend import checked, legend_text
+from vvgt_cli.gaussians.header import Certificate, checked, legend_text
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import ReadOptions, Volume, read_volume

@@ -13,11 +13,10 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.shards.regions import RegionNodes
+from vvgt_cli.conversion.shards.regions import Part, RegionNodes
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
-from vvgt_cli.field.part import Part
 from vvgt_cli.field.reader import Place, Scalars
 from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load

@@ -17,7 +17,7 @@ from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.score.record import ConversionReport
-from vvgt_cli.synth.analytic import blob
+from vvgt_cli.synth.shapes import blob
 from vvgt_cli.volume import Volume, statistics
 
 SMALL = ("--size", "32", "--max-gaussians", "60", "-q")

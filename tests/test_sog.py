@@ -15,8 +15,18 @@ import pytest
 from PIL import Image
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.sog import COMMENTS, read_sog, sog
-from vvgt_cli.gaussians.formats.sog_images import META, SIZE, best_intervals, codebook, nearest_turn, palette, places_in
+from vvgt_cli.gaussians.formats.sog import (
+    COMMENTS,
+    META,
+    SIZE,
+    best_intervals,
+    codebook,
+    nearest_turn,
+    palette,
+    places_in,
+    read_sog,
+    sog,
+)
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
 
 COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}

@@ -27,7 +27,7 @@ from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import InProcess
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
-from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
+from vvgt_cli.gaussians.formats.sog import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
 from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import transform, up_matrix
@@ -189,7 +189,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
     assert vvgt(*line, whole / "lod-meta.json").code == 0
     calls = {"level_errors": 0, "images_of": 0}
-    real = {"level_selection.level_errors": level_errors, "streamed_files.images_of": images_of}
+    real = {"level_selection.level_errors": level_errors, "streamed.images_of": images_of}
     stop = {"level_errors": 20, "images_of": 0}
 
     def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.synth import analytic, open_volume
+from vvgt_cli.synth import open_volume, shapes
 from vvgt_cli.volume import ReadOptions, Volume
 
 ALL = [
-    analytic.marschner_lobb,
-    analytic.blob,
-    analytic.slab,
-    analytic.sphere,
-    analytic.checkerboard,
-    analytic.constant,
-    analytic.random_field,
+    shapes.marschner_lobb,
+    shapes.blob,
+    shapes.slab,
+    shapes.sphere,
+    shapes.checkerboard,
+    shapes.constant,
+    shapes.random_field,
 ]
 
 
@@ -42,7 +42,7 @@ def test_frame(make) -> None:
 
 
 def test_marschner_lobb() -> None:
-    volume = analytic.marschner_lobb(40)
+    volume = shapes.marschner_lobb(40)
     x, y, z = centres(volume)
     r = np.sqrt(x**2 + y**2)
     rho = np.cos(2 * math.pi * 6 * np.cos(math.pi * r / 2))
@@ -52,7 +52,7 @@ def test_marschner_lobb() -> None:
 
 
 def test_blob_integral() -> None:
-    volume = analytic.blob(48, sigma=0.2)
+    volume = shapes.blob(48, sigma=0.2)
     x, y, z = centres(volume)
     np.testing.assert_allclose(volume.data, np.exp(-(x**2 + y**2 + z**2) / (2 * 0.2**2)), rtol=1e-5)
     total = volume.data.sum(dtype=np.float64) * math.prod(volume.spacing)
@@ -61,14 +61,14 @@ def test_blob_integral() -> None:
 
 @pytest.mark.parametrize("thickness", [0.01, 0.3, 1.0, 1.97])
 def test_slab_has_its_thickness(thickness: float) -> None:
-    volume = analytic.slab((6, 6, 31), thickness, value=3.0)
+    volume = shapes.slab((6, 6, 31), thickness, value=3.0)
     columns = volume.data.sum(axis=0, dtype=np.float64) * volume.spacing[2]
     np.testing.assert_allclose(columns, 3.0 * thickness, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("hard", "tolerance"), [(False, 1e-3), (True, 2e-2)])
 def test_sphere_has_its_volume(hard: bool, tolerance: float) -> None:
-    volume = analytic.sphere(48, 0.7, hard=hard)
+    volume = shapes.sphere(48, 0.7, hard=hard)
     total = volume.data.sum(dtype=np.float64) * math.prod(volume.spacing)
     assert total == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=tolerance)
     assert set(np.unique(volume.data)) == {0, 1} or not hard
@@ -77,26 +77,26 @@ def test_sphere_has_its_volume(hard: bool, tolerance: float) -> None:
 
 
 def test_checkerboard() -> None:
-    data = analytic.checkerboard(8, cells=8).data
+    data = shapes.checkerboard(8, cells=8).data
     assert data.sum() == 256
     for axis in range(3):
         assert np.all(np.diff(data, axis=axis) != 0)
-    coarse = analytic.checkerboard(8, cells=2).data
+    coarse = shapes.checkerboard(8, cells=2).data
     np.testing.assert_array_equal(coarse, np.kron(data[:2, :2, :2], np.ones((4, 4, 4))))
 
 
 def test_constant() -> None:
-    assert np.unique(analytic.constant(4, 2.5).data).tolist() == [2.5]
+    assert np.unique(shapes.constant(4, 2.5).data).tolist() == [2.5]
 
 
 def test_random_field_is_band_limited_and_seeded() -> None:
-    volume = analytic.random_field(32, cycles=5, seed=1)
+    volume = shapes.random_field(32, cycles=5, seed=1)
     assert (volume.data.min(), volume.data.max()) == (0, 1)
     power = np.abs(np.fft.fftn(volume.data.astype(np.float64)))
     k = np.fft.fftfreq(32) * 32
     radius = np.sqrt(k[:, None, None] ** 2 + k[None, :, None] ** 2 + k[None, None, :] ** 2)
     assert power[radius > 5.01].max() < 1e-5 * power[(radius > 0) & (radius < 5)].max()
-    assert np.abs(volume.data - analytic.random_field(32, cycles=5, seed=2).data).max() > 0.1
+    assert np.abs(volume.data - shapes.random_field(32, cycles=5, seed=2).data).max() > 0.1
 
 
 @pytest.mark.parametrize("name", ["marschner-lobb", "blob", "slab", "sphere", "checkerboard", "random"])

@@ -304,7 +304,7 @@ def test_files_without_preamble(tmp_path: Path, syntax: pydicom.uid.UID, among: 
 
 
 def test_text_and_raw_values_are_no_dicom_without_preamble(tmp_path: Path) -> None:
-    from vvgt_cli.volume.dicom.files import is_dicom
+    from vvgt_cli.volume.dicom.series import is_dicom
 
     for content in (b"", b"\x08\0\5\0" * 300, bytes(2000), bytes(range(256)) * 8, b"\x08\0\4\0\6\0\0\0" * 9):
         assert not is_dicom(content[:1024]), content[:20]

@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume, statistics
 from vvgt_cli.volume.components import magnitude
 from vvgt_cli.volume.openvdb import codec
-from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.reader import BrickArray, brick_array
 from vvgt_cli.volume.openvdb.tree import Tree
 

@@ -31,7 +31,7 @@ def show(
     Example:
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
-    from vvgt_cli.commands.show import show_transfer_function
+    from vvgt_cli.commands.tf import show_transfer_function
     from vvgt_cli.volume import ReadOptions
 
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
@@ -56,7 +56,7 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
       vvgt tf convert CT-Bone.vp bone.json
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
     """
-    from vvgt_cli.commands.tf_convert import convert_transfer_function
+    from vvgt_cli.commands.tf import convert_transfer_function
 
     convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
@@ -101,7 +101,7 @@ def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwri
     Example:
       vvgt tf suggest head.nrrd -n 10 -o bands
     """
-    from vvgt_cli.commands.suggest import suggest_transfer_functions
+    from vvgt_cli.commands.tf import suggest_transfer_functions
     from vvgt_cli.volume import ReadOptions
 
     for path in suggest_transfer_functions(volume, number, output, ReadOptions(**read), overwrite, console):

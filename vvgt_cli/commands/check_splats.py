@@ -28,10 +28,10 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.field import Field, Picture
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
-from vvgt_cli.gaussians.certificate import WORD as CERTIFICATE
 from vvgt_cli.gaussians.formats import read_columns
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import rescale
+from vvgt_cli.gaussians.header import CERTIFICATE
 from vvgt_cli.gaussians.live_facts import WORD as LIVE
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run

@@ -10,8 +10,8 @@ from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians, write_
 from vvgt_cli.gaussians.outputs import Output, claimed, write_text
 from vvgt_cli.jit.ahead import INFER
 from vvgt_cli.progress import Console
-from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.views import Views
 
 SHIPPED = "vvgt-small"  # the model that comes with the program
 JUDGES = 4  # views that the network is not shown, as many as the default check set

@@ -19,9 +19,8 @@ from vvgt_cli.images.viewset import load_views
 from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.views import psnr_note
+from vvgt_cli.score.views import Views, psnr_note
 
 if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Scores

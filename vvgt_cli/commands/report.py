@@ -40,7 +40,6 @@ from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.checks import Views, render_check_views
 from vvgt_cli.score.curves import (
     Series,
     cost,
@@ -56,7 +55,7 @@ from vvgt_cli.score.curves import (
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.score.viewing import SIDE, ConditionView, condition_pictures, condition_views, score_conditions, screens
-from vvgt_cli.score.views import WHOLE, score_drawn_view
+from vvgt_cli.score.views import WHOLE, Views, render_check_views, score_drawn_view
 from vvgt_cli.volume.blocks import check_memory
 
 if TYPE_CHECKING:

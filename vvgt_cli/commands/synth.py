@@ -71,7 +71,7 @@ def _make(request: SynthRequest, run: Run, shape: bool) -> ConversionReport:
 def _turbulence(request: SynthRequest, console: Console) -> tuple[Volume, str]:
     """Return the volume, and a note about the flow."""
     from vvgt_cli.synth import turbulence
-    from vvgt_cli.synth.analytic import volume_of
+    from vvgt_cli.synth.shapes import volume_of
 
     solver = turbulence.Solver(turbulence.flow_of(request.kind, request.size or TURBULENCE_SIZE))
     turnovers = DEVELOPED if request.turnovers is None else request.turnovers

@@ -17,9 +17,16 @@ from typing import Any
 from vvgt_cli.commands.converter import Converter
 from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, Cloud, PageController, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
+from vvgt_cli.conversion.gaussian_files import (
+    STDIN,
+    is_page,
+    layout_of,
+    open_gaussians,
+    report_agreement,
+    write_gaussians,
+    write_page,
+)
 from vvgt_cli.conversion.index import files_of, is_index
-from vvgt_cli.conversion.readback import report_agreement
 from vvgt_cli.errors import DataError, NoLiveForm, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -28,7 +35,7 @@ from vvgt_cli.gaussians.formats.choose import NOTHING
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
 from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.page_slices import Slices
-from vvgt_cli.gaussians.formats.sog_images import IMAGES, META
+from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed

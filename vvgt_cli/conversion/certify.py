@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.certificate import Certificate
+from vvgt_cli.gaussians.header import Certificate
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views, test_view_pixels

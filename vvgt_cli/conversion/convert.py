@@ -11,11 +11,10 @@ from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.file_layout import degree_of, harmonics_warning, ply_options
-from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+from vvgt_cli.conversion.gaussian_files import is_page, report_format_cost, write_gaussians
 from vvgt_cli.conversion.live import check_live, convert_live, editor_form
 from vvgt_cli.conversion.place import headset_axes, placement_warnings, to_unit_frame
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory, report_target
-from vvgt_cli.conversion.readback import report_format_cost
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of

@@ -9,7 +9,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.field.layered import content_of
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.legend import legend_text
+from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.look.labels import LabelTable
 
 VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even

@@ -24,7 +24,7 @@ from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views
+from vvgt_cli.score.views import Views
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings

@@ -12,8 +12,7 @@ from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.constants import MIN_ALPHA
-from vvgt_cli.gaussians.header import FileFacts
-from vvgt_cli.gaussians.legend import legend_text
+from vvgt_cli.gaussians.header import FileFacts, legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
 from vvgt_cli.gaussians.ply import opacity

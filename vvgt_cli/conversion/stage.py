@@ -12,8 +12,8 @@ from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import Rule, rule_of
-from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import Run
+from vvgt_cli.score.views import Views
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians.certificate import WORD as CERTIFICATE
-from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.frames import up_matrix
-from vvgt_cli.gaussians.legend import checked
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting, parse_lighting
 from vvgt_cli.version import VERSION
 
@@ -28,6 +27,7 @@ REQUIRED = (
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
 TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+CERTIFICATE = "certificate"  # keyword of the comment
 MIP = "SplatRenderMode: mip"  # Brush's marker for opacity compensated for dilation
 _ADVICE = "expected a binary little-endian 3DGS .ply, as written by vvgt and SuperSplat"
 
@@ -52,7 +52,7 @@ class FileFacts:
         length_unit: unit of the world if it has no anatomical space (whose unit is mm).
         function: name of the transfer function.
         certificate: measurements of the conversion; None if the Gaussians were changed since.
-        legend: legend of the file's look (`legend.legend_text`); live files keep it in ``live``.
+        legend: legend of the file's look (`legend_text`); live files keep it in ``live``.
         title: title of pages, which names no file unless it was chosen.
         camera: where pages open: eye and target, world, and the vertical field of view in degrees.
     """
@@ -331,3 +331,136 @@ def _finite(words: list[str]) -> list[float]:
     if not all(math.isfinite(value) for value in values):
         raise ValueError(words)
     return values
+
+
+MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: space in a header is limited
+
+
+def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "") -> str | None:
+    """Return one line of JSON: value range, unit, quantity, nodes (value, opacity, colour); or labels (name, colour).
+
+    Args:
+        tf: function on data values or label table; anything else has no legend, and None is returned.
+        lo: smallest value.
+        hi: largest value.
+        unit: unit of the values, "" if unknown.
+        quantity: what the values are, "" if unknown.
+    """
+    if isinstance(tf, LabelTable):
+        shown = [label for label in tf.labels if label.opacity > 0]
+        rows = [[label.name, _hex(label.color)] for label in shown[:MOST_LABELS]]
+        while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
+            rows.pop()
+        return text
+    if not isinstance(tf, TransferFunction):
+        return None
+    places = np.unique(np.concatenate([[lo, hi], tf.opacity_nodes.x, tf.color_map.x]).clip(lo, hi))
+    if len(places) > MOST_NODES or tf.color_map.space != "RGB":
+        places = np.linspace(lo, hi, MOST_NODES) if hi > lo else np.array([lo])
+    nodes: list[list[Any]] = []
+    for x in places.tolist():
+        below, above = (_node(tf, x, np.nextafter(x, side)) for side in (-np.inf, np.inf))
+        nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
+    return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
+
+
+def _node(tf: TransferFunction, x: float, beside: float) -> list[Any]:
+    at = np.array([beside])
+    return [float(f"{x:.6g}"), round(float(tf.opacity(at)[0]), 4), _hex(tf.color(at)[0].tolist())]
+
+
+def _hex(rgb: Any) -> str:
+    return "".join(f"{round(255 * min(max(float(c), 0.0), 1.0)):02x}" for c in rgb)
+
+
+def checked(text: str) -> str:
+    """Check that a text is a legend, and return it.
+
+    Raises:
+        ValueError: the text is not a legend.
+    """
+    found = json.loads(text)
+    if not isinstance(found, dict) or not ("nodes" in found or "labels" in found):
+        raise ValueError(text)
+    return text
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Measurements made during a conversion, valid only for the Gaussians of that file.
+
+    Attributes:
+        volume: title of the volume, which names no file unless it was chosen.
+        sha256: hexadecimal digest of its values; None for a volume too large to be read twice.
+        look: digest of functions, label tables, unit distances and light.
+        size: edge of the target screen in pixels.
+        rule: name of the rule of `vvgt_cli.gaussians.rules` that the scores used.
+        psnr: mean PSNR in dB of the first scored views against the volume.
+        views: number of these views.
+        pixels: number of pixels that were scored of each.
+        live_psnr: PSNR in dB of a live file recoloured with its own function; None for other files.
+        conditions: name and PSNR in dB of each viewing condition that was scored, worst first.
+        texture: texture of smooth areas close up, of the Gaussians and of the volume, in levels of 255; None if
+            nothing is opaque and smooth.
+        position_error: largest distance of a stored centre from the computed one, in world units.
+        command: the command line without folders, outputs, names of volumes and options that do not affect the
+            result; None from Python.
+    """
+
+    volume: str
+    sha256: str | None
+    look: str
+    size: int
+    rule: str
+    psnr: float
+    views: int
+    pixels: int
+    live_psnr: float | None = None
+    conditions: tuple[tuple[str, float], ...] = ()
+    texture: tuple[float, float] | None = None
+    position_error: float = 0.0
+    command: str | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return the known values by name."""
+        found = vars(self) | {"conditions": dict(self.conditions)}
+        return {key: value for key, value in found.items() if value not in (None, {})}
+
+    def line(self) -> str:
+        """Return the header comment, one line of ASCII without the word "comment"."""
+        return f"vvgt {CERTIFICATE} {json.dumps(self.facts())}"
+
+    @classmethod
+    def of(cls, text: str) -> Certificate:
+        """Parse the JSON that `line` writes after its keyword.
+
+        Raises:
+            ValueError: the text is something else.
+        """
+        found = json.loads(text)
+        if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):
+            raise ValueError(text)
+        conditions = tuple((str(name), _number(value)) for name, value in found.pop("conditions", {}).items())
+        woven = found.pop("texture", None)
+        if woven is not None and (not isinstance(woven, list) or len(woven) != 2):
+            raise ValueError(text)
+        texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
+        kinds = {
+            "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
+            "pixels": int, "live_psnr": float, "position_error": float, "command": str,
+        }  # fmt: skip
+        if not {"volume", "look", "size", "rule", "psnr", "views", "pixels"} <= set(found) <= set(kinds):
+            raise ValueError(text)
+        known: dict[str, Any] = {"sha256": None, "texture": texture}
+        for key, value in found.items():
+            kind = kinds[key]
+            found[key] = _number(value) if kind is float else value
+            if not isinstance(found[key], kind) or isinstance(value, bool):
+                raise ValueError(text)
+        return cls(**(known | found), conditions=conditions)
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(value)
+    return float(value)

@@ -16,8 +16,7 @@ from torch.nn import functional
 
 from vvgt_cli.gaussians.types import SH_C0
 from vvgt_cli.network.config import PARAMETERS, PATCH, SCALES, STAGES, STEP, GeometryConfig, ImageConfig, NetworkConfig
-from vvgt_cli.network.epipolar import EpipolarCrossAttention
-from vvgt_cli.network.layers import Attention, Block, Mlp, ZeroLinear, axial_rope
+from vvgt_cli.network.layers import Attention, Block, EpipolarCrossAttention, Mlp, ZeroLinear, axial_rope
 from vvgt_cli.network.tables import block_curves
 
 

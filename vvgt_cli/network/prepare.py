@@ -19,7 +19,6 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.network import tables
 from vvgt_cli.network.config import STEP, NetworkConfig
-from vvgt_cli.splat.half import halved
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 
@@ -288,3 +287,19 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
         np.full(count, math.log(rms) + 3.5), thick,
     ]  # fmt: skip
     return np.column_stack(columns).astype(np.float32)
+
+
+def halved(cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> tuple[list[Camera], np.ndarray, Rule]:
+    """Average views 2 x 2 where their sides are even; return them and the rule that stands for the standard one.
+
+    Args:
+        cameras: of the views.
+        images: (n, h, w, c) float32.
+        rule: by which these are drawn.
+    """
+    h, w = images.shape[1:3]
+    if h % 2 or w % 2:
+        return list(cameras), images, rule
+    upper, lower = images[:, ::2], images[:, 1::2]
+    mean = np.float32(0.25) * (upper[:, :, ::2] + upper[:, :, 1::2] + lower[:, :, ::2] + lower[:, :, 1::2])
+    return [camera.resized(0.5) for camera in cameras], mean, rule.at(0.5)

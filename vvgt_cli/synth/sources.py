@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.synth import analytic
+from vvgt_cli.synth import shapes
 from vvgt_cli.volume.examples import Maker, register_example
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume
@@ -16,7 +16,7 @@ from vvgt_cli.volume.types import Volume
 _SIZE = re.compile(r"(\d{1,6})(?:x(\d{1,6})x(\d{1,6}))?")
 
 
-def _sized(name: str, make: Callable[[analytic.Size], Volume], default: int) -> Maker:
+def _sized(name: str, make: Callable[[shapes.Size], Volume], default: int) -> Maker:
     def open_analytic(rest: str, options: ReadOptions) -> Volume:
         match = _SIZE.fullmatch(rest or str(default))
         if match is None:
@@ -31,12 +31,12 @@ def _sized(name: str, make: Callable[[analytic.Size], Volume], default: int) -> 
 
 
 for _name, _make, _default in (
-    ("marschner-lobb", analytic.marschner_lobb, 64),
-    ("blob", analytic.blob, 64),
-    ("slab", analytic.slab, 64),
-    ("sphere", analytic.sphere, 64),
-    ("checkerboard", analytic.checkerboard, 32),
-    ("random", analytic.random_field, 64),
+    ("marschner-lobb", shapes.marschner_lobb, 64),
+    ("blob", shapes.blob, 64),
+    ("slab", shapes.slab, 64),
+    ("sphere", shapes.sphere, 64),
+    ("checkerboard", shapes.checkerboard, 32),
+    ("random", shapes.random_field, 64),
 ):
     register_example(_name, _sized(_name, _make, _default))
 

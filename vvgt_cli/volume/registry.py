@@ -15,9 +15,8 @@ from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
-from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader

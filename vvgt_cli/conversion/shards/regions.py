@@ -1,29 +1,135 @@
-"""The Gaussians of a cut region by region, of the closed form or refined; a region is a task for any worker."""
+"""The Gaussians of a cut region by region, of the closed form or refined; a region is a task for any worker.
+
+The Gaussians of a `Part` of a volume are fitted to pictures of that part alone. Premultiplied pictures compose front to
+back. So if the Gaussians of every part show what the part shows, all of them show what the volume shows, and parts can
+be fitted in any order, by any number of workers, without an exchange.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras.sets import RADIUS
-from vvgt_cli.conversion.part_descent import PartDescent
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras.sets import RADIUS, pixel_width
 from vvgt_cli.conversion.shards.cut import Cut, Node, Regions
 from vvgt_cli.conversion.shards.level_selection import FIELDS, CutErrors, errors_of
+from vvgt_cli.conversion.stages.refinement import CHECK_EVERY, WIDER
+from vvgt_cli.conversion.stages.views import ray_settings, view_count
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
+from vvgt_cli.dvr.render import RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.part import Part
-from vvgt_cli.field.reader import Layers, Scalars
-from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting
+from vvgt_cli.field.reader import Box, Layers, Scalars
+from vvgt_cli.gaussians import Gaussians, as_stored
+from vvgt_cli.gaussians.frames import rescale
+from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.gaussians.types import concatenate
 
 if TYPE_CHECKING:
     from vvgt_cli.field.blocked import Pass
     from vvgt_cli.score.record import Run
+
+
+REACH = 16  # voxels around a part that may hide it
+PART_RADIUS = 1.25  # of a part in its frame: half its diagonal; the default views show all but its corners
+
+
+class Part:
+    """The voxels of a box, cut out of a volume: a ray is transparent before and behind them.
+
+    Its frame is centred on the box, with the directions of the volume's box frame, scaled so that half the diagonal is
+    `PART_RADIUS`.
+
+    Attributes:
+        centre: (3,) centre in the volume's box frame.
+        scale: lengths in its frame per length in the unit frame.
+    """
+
+    def __init__(
+        self, reader: Scalars | Layers, frame: Frame, dims: tuple[int, int, int], lo: np.ndarray, hi: np.ndarray,
+        light: Light | None = None,
+    ) -> None:  # fmt: skip
+        """Read the voxels ``lo`` to ``hi`` (3,), x first, of a volume of ``dims`` voxels with this ``frame``."""
+        from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
+
+        halo = REACH + (HALO if light is None else LIT_HALO)
+        self.box: Box = reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, dims))
+        self._lo, self._hi, self._dims, self._frame, self._light = lo, hi, dims, frame, light
+        self.centre = (lo + hi) / 2 * frame.step - frame.half
+        self.scale = PART_RADIUS / float(np.linalg.norm((hi - lo) / 2 * frame.step))
+        self._empty = empty_distance(brick_ranges(self.box.values), self.box.optics)
+        self._cast = caster(self.box, self._empty, lo, hi, dims, light)
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """Render a picture (h, w, 4) of the part, as `render_view` does; the camera is in the part's frame."""
+        eye, basis, lens = self._arrays(camera)
+        out = np.zeros((camera.height, camera.width, 4), np.float32)
+        box = Frame((self._hi - self._lo) / 2 * self._frame.step * self.scale, self._frame.step * self.scale)
+        for rays in tiers(for_thin(settings, box, camera), out, blocks):
+            for offsets, mask, known in rays:
+                row, column = np.nonzero(mask)
+                pixels = np.stack([column, row], axis=1)
+                bundle = KernelBundle(eye, basis, lens, min(settings.step, LONGEST), pixels, offsets)
+                near = meeting(bundle, self._lo - 0.5, self._hi - 0.5)
+                sums = np.zeros((len(pixels), 4))
+                sums[near] = self._cast(bundle, near).sum(axis=1)
+                out[row, column] = (known * out[row, column] + sums) / (known + len(offsets))
+        return out
+
+    def shown(self, camera: Camera) -> np.ndarray:
+        """Return the share (h, w) float32 of each pixel's light from the part that passes the voxels before it.
+
+        Voxels up to `REACH` before the part count: where its faces lie inside a body, other parts hide them.
+        """
+        eye, basis, lens = self._arrays(camera)
+        column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+        bundle = KernelBundle(eye, basis, lens, LONGEST, pixels, np.zeros((1, 2)))
+        through = np.ones(len(pixels), np.float32)
+        for lo, hi in self._before(eye):
+            near = meeting(bundle, lo - 0.5, hi - 0.5)
+            seen = caster(self.box, self._empty, lo, hi, self._dims, self._light)(bundle, near)
+            through[near] *= 1 - seen[:, 0, 3]
+        return through.reshape(camera.height, camera.width)
+
+    def _before(self, eye: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield boxes of voxels (first, end) that rays from an eye, in voxels, may pass before they enter the part.
+
+        A ray has entered once it has passed the near face of each axis, so that the boxes, one an axis, do not overlap.
+        """
+        lo, hi = np.maximum(self._lo - REACH, 0), np.minimum(self._hi + REACH, self._dims)
+        for axis in range(3):
+            first, end = lo.copy(), hi.copy()
+            if eye[axis] < self._lo[axis] - 0.5:
+                end[axis] = lo[axis] = self._lo[axis]
+            elif eye[axis] > self._hi[axis] - 0.5:
+                first[axis] = hi[axis] = self._hi[axis]
+            else:
+                continue
+            if (first < end).all():
+                yield first, end
+
+    def _arrays(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return `camera_arrays` of a camera in the part's frame, in voxels of the volume."""
+        frame = Frame(self._frame.half * self.scale, self._frame.step * self.scale)
+        eye, basis, lens = camera_arrays(frame, camera)
+        return eye + self.centre / self._frame.step, basis * self.scale, lens
+
+    def moved_in(self, gaussians: Gaussians) -> Gaussians:
+        """Return Gaussians of the volume's box frame in the part's frame."""
+        return rescale(gaussians, self.scale, -self.centre, np.zeros(3))
+
+    def moved_out(self, gaussians: Gaussians) -> Gaussians:
+        """Return Gaussians of the part's frame in the volume's box frame."""
+        return rescale(gaussians, 1 / self.scale, np.zeros(3), self.centre)
 
 
 @dataclass(frozen=True)
@@ -182,3 +288,77 @@ def make_regions(
         steps_of = "" if refiner is None else f"{refiner.descent.steps} steps in each of "
         stage.note = f"{steps_of}{len(task)} regions of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
     return Made(cut.store, kind, regions.ends)
+
+
+PIXEL = 3.0  # width of a pixel of the training views, in median standard deviations of the middle axis
+SMALLEST, LARGEST, MULTIPLE = 64, 384, 16  # pixels along the edge of a view
+SPREAD = 0.5  # share of a screen pixel's width in a training pixel from which rays cover all of the latter
+
+
+@dataclass(frozen=True)
+class PartDescent:
+    """Options of the descent on a part.
+
+    Attributes:
+        steps: number of steps.
+        size: pixels along the edge of the screen that the file is made for.
+        rule: rule by which viewers draw.
+        seed: seed of the order of views.
+        target_psnr: dB on a part's own check views at which its descent ends; None for all steps.
+    """
+
+    steps: int
+    size: int
+    rule: Rule
+    seed: int = 0
+    target_psnr: float | None = None
+
+    def __call__(self, part: Part, gaussians: Gaussians, distance: float = RADIUS) -> Gaussians:
+        """Return Gaussians of the volume's box frame, refined; the given ones where descent does not help.
+
+        Args:
+            part: voxels that the Gaussians stand for.
+            gaussians: Gaussians of the closed form.
+            distance: distance in the unit frame from which they are seen, which decides on the screen's pixel.
+        """
+        from vvgt_cli.closed_form.shape import widened
+        from vvgt_cli.dvr import render_views
+        from vvgt_cli.refine import OptimizeOptions, optimize
+        from vvgt_cli.score.views import render_check_views
+
+        if not len(gaussians) or not self.steps:
+            return gaussians
+        start = part.moved_in(gaussians)
+        screen = pixel_width(self.size) * distance / RADIUS * part.scale
+        edge = view_edge(start, screen)
+        footprint = min(screen / pixel_width(edge), 1.0)
+        rule = self.rule.at(footprint)
+        settings = ray_settings(part, start, edge, rule, 1.0 if footprint >= SPREAD else footprint)
+        check = render_check_views(part, default_views("check", size=edge), settings)
+        before, target = check.psnr(start, rule), self.target_psnr
+        if target is not None and before >= target:
+            return gaussians
+        cameras = default_views("train", view_count(self.steps, small=True), size=edge)
+        options = OptimizeOptions.of(
+            "frame", steps=self.steps, rule=rule, judge=rule, seed=self.seed, target_psnr=target,
+            check_every=max(self.steps // 2, 1) if target is None else CHECK_EVERY,
+        )  # fmt: skip
+        result, record = optimize(
+            widened(start, WIDER, screen), cameras, render_views(part, cameras, settings), options,
+            check=(check.cameras, check.images, check.blocks), weights=[part.shown(camera) for camera in cameras],
+        )  # fmt: skip
+        if not (record.psnr_after or 0.0) > before:
+            return gaussians
+        return as_stored(part.moved_out(result))
+
+
+def view_edge(gaussians: Gaussians, screen: float) -> int:
+    """Return the pixels along the edge of views of Gaussians, whose pixels are as wide as neighbours are apart.
+
+    Args:
+        gaussians: Gaussians in the frame of the views.
+        screen: width of a screen's pixel there, the least width of a view's pixel.
+    """
+    middle = float(np.exp(np.median(np.sort(gaussians.log_scales, axis=1)[:, 1])))
+    edge = pixel_width(1) / max(PIXEL * middle, screen)
+    return int(np.clip(math.ceil(edge / MULTIPLE) * MULTIPLE, SMALLEST, LARGEST))

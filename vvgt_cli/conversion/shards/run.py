@@ -12,19 +12,19 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
-from vvgt_cli.conversion.part_descent import PartDescent
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
 from vvgt_cli.conversion.shards.cut import Cut, cut_of
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
-from vvgt_cli.conversion.shards.regions import Made, Refiner, make_regions
-from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text, scored_views
+from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
@@ -34,7 +34,9 @@ from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks, Pass
 from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.digests import digest
+from vvgt_cli.field.field import Picture
 from vvgt_cli.field.open import FieldNeeds, blocked, runner_of, store_beside, thread_count
+from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.field.settings import MANY, BlockOptions, worker_count
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import pace
@@ -45,12 +47,17 @@ from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
-from vvgt_cli.gaussians.rules import INRIA, rule_of
+from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import DRAW, INIT, OPTIMIZE, RENDER, for_blocks, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+
+if TYPE_CHECKING:
+    from vvgt_cli.images.metrics import Scores
+
 
 DERIVED = ("coarse", "trees", "closed-", "errors-", "written-")  # what a merge adds to a folder of blocks
 A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
@@ -365,3 +372,52 @@ def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]
         else:
             with open(output, "ab") as stream:
                 shutil.copyfileobj(sink, stream)
+
+
+FEW = 64  # blocks of 16 x 16 px of each test view
+RAYS = 2  # rays along a pixel's edge
+A_GAUSSIAN = 400  # bytes to draw a Gaussian
+
+
+def scored_views(size: int) -> list[Picture]:
+    """List the blocks of three test views of ``size`` px."""
+    from vvgt_cli.dvr import RenderSettings
+
+    cameras = default_views("test", size=size)
+    settings = RenderSettings(samples=RAYS)
+    return [Picture(cameras[i], settings, spread_blocks(size, size, i, FEW)) for i in PREVIEW_VIEWS]
+
+
+def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
+    """Score Gaussians (box frame), drawn by a rule, against the stored views of the volume.
+
+    Raises:
+        DataError: a block is missing or damaged.
+    """
+    from vvgt_cli.images.metrics import score_views
+    from vvgt_cli.splat import render
+
+    rays = RayFile(str(store.folder / f"{plan.rays}.npz"), plan.rays)
+    x, y, z = plan.grid.blocks.dims
+    seen = composed(rays, store, range(len(plan.grid.blocks)), (x, y, z))
+    views = scored_views(plan.size)
+
+    def picked(view: Picture) -> np.ndarray:
+        drawn = render(gaussians, view.camera, rule, blocks=view.blocks)
+        shown = drawn if view.blocks is None else drawn[view.blocks.mask()]
+        return shown.reshape(-1, 1, 4)
+
+    whole = [rays.mean(axis=1, keepdims=True).astype(np.float32) for rays in seen]
+    return score_views(whole, map(picked, views), perceptual=False)
+
+
+def score_text(scores: Scores, size: int) -> str:
+    """Return the scores as a message."""
+    from vvgt_cli.score.views import psnr_note
+
+    return f"{psnr_note(scores)}, blocks of {scores.views} views of {size} px, through all voxels"
+
+
+def drawing_bytes(gaussians: int, size: int) -> int:
+    """Return the bytes of memory for scoring a number of Gaussians."""
+    return A_GAUSSIAN * gaussians + 2 * 16 * size**2

@@ -24,7 +24,7 @@ from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
+from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order, splats_of
 from vvgt_cli.gaussians.formats.streamed import read_manifest
 from vvgt_cli.gaussians.frames import transform

@@ -16,8 +16,8 @@ from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.score.checks import Views
 from vvgt_cli.score.record import Run
+from vvgt_cli.score.views import Views
 
 STEP = 0.027, 0.0275  # seconds per 400 x 400 px, per 100,000 Gaussians
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # factors of the time with harmonics of degree 0 to 3

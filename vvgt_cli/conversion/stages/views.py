@@ -16,7 +16,7 @@ from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.score.checks import VIEW_BYTES, Views, check_blocks, render_check_views
+from vvgt_cli.score.views import VIEW_BYTES, Views, check_blocks, render_check_views
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene

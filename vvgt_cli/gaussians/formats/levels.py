@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians.formats.sog_images import splats_in
+from vvgt_cli.gaussians.formats.sog import splats_in
 from vvgt_cli.gaussians.formats.splats import ROW_BYTES, Splats, joined
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, nodes_of, placed, read_manifest
 from vvgt_cli.resources import free_memory

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.sog_images import META
+from vvgt_cli.gaussians.formats.sog import META
 from vvgt_cli.gaussians.formats.splats import Splats
 
 MANIFEST = "lod-meta.json"

@@ -27,7 +27,7 @@ def is_dicom(head: bytes) -> bool:
 FORMATS = (
     Reader(
         "DICOM", (".dcm", ".ima"), lazy("dicom.reader.read_dicom"), is_dicom, _TAKES,
-        holds=lazy("dicom.files.holds_dicom"),
+        holds=lazy("dicom.series.holds_dicom"),
     ),
     Reader("DICOM archive", (".zip",), lazy("dicom.reader.read_dicom"), takes=_TAKES),
 )  # fmt: skip

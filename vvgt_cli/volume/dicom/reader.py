@@ -19,9 +19,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.dicom.files import Source, headers_in, read_file
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
-from vvgt_cli.volume.dicom.series import Files, choose_series, one_stack
+from vvgt_cli.volume.dicom.series import Files, Source, choose_series, headers_in, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.libraries import library_errors, need

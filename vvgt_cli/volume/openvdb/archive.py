@@ -13,8 +13,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb import MAGIC
-from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
-from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP, Cursor
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import struct
 import zlib
+from typing import Any
 
 import numpy as np
 
-from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.errors import DataError
 
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4
 _LZ4 = 1
@@ -102,3 +103,50 @@ def _unshuffle(block: bytes, typesize: int) -> bytes:
     n = len(block) // typesize
     body = np.frombuffer(block, np.uint8, n * typesize).reshape(typesize, n).T.tobytes()
     return body + block[n * typesize :]
+
+
+class Cursor:
+    """A position in ``data`` that moves as things are taken.
+
+    Attributes:
+        at: bytes from the start.
+        name: the file, for messages.
+    """
+
+    def __init__(self, data: memoryview, name: str) -> None:
+        """Begin at the start of ``data``."""
+        self.data, self.name, self.at = data, name, 0
+
+    def bad(self, what: str) -> DataError:
+        """Make the error for what was found here."""
+        return DataError(f"{self.name}: {what} (near byte {self.at}); check that the file is whole")
+
+    def take(self, n: int) -> memoryview:
+        """Take the next ``n`` bytes.
+
+        Raises:
+            DataError: there are fewer.
+        """
+        if not 0 <= n <= len(self.data) - self.at:
+            raise self.bad(f"{n} bytes are expected, {len(self.data) - self.at} are left")
+        self.at += n
+        return self.data[self.at - n : self.at]
+
+    def unpack(self, form: str) -> tuple[Any, ...]:
+        """Take the next little-endian numbers, by a format of `struct`."""
+        return struct.unpack("<" + form, self.take(struct.calcsize("<" + form)))
+
+    def text(self) -> str:
+        """Take a string behind its length."""
+        (n,) = self.unpack("I")
+        return str(self.take(n), "utf-8", "replace")
+
+    def seek(self, at: int) -> None:
+        """Move to ``at``.
+
+        Raises:
+            DataError: outside the file.
+        """
+        if not 0 <= at <= len(self.data):
+            raise self.bad(f"an offset of {at} in a file of {len(self.data)} bytes")
+        self.at = at

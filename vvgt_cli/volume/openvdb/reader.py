@@ -21,7 +21,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import choose, select_component
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
-from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name

@@ -15,8 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.openvdb.archive import TYPES
-from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, read_block
-from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, Cursor, read_block
 
 LEAF, LOWER, UPPER = 8, 128, 4096  # voxels along the edge
 _MASK = LEAF**3 // 8  # bytes

@@ -33,8 +33,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.tiff.decode import Pages
-from vvgt_cli.volume.tiff.pages import MAX_PAGES, check_pages
-from vvgt_cli.volume.tiff.stored import lazy_pages
+from vvgt_cli.volume.tiff.pages import MAX_PAGES, check_pages, lazy_pages
 from vvgt_cli.volume.types import Volume, triple
 
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}

@@ -21,8 +21,8 @@ from vvgt_cli.volume.headers import MAX_HEADER, Fields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
+from vvgt_cli.volume.tiff.pages import lazy_files
 from vvgt_cli.volume.tiff.reader import read_tiff
-from vvgt_cli.volume.tiff.stored import lazy_files
 from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files
