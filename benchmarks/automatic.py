@@ -21,8 +21,7 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.images import write_png
 from vvgt_cli.look import from_histogram, read_transfer_function, resolve, unit_distance
-from vvgt_cli.synth.sources import open_volume
-from vvgt_cli.volume import ReadOptions, Volume, statistics
+from vvgt_cli.volume import ReadOptions, Volume, read_volume, statistics
 
 SIZE, SIZE_NAMED, AZIMUTH, ELEVATION, FIELD = 180, 160, 60.0, 12.0, 36.0  # px, degrees
 MADE: dict[str, Callable[[], Volume]] = {
@@ -71,7 +70,7 @@ def main(folder: str, *given: str) -> None:
     volumes = dict(NAMED if named else MADE) if not given else {}
     for entry in given or [f"{name}=example:{name}" for name in EXAMPLES if not named]:
         name, _, source = entry.partition("=")
-        volumes[name] = lambda source=source: open_volume(source, ReadOptions())
+        volumes[name] = lambda source=source: read_volume(source, ReadOptions())
     Path(folder).mkdir(parents=True, exist_ok=True)
     for name, volume in volumes.items():
         image, function = picture(volume(), name if named else None)

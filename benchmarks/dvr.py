@@ -15,8 +15,7 @@ from floors import alternate, bandwidth, flops, machine
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import REFERENCE, RenderSettings, Scene, render_view
 from vvgt_cli.look import from_histogram
-from vvgt_cli.synth import open_volume
-from vvgt_cli.volume import statistics
+from vvgt_cli.volume import read_volume, statistics
 
 SIZE, REPEATS = 400, 5
 SAMPLE_FLOPS = 50  # position 6, trilinear 24, table coordinate 4, compositing the rest
@@ -42,7 +41,7 @@ def main(names: list[str]) -> None:
     bytes_per_second, rate = bandwidth(), flops(np.float64)
     print(f"{bytes_per_second / 1e9:.1f} GB/s in one thread, {rate / 1e9:.0f} Gflop/s float64\n")
     for name in names:
-        volume = open_volume(name)
+        volume = read_volume(name)
         scene = Scene.build(volume, from_histogram(statistics(volume)), float(np.mean(volume.spacing)))
         camera = default_views("test", size=SIZE)[0]
         calls = {label: partial(render_view, scene, camera, settings) for label, settings in SETTINGS.items()}

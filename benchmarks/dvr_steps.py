@@ -26,7 +26,7 @@ from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, absorbed, box_span, leap, mean_op
 from vvgt_cli.dvr.layout import BRICK_BITS
 from vvgt_cli.dvr.reference import rays
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import read_volume
 
 NAMES = ("ironprot-density", "bonsai-tree", "embryo-opaque", "headsq-step")
 STEPS = {"pre-integrated": (1, 1 / 2, 1 / 4, 1 / 8), "plain": (1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64)}
@@ -95,7 +95,7 @@ def measure(scene: Scene, repeats: int) -> list[dict[str, Any]]:
 
 def thin_shell() -> Scene:
     """The Marschner-Lobb signal under opacity that is not zero on 2 % of the data's range alone."""
-    volume = open_volume("example:marschner-lobb")
+    volume = read_volume("example:marschner-lobb")
     lo, hi = float(volume.data.min()), float(volume.data.max())
     x = lo + (hi - lo) * np.array([0, 0.49, 0.5, 0.51, 1])
     opacity = PiecewiseOpacity(x, np.array([0, 0, 0.9, 0, 0]))

@@ -48,10 +48,10 @@ def closed_form(count: int) -> Gaussians:
     from vvgt_cli.closed_form import VbmOptions, initialise
     from vvgt_cli.dvr import Scene
     from vvgt_cli.look import from_histogram
-    from vvgt_cli.synth import open_volume
+    from vvgt_cli.volume import read_volume
     from vvgt_cli.volume import statistics as volume_statistics
 
-    volume = open_volume(VOLUME)
+    volume = read_volume(VOLUME)
     scene = Scene.build(volume, from_histogram(volume_statistics(volume)), float(np.mean(volume.spacing)))
     return initialise(scene, VbmOptions(max_gaussians=count, size=800)).gaussians
 

@@ -26,7 +26,7 @@ from vvgt_cli.refine.steps import own_axes
 from vvgt_cli.splat import blend, render
 from vvgt_cli.splat.kernel import project_factors, tile_lists
 from vvgt_cli.splat.render import depth_order, moments, own_axes_backward, pose
-from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import read_volume
 
 REPEATS = 9
 BACKWARD_FLOPS = 60  # a pixel: the forward's 30, colour against gradient 8, what is behind 5, nine sums 12, division
@@ -94,7 +94,7 @@ def main(files: tuple[str, ...], count: int) -> None:
     most = numba.get_num_threads()
     camera, out = default_views("train")[3], np.empty(256)
     for name in files or ("example:frog", "example:channels"):
-        gaussians = read_ply(name)[0] if name.endswith(".ply") else sampled(open_volume(name), count)
+        gaussians = read_ply(name)[0] if name.endswith(".ply") else sampled(read_volume(name), count)
         target = render(gaussians, camera) * np.float32(0.9)
         calls = part_calls(gaussians, target) | {"(arithmetic)": lambda: arithmetic(out)}
         both = {(part, n): with_threads(n, call) for part, call in calls.items() for n in (1, most)}

@@ -18,8 +18,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.look import from_histogram
 from vvgt_cli.splat import Projection, blend, gather, project
-from vvgt_cli.synth import open_volume
-from vvgt_cli.volume import Volume, statistics
+from vvgt_cli.volume import Volume, read_volume, statistics
 
 COUNT, REPEATS, SIZES = 100_000, 9, (400, 1600)
 PIXEL_FLOPS = 30  # exponent 4, exponential 12, alpha and transmittance 6, four channels 8
@@ -54,7 +53,7 @@ def main(names: list[str]) -> None:
     bytes_per_second, rate = bandwidth(), flops(np.float32)
     print(f"{bytes_per_second / 1e9:.1f} GB/s in one thread, {rate / 1e9:.0f} Gflop/s float32\n")
     for name in names:
-        gaussians = sampled(open_volume(name), COUNT)
+        gaussians = sampled(read_volume(name), COUNT)
         for size in SIZES:
             camera = default_views("test", size=size)[0]
             projection = project(gaussians, camera)

@@ -34,6 +34,7 @@ from closed_form import read_options, scene_rows
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
+from vvgt_cli.commands.synth import TURNOVER, Solver, fields, flow_of, run
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -46,9 +47,8 @@ from vvgt_cli.network.training.scenes import as_float, prepare_scenes
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
-from vvgt_cli.synth.shapes import make_shape, volume_of
-from vvgt_cli.synth.turbulence import TURNOVER, Solver, fields, flow_of, run
 from vvgt_cli.volume.medical.nrrd import write_nrrd
+from vvgt_cli.volume.shapes import make_shape, volume_of
 
 GRID, SIZES = 64, (96, 128, 160)
 KINDS = ("shells", "tubes", "plates", "noise", "wells", "bodies", "bodies")  # the last twice, other seeds

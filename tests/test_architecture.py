@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
-    *("gaussians", "synth", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
+    *("gaussians", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
     *("conversion", "checks", "commands", "library", "integrations", "cli"),
 )
 HEAVY = {

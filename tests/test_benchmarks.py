@@ -19,8 +19,7 @@ from vvgt_cli.cli.main import run
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.images import read_png, write_png
-from vvgt_cli.synth import open_volume
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, read_volume
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 
 ROOT = Path(__file__).parent.parent
@@ -63,7 +62,7 @@ def bench(monkeypatch):
 def scenes(tmp_path_factory):
     """A list with a comment, the names of its columns and one scene; the folders of its volume and its function."""
     folder = tmp_path_factory.mktemp("scenes")
-    write_nrrd(folder / "blob.nrrd", open_volume("example:blob:10"))
+    write_nrrd(folder / "blob.nrrd", read_volume("example:blob:10"))
     points = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": o} for x, o in ((0, 0), (0.2, 0), (0.4, 0.5), (1, 0.8))]
     (folder / "shells.json").write_text(json.dumps({"range": [0, 1], "points": points}))
     listing = folder / "scenes.tsv"
@@ -131,7 +130,7 @@ def test_dvr_pixels(bench, scenes, tmp_path):
 
 def test_dvr_steps(bench, tmp_path, monkeypatch):
     module = bench("dvr_steps", STEPS={"pre-integrated": (1,), "plain": (1,)})
-    monkeypatch.setattr(module, "open_volume", lambda name: open_volume(f"{name}:12"))
+    monkeypatch.setattr(module, "read_volume", lambda name: read_volume(f"{name}:12"))
     call(module.main, "-o", tmp_path / "a.csv", "--repeats", 1)
     ours, plain = rows_of(tmp_path / "a.csv")
     assert float(ours["db"]) > float(plain["db"])  # through a thin shell

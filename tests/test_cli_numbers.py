@@ -11,8 +11,8 @@ import pytest
 
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.errors import UsageError
-from vvgt_cli.synth.shapes import blob
 from vvgt_cli.volume.plain.raw import guess_dims
+from vvgt_cli.volume.shapes import blob
 
 FORMS = (
     "64 64 93", "64,64,93", "64x64x93", "64X64X93", "64, 64, 93", "64 x 64 x 93", "64,64 93", "64×64×93", "64 ,64 ,93",

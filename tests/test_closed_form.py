@@ -17,8 +17,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
-from vvgt_cli.synth import shapes
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, shapes
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 SIZE = 64

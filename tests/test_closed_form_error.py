@@ -17,7 +17,7 @@ from vvgt_cli.closed_form.tree import select, split_score
 from vvgt_cli.dvr import RenderSettings, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.synth import shapes
+from vvgt_cli.volume import shapes
 
 BUDGET = 300
 

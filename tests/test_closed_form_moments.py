@@ -15,8 +15,7 @@ from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.bricks import ranges_of
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.look.tables import Optics, extinction
-from vvgt_cli.synth import shapes
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, shapes
 
 
 def test_ranges_of_blocks_are_those_of_their_voxels_and_the_next() -> None:

@@ -23,8 +23,7 @@ from vvgt_cli.gaussians.constants import MAX_ALPHA, MIN_ALPHA
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.splat import render
-from vvgt_cli.synth import shapes
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, shapes
 
 
 def test_dilogarithm_known_values() -> None:

@@ -17,8 +17,7 @@ from vvgt_cli.closed_form.moments import base_cells, morton
 from vvgt_cli.closed_form.tree import PLAIN, Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.closed_form.visibility import Visibility, march, visibility
 from vvgt_cli.dvr import Scene
-from vvgt_cli.synth import shapes
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, shapes
 
 FAR = 200.0  # rays of a camera this far away are parallel to 0.3 degrees
 

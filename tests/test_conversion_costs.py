@@ -10,7 +10,7 @@ from vvgt_cli.dvr import Scene
 from vvgt_cli.field import workload as case_module
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.look.readers import minimal
-from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import read_volume
 
 POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
 
@@ -22,7 +22,7 @@ def drawn(size, enough):
 
 @pytest.fixture(scope="module")
 def scene():
-    return Scene.build(open_volume("example:marschner-lobb:16"), minimal.read({"points": POINTS}, "ramp"), 1.0)
+    return Scene.build(read_volume("example:marschner-lobb:16"), minimal.read({"points": POINTS}, "ramp"), 1.0)
 
 
 @pytest.mark.parametrize(("size", "judged"), [(300, 300**2), (1080, drawn(1080, FEW))])

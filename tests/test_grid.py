@@ -19,8 +19,7 @@ from vvgt_cli.dvr.layout import Texels
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.splat import render
-from vvgt_cli.synth import shapes
-from vvgt_cli.volume import Volume
+from vvgt_cli.volume import Volume, shapes
 
 FINE = RenderSettings(step=0.0625, samples=1)
 LIT = Lighting(headlight=True, directions=((0.6, -0.48, 0.64),), shadows=True, occlusion=0.2)

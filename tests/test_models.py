@@ -17,8 +17,8 @@ from vvgt_cli.look import from_histogram
 from vvgt_cli.network.card import find_model
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.splat import render
-from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.volume import statistics
+from vvgt_cli.volume.shapes import make_shape
 
 ROOT = Path(__file__).parent.parent
 

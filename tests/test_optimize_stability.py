@@ -16,8 +16,7 @@ from vvgt_cli.refine import METHODS, OptimizeOptions, optimize
 from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.refine.steps import adam
 from vvgt_cli.splat import render
-from vvgt_cli.synth import open_volume
-from vvgt_cli.volume import statistics
+from vvgt_cli.volume import read_volume, statistics
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 STEPS = [pytest.param(100, id="100"), pytest.param(10_000, id="10000", marks=pytest.mark.long)]
@@ -27,7 +26,7 @@ SIZE = 32
 @pytest.fixture(scope="module")
 def stiff():
     """A step function of opacity 1 over an optical depth of 1e6: (start, cameras, views)."""
-    volume = open_volume("example:blob:16")
+    volume = read_volume("example:blob:16")
     numbers = statistics(volume)
     x = [0.0, 0.4, 0.4, 1.0]
     tf = TransferFunction("step", PiecewiseOpacity(x, [0, 0, 1, 1]), ColorMap(x, np.float64([*np.eye(3), [1, 1, 0]])))

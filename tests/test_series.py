@@ -17,8 +17,8 @@ from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.score.record import ConversionReport
-from vvgt_cli.synth.shapes import blob
 from vvgt_cli.volume import Volume, statistics
+from vvgt_cli.volume.shapes import blob
 
 SMALL = ("--size", "32", "--max-gaussians", "60", "-q")
 TF = {"points": [{"x": 0, "rgb": [0, 0, 1], "opacity": 0}, {"x": 10, "rgb": [1, 0, 0], "opacity": 0.5}]}

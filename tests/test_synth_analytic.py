@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.synth import open_volume, shapes
-from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume import ReadOptions, Volume, read_volume, shapes
 
 ALL = [
     shapes.marschner_lobb,
@@ -101,9 +100,9 @@ def test_random_field_is_band_limited_and_seeded() -> None:
 
 @pytest.mark.parametrize("name", ["marschner-lobb", "blob", "slab", "sphere", "checkerboard", "random"])
 def test_example_sources(name: str) -> None:
-    assert open_volume(f"example:{name}").name == name
-    assert open_volume(f"example:{name}:12").dims == (12, 12, 12)
-    volume = open_volume(f"example:{name}:12x8x10", ReadOptions(spacing=(1, 2, 3)))
+    assert read_volume(f"example:{name}").name == name
+    assert read_volume(f"example:{name}:12").dims == (12, 12, 12)
+    volume = read_volume(f"example:{name}:12x8x10", ReadOptions(spacing=(1, 2, 3)))
     assert (volume.dims, volume.spacing) == ((12, 8, 10), (1, 2, 3))
 
 
@@ -123,9 +122,9 @@ def test_example_sources(name: str) -> None:
 )
 def test_example_errors(source: str, options: ReadOptions, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        open_volume(source, options)
+        read_volume(source, options)
 
 
 def test_a_size_beyond_memory_is_refused() -> None:
     with pytest.raises(DataError, match="of memory"):
-        open_volume("example:blob:999999")
+        read_volume("example:blob:999999")

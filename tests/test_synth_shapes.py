@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.synth import open_volume
-from vvgt_cli.synth.shapes import SHAPES, make_shape
+from vvgt_cli.volume import read_volume
 from vvgt_cli.volume.medical.nrrd import write_nrrd
+from vvgt_cli.volume.shapes import SHAPES, make_shape
 from vvgt_cli.volume.types import Volume
 
 
@@ -70,13 +70,13 @@ def test_a_volume_written_as_nrrd_reads_back(tmp_path):
     values = np.random.default_rng(0).normal(size=(3, 4, 5)).astype(np.float32)
     volume = Volume(values, (0.1, 2.0, 1 / 3), (1.0, -2.5, 1e-7), slope=2.0, intercept=-1.0)
     write_nrrd(tmp_path / "v.nrrd", volume)
-    back = open_volume(str(tmp_path / "v.nrrd"))
+    back = read_volume(str(tmp_path / "v.nrrd"))
     assert np.array_equal(back.data, values * np.float32(2) - np.float32(1))
     assert back.spacing == pytest.approx(volume.spacing, rel=1e-15)
     assert back.origin == pytest.approx(volume.origin, rel=1e-15)
     big = Volume(values.astype(">f8"))
     write_nrrd(tmp_path / "v.nrrd", big, overwrite=True)
-    assert np.array_equal(open_volume(str(tmp_path / "v.nrrd")).data, values)
+    assert np.array_equal(read_volume(str(tmp_path / "v.nrrd")).data, values)
 
 
 @pytest.mark.parametrize("kind", ["tubes", "stratified"])
@@ -84,7 +84,7 @@ def test_the_command_writes_what_it_reports(kind, tmp_path, vvgt):
     more = [] if kind == "tubes" else ["--turnovers", "0.1"]
     result = vvgt("synth", kind, "--size", 16, "--seed", 3, *more, "-o", tmp_path / "v.nrrd")
     assert result.code == 0, result.err
-    volume = open_volume(str(tmp_path / "v.nrrd"))
+    volume = read_volume(str(tmp_path / "v.nrrd"))
     assert volume.dims == (16, 16, 16)
     assert np.ptp(volume.data) > 0
     if kind == "stratified":

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vvgt_cli.commands.synth import Flow, Solver, fields, flow_of, resolved_viscosity, run
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.synth.turbulence import Flow, Solver, fields, flow_of, resolved_viscosity, run
 
 QUIET = Flow(16, 0.05, power=0)
 

@@ -24,14 +24,14 @@ from vvgt_cli.score.viewing import (
 )
 from vvgt_cli.score.views import score_drawn_view, score_test_views
 from vvgt_cli.splat import render
-from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import read_volume
 
 ONE_RAY = RenderSettings(samples=1)
 
 
 @pytest.fixture(scope="module")
 def pair():
-    scene = scene_of(open_volume("example:blob:12"), Tent())
+    scene = scene_of(read_volume("example:blob:12"), Tent())
     return scene, initialise(scene, VbmOptions(60, 32)).gaussians
 
 
@@ -66,7 +66,7 @@ def test_conditions_are_scored_by_their_rule_size_and_field_worst_first(pair):
 
 def test_texture_is_measured_in_close_views(pair):
     _, gaussians = pair
-    scene = scene_of(open_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
+    scene = scene_of(read_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
     ticks = []
     found = score_texture(scene, gaussians, 96, "playcanvas", ONE_RAY, lambda *done: ticks.append(done))
     cameras = [zoomed(default_views("test", size=96)[i], 14.0) for i in (0, 4, 9)]

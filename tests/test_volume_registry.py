@@ -15,7 +15,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.synth import open_volume
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.blocks import parse_numbers
 from vvgt_cli.volume.readers import READERS, Reader, known_suffixes, register, volume_name
@@ -172,7 +171,7 @@ def test_numbers_across_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     ("name", "dims", "dtype"), [("frog", (500, 470, 136), "uint8"), ("channels", (250, 250, 100), "int64")]
 )
 def test_bundled_examples(name: str, dims: tuple[int, int, int], dtype: str) -> None:
-    volume = open_volume(f"example:{name}")
+    volume = read_volume(f"example:{name}")
     assert volume.dims == dims
     assert volume.data.dtype == dtype
     assert volume.data.max() > volume.data.min()
@@ -181,7 +180,7 @@ def test_bundled_examples(name: str, dims: tuple[int, int, int], dtype: str) -> 
 def test_reading_loads_nothing_heavy(tmp_path: Path) -> None:
     (tmp_path / "v.nrrd").write_bytes(NRRD)
     code = (
-        "import sys\nfrom vvgt_cli.synth import open_volume\nopen_volume(sys.argv[1])\nopen_volume('example:blob:8')\n"
+        "import sys\nfrom vvgt_cli.volume import read_volume\nread_volume(sys.argv[1])\nread_volume('example:blob:8')\n"
         "heavy = {'numba', 'vtkmodules', 'vtk', 'pyvista', 'OpenImageIO', 'matplotlib', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

@@ -61,8 +61,7 @@ def suggest_transfer_functions(
     """
     from vvgt_cli.look.presets import fitting
     from vvgt_cli.look.suggest import suggest
-    from vvgt_cli.synth.sources import open_volume
-    from vvgt_cli.volume import statistics
+    from vvgt_cli.volume import read_volume, statistics
 
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
@@ -75,7 +74,7 @@ def suggest_transfer_functions(
             raise UsageError(f"{path} exists; give --overwrite to replace it, or another directory")
     run = Run(console or Console(), ConversionReport("tf suggest"))
     with run.stage("read") as stage:
-        grid = open_volume(volume, read)
+        grid = read_volume(volume, read)
         numbers = statistics(grid)
         stage.note = f"{grid.name}: values {numbers.lo:g} to {numbers.hi:g}"
     with run.stage("suggest") as stage:
@@ -100,8 +99,7 @@ def show_transfer_function(
         UsageError, DataError: an output that may not be written, or inputs that are not what they must be.
     """
     from vvgt_cli.look import draw, read_transfer_function, resolve
-    from vvgt_cli.synth.sources import open_volume
-    from vvgt_cli.volume import statistics
+    from vvgt_cli.volume import read_volume, statistics
 
     if output == STDOUT:
         raise UsageError("-o -: a picture goes to a file; expected a name ending in .png")
@@ -111,7 +109,7 @@ def show_transfer_function(
     function = read_transfer_function(tf)
     numbers = None
     if volume is not None:
-        data = open_volume(volume, read)
+        data = read_volume(volume, read)
         numbers = statistics(data)
         function = resolve(function, numbers, tf_range, data.hounsfield)
     draw(function, numbers, output, overwrite)

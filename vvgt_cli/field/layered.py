@@ -24,8 +24,7 @@ from vvgt_cli.look import (
 from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.label_files import holds_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable, distinct
-from vvgt_cli.synth.sources import open_volume
-from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
+from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
 
@@ -148,11 +147,11 @@ def open_content(source: str, read: ReadOptions) -> Content:
     channels of a microscope.
 
     Raises:
-        DataError, UsageError: see `open_volume`; also for components that are not colours.
+        DataError, UsageError: see `read_volume`; also for components that are not colours.
     """
     asked = read.component if read.component in (COLOR, ALL) else None
     try:
-        volume = open_volume(source, replace(read, component=None) if asked else read)
+        volume = read_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
         by_default = not (asked or error.color or overlapping)
@@ -163,7 +162,7 @@ def open_content(source: str, read: ReadOptions) -> Content:
         color = asked == COLOR or (error.color and not asked and not overlapping)
         if color and read.keep_largest is not None:
             raise UsageError(f"--keep-largest: {source} has colours; expected scalars: give a --mask") from None
-        parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
+        parts = tuple(read_volume(source, replace(read, component=k)) for k in range(error.count))
         if color:
             return Content(parts, True, stored=read.stored)
         colors = error.colors or [None] * error.count

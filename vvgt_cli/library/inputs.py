@@ -207,7 +207,7 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         DataError: the volume is invalid or damaged.
         UsageError: an option is unknown, or does not apply.
     """
-    from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.volume import read_volume
     from vvgt_cli.volume.registry import cut
 
     given: dict[str, Any] = dict(reading)
@@ -220,7 +220,7 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     if isinstance(volume, str | os.PathLike):
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are for arrays, and files have their own; remove them")
-        return open_volume(os.fspath(volume), options)
+        return read_volume(os.fspath(volume), options)
     found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
     return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 

@@ -1,12 +1,15 @@
-"""``example:NAME`` sources: a table that rooms add to, with the real volumes of pyvista's wheel in it."""
+"""``example:NAME`` sources: analytic volumes of any size, and the real ones of pyvista's wheel."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import shapes
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.types import Volume
@@ -14,12 +17,7 @@ from vvgt_cli.volume.types import Volume
 # (text behind the name, options) -> Volume
 Maker = Callable[[str, ReadOptions], Volume]
 
-_EXAMPLES: dict[str, Maker] = {}
-
-
-def register_example(name: str, make: Maker) -> None:
-    """Make ``example:NAME`` (and ``example:NAME:rest``, if the maker takes a rest) a source."""
-    _EXAMPLES[name] = make
+_SIZE = re.compile(r"(\d{1,6})(?:x(\d{1,6})x(\d{1,6}))?")
 
 
 def open_example(text: str, options: ReadOptions) -> Volume:
@@ -29,11 +27,11 @@ def open_example(text: str, options: ReadOptions) -> Volume:
         UsageError: unknown name (the error lists those that exist), or options that an example does not take.
     """
     name, _, rest = text.partition(":")
-    if name not in _EXAMPLES:
-        raise UsageError(f"example:{name}: no such example; expected one of {', '.join(sorted(_EXAMPLES))}")
+    if name not in EXAMPLES:
+        raise UsageError(f"example:{name}: no such example; expected one of {', '.join(sorted(EXAMPLES))}")
     if options.raw_flags:
         raise UsageError(f"example:{name}: an example has its own layout; leave out {' '.join(options.raw_flags)}")
-    return _EXAMPLES[name](rest, options)
+    return EXAMPLES[name](rest, options)
 
 
 def _bundled(name: str, filename: str) -> Maker:
@@ -51,5 +49,27 @@ def _bundled(name: str, filename: str) -> Maker:
     return make
 
 
-register_example("frog", _bundled("frog", "frog_tissues.vti"))
-register_example("channels", _bundled("channels", "channels.vti"))
+def _sized(name: str, make: Callable[[shapes.Size], Volume], default: int) -> Maker:
+    def open_analytic(rest: str, options: ReadOptions) -> Volume:
+        match = _SIZE.fullmatch(rest or str(default))
+        if match is None:
+            raise UsageError(f"example:{name}:{rest}: expected a size, as example:{name}:64 or example:{name}:64x48x32")
+        if options.array is not None or options.component not in (None, 0):
+            raise UsageError(f"example:{name}: has a single unnamed scalar array; omit --array and --component")
+        x, y, z = (int(match[1]), int(match[2] or match[1]), int(match[3] or match[1]))
+        volume = make((x, y, z))
+        return volume if options.spacing is None else replace(volume, spacing=options.spacing)
+
+    return open_analytic
+
+
+EXAMPLES = {
+    "frog": _bundled("frog", "frog_tissues.vti"),
+    "channels": _bundled("channels", "channels.vti"),
+    "marschner-lobb": _sized("marschner-lobb", shapes.marschner_lobb, 64),
+    "blob": _sized("blob", shapes.blob, 64),
+    "slab": _sized("slab", shapes.slab, 64),
+    "sphere": _sized("sphere", shapes.sphere, 64),
+    "checkerboard": _sized("checkerboard", shapes.checkerboard, 32),
+    "random": _sized("random", shapes.random_field, 64),
+}

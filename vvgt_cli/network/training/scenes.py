@@ -197,10 +197,9 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
     from vvgt_cli.dvr import RenderSettings, Scene, render_views
     from vvgt_cli.look.readers import minimal
     from vvgt_cli.look.suggest import suggest
-    from vvgt_cli.synth.sources import open_volume
-    from vvgt_cli.volume import statistics
+    from vvgt_cli.volume import read_volume, statistics
 
-    volume = open_volume(recipe.volume)
+    volume = read_volume(recipe.volume)
     numbers = statistics(volume)
     size = recipe.size
     bands = suggest(numbers, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)
