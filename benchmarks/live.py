@@ -22,7 +22,7 @@ from tests.live_stream import from_bytes
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.convert import fit_gaussians
 from vvgt_cli.conversion.file_layout import degree_of
-from vvgt_cli.conversion.live import box_lighting, fog_start, function_table, widen_narrow, with_values
+from vvgt_cli.conversion.live import box_lighting, fog, fog_start, function_table, widen_narrow, with_values
 from vvgt_cli.conversion.recolored import visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
@@ -36,7 +36,6 @@ from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.live import apply_look, baked
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.fog import fog
 from vvgt_cli.look.histogram import background_bins
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console

@@ -24,6 +24,7 @@ from vvgt_cli.closed_form.gaussian_samples import (
     sample_points,
     values_of,
 )
+from vvgt_cli.conversion.live import fog
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -40,7 +41,6 @@ from vvgt_cli.gaussians.live import (
 from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
-from vvgt_cli.look.fog import fog
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume

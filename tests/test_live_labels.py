@@ -14,12 +14,12 @@ from tests.live_stream import from_bytes
 from tests.test_live import SMALL, cloud
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import assign_labels
+from vvgt_cli.conversion.live import label_fog
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.gaussians.live import SHARP, Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LiveFacts
-from vvgt_cli.look.fog import label_fog
 from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume

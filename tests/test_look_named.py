@@ -15,9 +15,9 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.open import needs_histogram
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look import from_histogram, read_transfer_function, resolve
-from vvgt_cli.look.presets import fitting
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.look.recognise import foreground, moments
+from vvgt_cli.look.suggest import fitting
 from vvgt_cli.volume import Volume, statistics
 from vvgt_cli.volume.bodies import largest
 

@@ -147,7 +147,7 @@ def test_dasks_workers_convert_labels_under_light(vvgt, tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("vvgt_cli.field.dask_runner.WAIT", "1s")
+    monkeypatch.setattr("vvgt_cli.field.runners.WAIT", "1s")
     for scheduler, code, word in (
         ("tcp://127.0.0.1:9", 1, "no Dask scheduler answers"),
         ("nonsense://x", 1, "no Dask scheduler answers"),
@@ -347,13 +347,13 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
 @pytest.fixture
 def jobs(slurm, monkeypatch):
     """Jobs in this process, looked at twice a second; the variables of SLURM's stand-in as given."""
-    from vvgt_cli.field import dask_runner
+    from vvgt_cli.field import runners
 
-    monkeypatch.setattr(dask_runner, "AGAIN", 0.5)
-    monkeypatch.setattr(dask_runner, "memory_limit", lambda: 1e9)
+    monkeypatch.setattr(runners, "AGAIN", 0.5)
+    monkeypatch.setattr(runners, "memory_limit", lambda: 1e9)
     for name, value in slurm[1].items():
         monkeypatch.setenv(name, value)
-    return lambda: dask_runner.DaskRunner("slurm", 2, 1)
+    return lambda: runners.DaskRunner("slurm", 2, 1)
 
 
 def test_slurm_jobs_that_all_end_early_are_reported(slurm, jobs, monkeypatch):

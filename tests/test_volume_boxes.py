@@ -15,7 +15,7 @@ from vtkmodules.vtkCommonDataModel import vtkImageData
 from tests.ramps import X, Y, Z
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.arrays.netcdf3 import check_header
+from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.stored import Stored, read_block
 
 

@@ -16,7 +16,7 @@ import zarr
 from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.arrays.netcdf3 import check_header
+from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.labelled import even
 
 VALUES = ramp(X, Y, Z)

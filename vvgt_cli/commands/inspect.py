@@ -238,7 +238,7 @@ def _channels(content: Content) -> list[dict[str, Any]]:
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.field.layered import open_content
     from vvgt_cli.look import unit_distance
-    from vvgt_cli.look.presets import fitting
+    from vvgt_cli.look.suggest import fitting
     from vvgt_cli.volume import statistics
     from vvgt_cli.volume.label_maps import recognised
 

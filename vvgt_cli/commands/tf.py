@@ -59,8 +59,7 @@ def suggest_transfer_functions(
         UsageError: a file that exists, or a folder that cannot be made.
         DataError: invalid input, or data of a single value.
     """
-    from vvgt_cli.look.presets import fitting
-    from vvgt_cli.look.suggest import suggest
+    from vvgt_cli.look.suggest import fitting, suggest
     from vvgt_cli.volume import read_volume, statistics
 
     folder = Path(output)

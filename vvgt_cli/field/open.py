@@ -327,7 +327,7 @@ def runner_of(options: BlockOptions, threads: int) -> Runner:
     """Return the runner of the options' workers, which share ``threads``."""
     workers = options.workers or 1
     if options.scheduler is not None:
-        from vvgt_cli.field.dask_runner import DaskRunner
+        from vvgt_cli.field.runners import DaskRunner
 
         return DaskRunner(options.scheduler, workers, threads)
     return Processes(workers, threads) if workers > 1 else InProcess()

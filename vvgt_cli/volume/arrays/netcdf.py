@@ -1,8 +1,16 @@
-"""NetCDF 3 and 4 (``.nc``), one variable on its CF axes. Read by netCDF4."""
+"""NetCDF 3 and 4 (``.nc``), one variable on its CF axes. Read by netCDF4.
+
+The header of a classic file is walked and compared with the file before the library sees it: the C library follows
+counts and offsets of a damaged header out of its memory. Format: "NetCDF Classic Format Specification"
+(https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html), CDF-1, -2 and -5.
+"""
 
 from __future__ import annotations
 
+import math
+import mmap
 import warnings
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -10,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.volume.arrays.netcdf3 import check_header
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import DESCRIBES, Axis, axis, described_by, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -118,3 +127,152 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
             return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, stated)
         group = group.parent
     return axis(name, size)
+
+
+_DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
+_TYPES = {1: "i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8", 7: "u1", 8: ">u2", 9: ">u4", 10: ">i8", 11: ">u8"}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of a classic file.
+
+    Attributes:
+        dims: names of its dimensions, slowest first.
+        shape: values along them; along one without an end, the number of records.
+        dtype: of the values, as stored.
+        begin: byte of the first.
+        endless: whether the first dimension has no end: its records lie `step` bytes apart.
+        attributes: numbers as arrays, text.
+        step: bytes of a record of all variables.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    begin: int
+    endless: bool
+    attributes: dict[str, Any]
+    step: int = 0
+
+    def mapped(self, path: Path) -> np.ndarray:
+        """Map the values."""
+        if not self.endless:
+            return load_block(path, self.dtype, self.shape, offset=self.begin)
+        inner = np.empty(self.shape[1:], np.uint8).strides  # of bytes: a record is in one piece
+        strides = (self.step, *(n * self.dtype.itemsize for n in inner))
+        whole = load_block(path, np.dtype(np.uint8), (path.stat().st_size,))
+        return np.ndarray(self.shape, self.dtype, whole, self.begin, strides)
+
+
+class _Header:
+    """A position in the header; everything read is checked to lie in the file."""
+
+    def __init__(self, data: mmap.mmap, path: Path) -> None:
+        self.data, self.path, self.at = data, path, 4
+        self.wide = 8 if data[3] == 5 else 4  # bytes of a count
+        self.offset = 4 if data[3] == 1 else 8  # bytes of a position
+
+    def bad(self, what: str) -> DataError:
+        return DataError(f"{self.path}: its NetCDF header {what} (near byte {self.at}); check that the file is whole")
+
+    def number(self, width: int) -> int:
+        if self.at + width > len(self.data):
+            raise self.bad("is cut short")
+        value = int.from_bytes(self.data[self.at : self.at + width], "big", signed=True)
+        self.at += width
+        return value
+
+    def count(self) -> int:
+        """Read the number of things that each take a byte of the file or more."""
+        value = self.number(self.wide)
+        if not 0 <= value <= len(self.data) - self.at:
+            raise self.bad(f"declares {value} things")
+        return value
+
+    def skip(self, n: int) -> None:
+        """Skip ``n`` bytes and their padding to four."""
+        self.at += (n + 3) // 4 * 4
+        if self.at > len(self.data):
+            raise self.bad("is cut short")
+
+    def name(self) -> bytes:
+        n = self.count()
+        text = self.data[self.at : self.at + n]
+        self.skip(n)
+        if not n or b"\0" in text:
+            raise self.bad("has a thing without a name")
+        return text
+
+    def items(self, tag: int) -> int:
+        """Read how many things a list of ``tag`` has."""
+        found, n = self.number(4), self.count()
+        if found != tag and (found, n) != (0, 0):
+            raise self.bad(f"has the tag {found} where {tag} was expected")
+        return n
+
+    def kind(self) -> np.dtype:
+        """Read the type of values."""
+        found = self.number(4)
+        if found not in _TYPES:
+            raise self.bad(f"has values of type {found}")
+        return np.dtype(_TYPES[found])
+
+    def attributes(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for _ in range(self.items(_ATTRIBUTE)):
+            name, kind, n, begin = self.name(), self.kind(), self.count(), self.at
+            self.skip(kind.itemsize * n)
+            data = self.data[begin : begin + kind.itemsize * n]
+            text = kind.kind == "S"
+            found[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind)
+        return found
+
+
+def _plain(data: bytes) -> str:
+    return data.decode("utf-8", "replace").rstrip("\0")
+
+
+def check_header(path: Path) -> dict[str, Variable]:
+    """Check that a classic file's header and the values it declares lie in the file; return its variables by name.
+
+    Raises:
+        DataError: they do not.
+    """
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        header = _Header(data, path)
+        records = header.number(header.wide)
+        sizes: list[tuple[str, int]] = []
+        for _ in range(header.items(_DIMENSION)):
+            name = _plain(header.name())
+            sizes.append((name, header.number(header.wide)))
+        lengths = [n for _, n in sizes]
+        if any(n < 0 for n in lengths) or lengths.count(0) > 1:
+            raise header.bad(f"has dimensions of sizes {lengths[:9]}")
+        header.attributes()
+        found = {}
+        for _ in range(header.items(_VARIABLE)):
+            name = _plain(header.name())
+            found[name] = _variable(header, sizes, records)
+    rows = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
+    padded = sum(-(-n // 4) * 4 for n in rows)  # each to four bytes, where there are several
+    step = padded if len(rows) > 1 else sum(rows)
+    return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}
+
+
+def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Variable:
+    along = [header.number(header.wide) for _ in range(header.count())]
+    if any(not 0 <= k < len(sizes) for k in along) or 0 in [sizes[k][1] for k in along[1:]]:
+        raise header.bad(f"has a variable along dimensions {along[:9]} of {len(sizes)}")
+    attributes = header.attributes()
+    kind = header.kind()
+    header.number(header.wide)  # vsize, which may be wrong and is redundant
+    begin = header.number(header.offset)
+    need = kind.itemsize * math.prod(sizes[k][1] for k in along if sizes[k][1])
+    endless = bool(along) and sizes[along[0]][1] == 0
+    if not 0 <= begin <= len(header.data) or (begin + need > len(header.data) and not (endless and records == 0)):
+        raise header.bad(f"places {need} bytes of values at {begin} of {len(header.data)}")
+    if endless and records > 0 and need * records > len(header.data):
+        raise header.bad(f"declares {records} records of {need} bytes")
+    shape = tuple(sizes[k][1] or max(records, 0) for k in along)
+    return Variable(tuple(sizes[k][0] for k in along), shape, kind, begin, endless, attributes)

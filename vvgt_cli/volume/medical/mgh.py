@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.medical import MGH_HEADER, MGH_TYPES, is_mgh
-from vvgt_cli.volume.medical.frames import Frames, load_frames
+from vvgt_cli.volume.medical.nifti import Frames, load_frames
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import placed

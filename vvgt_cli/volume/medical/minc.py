@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAGIC
 from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
-from vvgt_cli.volume.arrays.netcdf3 import check_header
+from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
