@@ -17,7 +17,7 @@ from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import Network
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.images.viewset import load_views
+from vvgt_cli.images.files import load_views
 from vvgt_cli.network.card import ModelCard
 from vvgt_cli.network.prepare import prepare
 from vvgt_cli.network.runtime import Model

@@ -17,7 +17,7 @@ from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
 from vvgt_cli.gaussians.frames import transform
-from vvgt_cli.images.png import read_png
+from vvgt_cli.images.files import read_png
 from vvgt_cli.splat import render
 from vvgt_cli.volume import ReadOptions, read_volume
 

@@ -10,7 +10,7 @@ import pytest
 from tests.closed_form_scenes import Ramp, Tent, scene_of, score
 from tests.stiff_scenes import camera, quadrature
 from vvgt_cli.cameras import default_views
-from vvgt_cli.checks.scene import require_cuts_keep_mass
+from vvgt_cli.checks.self_test import require_cuts_keep_mass
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.moments import base_cells

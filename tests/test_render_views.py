@@ -14,7 +14,7 @@ from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.images import over, read_exr, read_png
-from vvgt_cli.images.viewset import load_views
+from vvgt_cli.images.files import load_views
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from tests.stiff_scenes import (
     step,
 )
 from vvgt_cli.cameras import default_views
-from vvgt_cli.checks.scene import (
+from vvgt_cli.checks.self_test import (
     FINE,
     bound_long_steps,
     compare_with_twin,

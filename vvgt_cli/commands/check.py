@@ -8,8 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from vvgt_cli.checks import Case, Outcome, run_case
-from vvgt_cli.checks.scene import scene_cases
-from vvgt_cli.checks.self_test import self_test_cases
+from vvgt_cli.checks.self_test import scene_cases, self_test_cases
 from vvgt_cli.checks.stiffness import Stiffness, measure_stiffness
 from vvgt_cli.commands.check_splats import open_splats
 from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record

@@ -70,7 +70,7 @@ def infer_file(request: InferRequest, console: Console | None = None) -> Convers
 def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
     import numba
 
-    from vvgt_cli.images.viewset import load_views
+    from vvgt_cli.images.files import load_views
     from vvgt_cli.network.card import find_model
     from vvgt_cli.network.runtime import Model
 

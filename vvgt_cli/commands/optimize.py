@@ -15,7 +15,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed, write_text
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.images.viewset import load_views
+from vvgt_cli.images.files import load_views
 from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions

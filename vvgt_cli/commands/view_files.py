@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.files import blender_json, colmap_model, point_cloud_ply, transforms_json
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
-from vvgt_cli.images.viewset import read_view
+from vvgt_cli.images.files import read_view
 from vvgt_cli.look.function import TransferFunctionLike
 
 if TYPE_CHECKING:

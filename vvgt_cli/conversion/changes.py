@@ -12,8 +12,8 @@ from vvgt_cli.cameras.blocks import BLOCK
 from vvgt_cli.dvr.layers import Layer
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.splat.reference import rotations
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import read_block
 

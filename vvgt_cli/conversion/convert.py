@@ -298,7 +298,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
         load_ahead()
     options, most = request.blocks or automatic(request.source, run.console), None
     if options is not None and by_regions(request):
-        from vvgt_cli.conversion.shards.plan import most_cells
+        from vvgt_cli.conversion.shards.cut import most_cells
 
         most = most_cells(request.budget())
     if options is None:

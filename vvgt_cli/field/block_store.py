@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,12 +131,8 @@ class BlockStore:
         Raises:
             DataError: the file is missing or damaged.
         """
-        path = self.path(kind, number, suffix)
-        try:
-            with np.load(path) as found:
-                return {name: found[name] for name in (found.files if names is None else names)}
-        except Exception as error:
-            raise _unreadable(path, number, error) from error
+        with self._opened(kind, number, suffix) as found:
+            return {name: found[name] for name in (found.files if names is None else names)}
 
     def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
         """Return the names of a result's arrays.
@@ -143,12 +140,22 @@ class BlockStore:
         Raises:
             DataError: the file is missing or damaged.
         """
+        with self._opened(kind, number, suffix) as found:
+            return frozenset(found.files)
+
+    @contextmanager
+    def _opened(self, kind: str, number: int, suffix: str) -> Iterator[Any]:
+        """Open a result; zipfile, zlib and numpy raise many types, here and while it is read."""
         path = self.path(kind, number, suffix)
         try:
             with np.load(path) as found:
-                return frozenset(found.files)
+                yield found
+        except FileNotFoundError as error:
+            text = f"{path}: block {number} is missing; remove its other files and run its shard again"
+            raise DataError(text) from error
         except Exception as error:
-            raise _unreadable(path, number, error) from error
+            text = f"{path}: damaged ({error}); remove the block's files and run the same command again"
+            raise DataError(text) from error
 
     def bytes(self, kind: str) -> int:
         """Return the size of all complete files of a pass."""
@@ -159,13 +166,6 @@ class BlockStore:
     def remove(self) -> None:
         """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _unreadable(path: Path, number: int, error: Exception) -> DataError:
-    """Return the error for a result that cannot be read (zipfile, zlib and numpy raise many types)."""
-    if isinstance(error, FileNotFoundError):
-        return DataError(f"{path}: block {number} is missing; remove its other files and run its shard again")
-    return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
 
 def differences(place: Path, settings: dict[str, Any]) -> str:

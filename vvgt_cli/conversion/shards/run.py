@@ -22,8 +22,7 @@ from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
-from vvgt_cli.conversion.shards.cut import Cut, cut_of
-from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
+from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin

@@ -1,0 +1,263 @@
+"""Pictures in files: OpenEXR (premultiplied float RGBA, with the camera in the header), 8-bit PNG, and view sets."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import asdict
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.cameras.files import read_frames
+from vvgt_cli.cameras.types import Camera
+from vvgt_cli.errors import DataError
+from vvgt_cli.files import atomic_write
+
+SUFFIXES = (".exr", ".png")  # the first that exists is read
+
+
+def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[list[Camera], np.ndarray]:
+    """Read cameras and images of ``transforms_SPLIT.json`` in a folder written by `vvgt render-views`.
+
+    EXR is preferred to PNG, whose 8 bits round colours and alpha.
+
+    Args:
+        directory: the folder.
+        split: ``train`` or ``test``.
+
+    Returns:
+        (cameras, images): n cameras in the unit frame, and (n, h, w, 4) float32 premultiplied RGBA.
+
+    Raises:
+        DataError: there is no such split, an image is missing, damaged or not of its camera's size, or sizes differ.
+    """
+    folder = Path(directory)
+    path = folder / f"transforms_{split}.json"
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected a folder that 'vvgt render-views' wrote")
+    frames = read_frames(path)
+    cameras = [frame.camera for frame in frames]
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        shown = ", ".join(f"{width} x {height}" for width, height in sizes[:4])
+        raise DataError(f"{path}: views of {len(sizes)} sizes ({shown}); expected one")
+    width, height = sizes[0]
+    images = np.empty((len(frames), height, width, 4), np.float32)
+    for image, frame in zip(images, frames, strict=True):
+        read = read_view(folder / frame.file_path)
+        if read.shape != image.shape:
+            raise DataError(
+                f"{folder / frame.file_path}: {read.shape[1]} x {read.shape[0]} px; expected {width} x {height}, as in "
+                f"{path.name}"
+            )
+        image[:] = read
+    return cameras, images
+
+
+def read_view(path: str | PathLike[str]) -> np.ndarray:
+    """Read the image at ``path`` (with or without a suffix), EXR or else PNG: (h, w, 4) float32 premultiplied.
+
+    Raises:
+        DataError: the image is missing or damaged.
+    """
+    stem = Path(path)
+    if stem.suffix in SUFFIXES:
+        stem = stem.with_suffix("")
+    for suffix in SUFFIXES:
+        file = stem.with_name(stem.name + suffix)
+        if file.is_file():
+            image = read_exr(file)[0] if suffix == ".exr" else read_png(file)
+            opaque = np.ones_like(image[..., :1])
+            return image if image.shape[2] == 4 else np.concatenate([image, opaque], axis=-1)
+    raise DataError(f"{stem}: no such image; expected {' or '.join(stem.name + suffix for suffix in SUFFIXES)}")
+
+
+CAMERA_ATTRIBUTE = "vvgt.camera"  # a JSON string, because EXR's matrix attributes are only float32
+CHANNELS = ("R", "G", "B", "A")
+
+
+def write_exr(
+    path: str | PathLike[str],
+    rgba: np.ndarray,
+    *,
+    half: bool = False,
+    camera: Camera | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write channels R, G, B, A, ZIP-compressed; float32 values are preserved exactly.
+
+    Args:
+        path: the file, which is written atomically.
+        rgba: (h, w, 4) premultiplied.
+        half: write 16-bit floats.
+        camera: camera for the header attribute ``vvgt.camera``: a JSON object with ``rotation`` (3 x 3,
+            world to camera, OpenCV axes), ``translation`` (3), ``fx fy cx cy`` (pixels), ``width height name``.
+        overwrite: replace an existing file.
+
+    Raises:
+        DataError: the shape is wrong, the camera has another size, or the file cannot be written.
+        UsageError: the file exists and ``overwrite`` is not set.
+    """
+    import OpenEXR
+
+    pixels = np.ascontiguousarray(rgba, dtype=np.float16 if half else np.float32)
+    if pixels.ndim != 3 or pixels.shape[2] != 4 or 0 in pixels.shape:
+        raise DataError(f"image of shape {pixels.shape}; expected (height, width, 4)")
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if camera is not None:
+        if (camera.height, camera.width) != pixels.shape[:2]:
+            raise DataError(
+                f"camera {camera.name} is {camera.width} x {camera.height} px, the image "
+                f"{pixels.shape[1]} x {pixels.shape[0]}; expected the same"
+            )
+        header[CAMERA_ATTRIBUTE] = json.dumps(asdict(camera), default=lambda array: array.tolist())
+    with atomic_write(path, overwrite) as temporary:
+        try:
+            OpenEXR.File(header, {"RGBA": pixels}).write(str(temporary))
+        except RuntimeError as error:
+            raise DataError(f"{path}: cannot be written ({error})") from error
+
+
+def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
+    """Read channels R, G, B, A (opaque if A is missing) and the camera, if the header has one.
+
+    Returns:
+        (rgba, camera): (h, w, 4) premultiplied float32, and the camera or None.
+
+    Raises:
+        DataError: the file is not an EXR image or has more than 2^28 pixels, channels are missing or subsampled, or the
+            camera is not valid.
+    """
+    import OpenEXR
+
+    if not Path(path).is_file():
+        raise DataError(f"{path}: no such file; expected an EXR image")
+    try:
+        header = OpenEXR.File(str(path), header_only=True).header()
+        low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
+        width, height = (int(n) for n in high - low + 1)
+        check_pixels(path, width, height)
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: not a readable EXR image ({error}); expected channels R, G, B, A") from error
+    missing = [name for name in CHANNELS[:3] if name not in channels]
+    if missing:
+        raise DataError(f"{path}: channels {', '.join(sorted(channels))}; expected R, G, B, A")
+    rgba = np.ones((height, width, 4), dtype=np.float32)
+    for i, name in enumerate(CHANNELS):
+        if name in channels:
+            plane = channels[name].pixels
+            if plane is None or plane.shape != (height, width):
+                raise DataError(f"{path}: channel {name} is subsampled; expected {width} x {height} samples")
+            rgba[..., i] = plane
+    return rgba, _camera_of(header.get(CAMERA_ATTRIBUTE), path)
+
+
+def _camera_of(text: Any, path: str | PathLike[str]) -> Camera | None:
+    """Parse the camera of a header attribute, None if there is none."""
+    if text is None:
+        return None
+    try:
+        return Camera(**json.loads(text))
+    except (TypeError, ValueError, KeyError, RecursionError) as error:
+        raise DataError(f"{path}: header attribute {CAMERA_ATTRIBUTE}; expected a camera ({error})") from error
+
+
+MAX_PIXELS = 2**28  # 16384 x 16384, because a damaged header may claim anything
+MAX_PIXELS_PER_BYTE = 2**14  # more than deflate can reach for one-bit pixels
+
+
+def check_pixels(path: str | PathLike[str], width: int, height: int) -> None:
+    """Raise DataError if an image is too large for its file, or larger than 2^28 pixels."""
+    size = Path(path).stat().st_size
+    if width < 1 or height < 1 or width * height > min(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size):
+        raise DataError(f"{path}: claims {width} x {height} pixels in {size} bytes; expected a whole image, up to 2^28")
+
+
+def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = False) -> None:
+    """Write an image as 8-bit PNG; no gamma is applied.
+
+    Args:
+        path: the file, which is written atomically.
+        image: (h, w, 3) RGB or (h, w, 4) *premultiplied* RGBA, in [0, 1] (clipped; NaN becomes 0). PNG stores
+            straight alpha, so colours are divided by alpha.
+        overwrite: replace an existing file.
+
+    Raises:
+        DataError: the shape is wrong, or the file cannot be written.
+        UsageError: the file exists and ``overwrite`` is not set.
+    """
+    import OpenImageIO as oiio
+
+    pixels = _bytes(image)
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # alpha is straight already: the writer must not divide again
+    spec.attribute("oiio:ColorSpace", "sRGB")
+    spec.attribute("png:compressionLevel", 3)
+    with atomic_write(path, overwrite) as temporary:
+        output = oiio.ImageOutput.create("png")
+        if output is None or not output.open(str(temporary), spec):
+            raise DataError(f"{path}: cannot be written ({output.geterror() if output else oiio.geterror()})")
+        written = output.write_image(pixels)
+        if not (output.close() and written):
+            raise DataError(f"{path}: cannot be written ({output.geterror()})")
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """Encode an image as PNG in memory, for notebooks and browsers; see `write_png`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.png"
+        write_png(path, image)
+        return path.read_bytes()
+
+
+def read_png(path: str | PathLike[str]) -> np.ndarray:
+    """Read a PNG: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA, float32 in [0, 1].
+
+    Grey images are returned as RGB(A). Division and multiplication by alpha are exact to half an 8-bit step.
+
+    Raises:
+        DataError: the file is not a PNG, or larger than 2^28 pixels.
+    """
+    import OpenImageIO as oiio
+
+    if not Path(path).is_file():
+        raise DataError(f"{path}: no such file; expected a PNG image")
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise DataError(f"{path}: not an image ({oiio.geterror().splitlines()[0]}); expected a PNG")
+    try:
+        spec, kind = source.spec(), source.format_name()
+        if kind != "png":
+            raise DataError(f"{path}: an image of format {kind}; expected a PNG")
+        check_pixels(path, spec.width, spec.height)
+        pixels = source.read_image(oiio.FLOAT)
+        if pixels is None:
+            raise DataError(f"{path}: damaged PNG ({source.geterror().strip()}); expected a complete one")
+    finally:
+        source.close()
+    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    if spec.nchannels <= 2:
+        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=-1), pixels[..., 1:]], axis=-1)
+    if pixels.shape[-1] == 4:
+        pixels[..., :3] *= pixels[..., 3:]
+    return pixels
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    """Convert an image to (h, w, 3 or 4) uint8 with straight alpha."""
+    image = np.asarray(image, dtype=np.float32)
+    if image.ndim != 3 or image.shape[2] not in (3, 4) or 0 in image.shape:
+        raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
+    image = np.clip(np.nan_to_num(image, nan=0.0), 0, 1)
+    if image.shape[2] == 4:
+        alpha = image[..., 3:]
+        straight = np.divide(image[..., :3], alpha, out=np.zeros_like(image[..., :3]), where=alpha > 0)
+        image = np.concatenate([np.minimum(straight, 1), alpha], axis=-1)
+    return np.ascontiguousarray(np.rint(image * 255).astype(np.uint8))
