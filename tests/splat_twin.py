@@ -9,8 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import NEAR
-from vvgt_cli.gaussians.frames import rotations
-from vvgt_cli.gaussians.harmonics import basis, directions, term_slopes, view_colors
+from vvgt_cli.gaussians.frames import basis, directions, rotations, term_slopes, view_colors
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat.reference import covariances, drawn_opacity, layers, project, weights

@@ -12,7 +12,7 @@ from vvgt_cli.closed_form.lit import at_points, even, highlights, mean_normals, 
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.reference import normals
-from vvgt_cli.gaussians.harmonics import basis, view_colors
+from vvgt_cli.gaussians.frames import basis, view_colors
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.volume import Volume
 

@@ -13,7 +13,7 @@ from vvgt_cli.closed_form import fit
 from vvgt_cli.closed_form import fit as fit_module
 from vvgt_cli.closed_form.fit import BRIGHTEST, solve_colors
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.harmonics import basis, directions
+from vvgt_cli.gaussians.frames import basis, directions
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import project, render
 

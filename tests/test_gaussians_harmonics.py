@@ -16,12 +16,16 @@ from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.conversion.stages.refinement import without_undrawn
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, describe, in_unit_frame, read_ply, write_ply
-from vvgt_cli.gaussians.frames import UP_NAMES, rescale, transform, turn, up_matrix
-from vvgt_cli.gaussians.harmonics import (
+from vvgt_cli.gaussians.frames import (
+    UP_NAMES,
     basis,
     directions,
     mixing,
+    rescale,
+    transform,
+    turn,
     turned,
+    up_matrix,
     view_colors,
 )
 from vvgt_cli.gaussians.types import HARMONICS

@@ -17,8 +17,7 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
-from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
-from vvgt_cli.gaussians.harmonics import basis, view_colors
+from vvgt_cli.gaussians.frames import basis, rotations, turn, up_matrix, view_colors
 from vvgt_cli.gaussians.live import MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
 from vvgt_cli.gaussians.live_facts import AXIS
 from vvgt_cli.look.lighting import Lighting, LightOptions

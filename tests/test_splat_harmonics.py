@@ -10,8 +10,7 @@ import pytest
 from tests.random_clouds import random_cloud
 from tests.splat_twin import render_backward_reference, view_slopes
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.gaussians.frames import rotations
-from vvgt_cli.gaussians.harmonics import view_colors
+from vvgt_cli.gaussians.frames import rotations, view_colors
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat import project, render, render_backward, render_reference
 from vvgt_cli.splat.reference import layers

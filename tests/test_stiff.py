@@ -37,7 +37,7 @@ from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.dvr import RenderSettings, render_view, render_views
-from vvgt_cli.gaussians.harmonics import view_colors
+from vvgt_cli.gaussians.frames import view_colors
 from vvgt_cli.look import PiecewiseOpacity
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import build_tables, extinction

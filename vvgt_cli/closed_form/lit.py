@@ -22,8 +22,7 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.frames import rotations
-from vvgt_cli.gaussians.harmonics import C2, basis
+from vvgt_cli.gaussians.frames import C2, basis, rotations
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations

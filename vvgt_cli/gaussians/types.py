@@ -24,7 +24,7 @@ class Gaussians:
         opacity_logits: (K,) logit of the peak alpha.
         colors: (K, 3) RGB in display space, 0.5 + SH_C0 * f_dc; may lie outside [0, 1].
         harmonics: (K, M, 3) view-dependent RGB, added to the colour by direction from the eye to the centre, as M = 3,
-            8 or 15 coefficients in the order of `vvgt_cli.gaussians.harmonics.basis`; None for none.
+            8 or 15 coefficients in the order of `vvgt_cli.gaussians.frames.basis`; None for none.
         live: (K, 9) carried values, for a look under any function (`vvgt_cli.gaussians.live`): mean and spread of the
             data value, length in the unit frame, axis of the normals with their concentration as its length, and
             gradient direction with the share of the spread that it explains as its length; (K, 10) for a label map,

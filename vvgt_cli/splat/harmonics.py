@@ -1,4 +1,4 @@
-"""Numba kernels of colours that depend on the view. Twin: `vvgt_cli.gaussians.harmonics`.
+"""Numba kernels of colours that depend on the view. Twin: `vvgt_cli.gaussians.frames`.
 
 Of K Gaussians, float32: ``means`` (K, 3), ``colors`` (K, 3), ``harmonics`` (K, M, 3), M = 3, 8 or 15; ``eye`` (3,)
 float64. Sums are float64 and rounded once.
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from vvgt_cli.gaussians.harmonics import term_slopes, terms
+from vvgt_cli.gaussians.frames import term_slopes, terms
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 

@@ -10,7 +10,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import NEAR
 from vvgt_cli.gaussians.frames import rotations as rotations
-from vvgt_cli.gaussians.harmonics import view_colors
+from vvgt_cli.gaussians.frames import view_colors
 from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
