@@ -20,14 +20,13 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
-from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
+from vvgt_cli.conversion.plan import FEWEST_STEPS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
 from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
-from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks, Pass
@@ -141,7 +140,7 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     """Return the refiner of a request's steps, as many as there is time for; None for no steps."""
     fit, limits = request.fit, request.limits
     ended = limits.target_psnr is not None or limits.time_budget is not None
-    steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
+    steps = fit.most_steps(ended)
     degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
     chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
     if chosen.is_file():
