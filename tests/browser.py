@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,6 +70,17 @@ def shoot(
     run = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert run.returncode == 0, run.stderr
     return [read_png(path)[..., :3] for path in outputs]
+
+
+def page_picture(url: str, folder: Path, size: int, **job: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """Picture (size, size, 3) where a page begins, after what ``job`` does, and what the browser noted: `page.mjs`."""
+    job = {"browser": browser(), "url": url, "size": size, "camera": None, "frame": None} | job
+    out, jobs = folder / "page.png", folder / "page.json"
+    jobs.write_text(json.dumps(job | {"out": str(out)}))
+    command = ["node", str(PAGES / "page.mjs"), str(jobs), str(packages())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    return read_png(out)[..., :3], json.loads(done.stdout.splitlines()[-1])
 
 
 def _pose(camera: Camera) -> dict[str, object]:

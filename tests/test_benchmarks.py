@@ -182,6 +182,23 @@ def test_live(bench, scenes, tmp_path):
     assert min(float(row[look]) for row in rows for look in ("live", "closed form")) > 15
 
 
+def test_grey(bench, scenes, tmp_path, monkeypatch):
+    """A page that draws as the command does, by as many presses of k."""
+    module = bench("grey")
+
+    def page_picture(url, folder, size, actions):
+        rule = module.RULES[len(actions) - 1]
+        return read_png(folder / f"blob-{rule}-{size}.command.png")[..., :3], {}
+
+    monkeypatch.setattr(module, "page_picture", page_picture)
+    options = ("--gaussians", 500, "--size", SIZE, "--pictures", tmp_path / "pictures")
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", *options)
+    rows = rows_of(tmp_path / "a.csv")
+    assert [row["rule"] for row in rows] == ["mip", "xray"]
+    assert all(20 < float(row["command"]) == float(row["page"]) < float(row["agreement"]) for row in rows)
+    assert "| mip |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
 def test_live_page(bench, scenes, tmp_path):
     module = bench("live_page")
     call(module.main, *scenes, "-o", tmp_path / "a.csv", "--scene", "blob", "--gaussians", 200, "--rounds", 1)

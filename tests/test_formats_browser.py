@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import PAGES, browser, packages
+from browser import page_picture
 
 from tests.test_formats_server import shown
 from vvgt_cli.cameras import orbit_views
@@ -22,7 +21,6 @@ from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.gaussians.formats.page_file import policy
-from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import render
 
@@ -32,18 +30,10 @@ pytestmark = pytest.mark.long
 
 def shoot(url: str, folder: Path, frame: int | None = None, before: str = "") -> tuple[np.ndarray, dict[str, Any]]:
     """Picture (SIZE, SIZE, 3) where the page begins, and what the browser noted."""
-    job = {
-        "browser": browser(), "url": url, "size": SIZE, "camera": None, "frame": frame, "before": before,
-        "out": str(folder / "a.png"),
-    }  # fmt: skip
-    (folder / "job.json").write_text(json.dumps(job))
-    command = ["node", str(PAGES / "page.mjs"), str(folder / "job.json"), str(packages())]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
-    assert done.returncode == 0, done.stderr
-    noted = json.loads(done.stdout.splitlines()[-1])
+    picture, noted = page_picture(url, folder, SIZE, frame=frame, before=before)
     assert noted["asked"] == []
     assert noted["text"] == ""
-    return read_png(folder / "a.png")[..., :3], noted
+    return picture, noted
 
 
 @pytest.fixture(scope="module")

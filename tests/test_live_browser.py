@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import PAGES, browser, packages
+from browser import page_picture
 from test_live_layers import pair  # noqa: F401
 
 from vvgt_cli.cameras import orbit_views
@@ -34,16 +33,8 @@ def after(
     page = file.with_suffix(".html")
     if not page.exists():
         assert run(["view", str(file), "-o", str(page), "--quiet"]) == 0
-    job = {
-        "browser": browser(), "url": page.as_uri(), "size": SIZE, "camera": None, "frame": None,
-        "before": before,
-        "actions": actions, "window": window, "look": str(folder / "look.png"), "out": str(folder / "a.png"),
-    }  # fmt: skip
-    (folder / "job.json").write_text(json.dumps(job))
-    command = ["node", str(PAGES / "page.mjs"), str(folder / "job.json"), str(packages())]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
-    assert done.returncode == 0, done.stderr
-    return read_png(folder / "a.png")[..., :3]
+    job = {"before": before, "actions": actions, "window": window, "look": str(folder / "look.png")}
+    return page_picture(page.as_uri(), folder, SIZE, **job)[0]
 
 
 def ours(file: Path, folder: Path, *look: str) -> np.ndarray:

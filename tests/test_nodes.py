@@ -249,11 +249,17 @@ def test_slicers_terms_are_groups(tmp_path) -> None:
     assert (label.parents, label.codes) == (labels[1].parents, labels[1].codes)
 
 
-def test_a_label_that_itk_snap_switches_off_is_there_switched_off(vvgt, atlas) -> None:
+def test_a_label_that_itk_snap_switches_off_is_there_switched_off(vvgt, atlas, recwarn) -> None:
     rows = [f'{number} 10 20 30 0.5 {int(number != 16)} 1 "part {number}"' for number in sorted(CENTRES)]
     (atlas / "t.label").write_text("\n".join(rows) + "\n")
     line = ("convert", "aseg.nii", "--labels", "t.label", *SMALL)
     assert vvgt(*line, "-o", "a_{}.spz").code == 0
+    assert [str(one.message) for one in recwarn if "hides" in str(one.message)] == []  # it is in its file
+    with pytest.warns(UserWarning, match=r"t.label hides 1 of its labels \(opacity 0\): 16 \(part 16\)"):
+        assert vvgt(*line[:-1], "-o", "a.ply").code == 0
+    (atlas / "u.label").write_text((atlas / "t.label").read_text().replace('0.5 1 1 "part 53', '0 1 1 "part 53'))
+    with pytest.warns(UserWarning, match=r"u.label hides 1 of its labels \(opacity 0\): 53 \(part 53\)"):
+        assert vvgt(*line[:3], "u.label", *SMALL, "-o", "b_{}.spz").code == 0
     index = {row["label"]: row for row in json.loads((atlas / "a_index.json").read_text())["files"]}
     assert index[16]["visible"] is False
     assert index[16]["opacity"] == 0.5

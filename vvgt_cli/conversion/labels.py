@@ -23,10 +23,12 @@ from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.layered import AUTO, IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
+from vvgt_cli.field.layered import NONE as NO_LABELS
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
@@ -160,23 +162,23 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
         return [Part(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
-    maps = layers_of(content, None, labels, distance=source.unit_distance)
+    read = read_labels(labels) if isinstance(labels, str) and labels not in (AUTO, NO_LABELS) else labels
+    maps = layers_of(content, None, read, distance=source.unit_distance)
     tables += [one.tf.name for one in maps]
     if not layer:
         check_labels([one.tf for one in maps])
     shown = []
     for whole_map in maps:
-        extents = extents_of(whole_map.volume)
-        for label in whole_map.tf.labels if isinstance(whole_map.tf, LabelTable) else ():
+        volume, table, extents = whole_map.volume, whole_map.tf, extents_of(whole_map.volume)
+        assert isinstance(table, LabelTable)
+        for label in table.warned(extents, volume.name, split=True).labels:
             extent = extents.get(float(label.number))
             if label.shown_opacity > 0 and extent is not None:
-                shown.append((whole_map, label, extent))
-    numbers = [label.number for _, label, _ in shown]
+                shown.append((volume, table, label, extent))
+    numbers = [label.number for *_, label, _ in shown]
     found: list[Part] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
-    for (whole_map, label, extent), share in zip(shown, divided, strict=True):
-        volume, table = whole_map.volume, whole_map.tf
-        assert isinstance(table, LabelTable)
+    for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
         again = numbers.count(label.number) > 1  # of segments that overlap
         stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -136,10 +136,13 @@ class LabelTable:
             )
         return replace(self, labels=tuple(known[n] for n in numbers if n in known))
 
-    def warned(self, numbers: Sequence[int], where: str) -> LabelTable:
-        """Return the table; warn about labels of the volume, ``numbers``, that it hides (0 aside)."""
-        there = {*numbers} - {0}
-        if hidden := [f"{e.number} ({e.name})" for e in self.labels if e.number in there and not e.opacity]:
+    def warned(self, numbers: Collection[float], where: str, split: bool = False) -> LabelTable:
+        """Return the table; warn about labels of the volume, ``numbers``, that it hides (0 aside).
+
+        With ``split``, labels that are only switched off are not hidden.
+        """
+        opacity = {e: e.shown_opacity if split else e.opacity for e in self.labels if e.number in numbers and e.number}
+        if hidden := [f"{e.number} ({e.name})" for e in opacity if not opacity[e]]:
             shown = ", ".join(hidden[:LISTED]) + (", ..." if len(hidden) > LISTED else "")
             warnings.warn(f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {shown}", stacklevel=2)
         return self
