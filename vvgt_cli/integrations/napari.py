@@ -1,7 +1,8 @@
 """Save Selected Layers as Gaussian splats in napari: image and labels layers, in their colours and places.
 
 Image layers have the opacity of their colour map; where it has none, of their intensity within the contrast limits,
-with gamma, as napari's views by maximum or sum have no other. Several layers are drawn together, and a first axis of four is time.
+with gamma, as napari's views by maximum or sum have no other. Several layers are drawn together, and a first axis of
+four is time.
 
 Tried: napari 0.9.2
 Enable:
