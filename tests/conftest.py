@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -79,6 +81,18 @@ def whole_march() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MARCH, 128)
         yield
+
+
+@pytest.fixture(scope="session")
+def display() -> Iterator[str]:
+    """Start an X server without a screen, for programs that want a window; yield its name."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("Xvfb is not on the path (Debian: xvfb)")
+    words = ["Xvfb", "-noreset", "-displayfd", "1", "-screen", "0", "1280x1024x24"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        yield f":{server.stdout.readline().decode().strip()}"
+        server.terminate()
 
 
 @dataclass

@@ -51,5 +51,6 @@ camera.Azimuth(40)
 camera.Elevation(25)
 Render()
 SaveScreenshot(picture, view, ImageResolution=[300, 300])
-print("up", *view.CameraViewUp)
+sys.stdout.write(f"up {' '.join(map(str, view.CameraViewUp))}\n")  # at once, as other ranks do
+sys.stdout.flush()
 SaveData(name, data, **{key: value for key, value in values.items() if "." not in key})

@@ -6,9 +6,11 @@ PYTHON slicer_scene.py FOLDER: needs VVGT, the words that start vvgt; leaves fil
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import slicer
@@ -167,6 +169,20 @@ for (name, part), rgb in zip(parts.items(), ((0.2, 0.4, 0.6), (0.9, 0.3, 0.1), (
 segments.GetDisplayNode().SetSegmentVisibility("air", False)
 convert("segments", None, segments)
 convert("both", volume, segments)
+
+# the module's logic, with stand-ins for what slicer-core lacks: Qt, CTK, and the base classes on them
+base = ModuleType("slicer.ScriptedLoadableModule")
+for kind in ("", "Logic", "Widget"):
+    setattr(base, f"ScriptedLoadableModule{kind}", object)
+sys.modules |= {"ctk": ModuleType("ctk"), "qt": ModuleType("qt"), base.__name__: base}
+part = SimpleNamespace(renderWindow=lambda: window)
+slicer.app = SimpleNamespace(
+    layoutManager=lambda: SimpleNamespace(
+        threeDViewCount=1, threeDWidget=lambda _: SimpleNamespace(threeDView=lambda: part)
+    )
+)
+module = runpy.run_path(str(ADAPTER.parent / "slicer" / "GaussianSplats.py"))
+facts["logic"] = module["GaussianSplatsLogic"]().convert(volume, segments, str(FOLDER / "logic.ply"), options=FAST)
 
 # a region of interest: half of the ball
 roi = added(scene, "vtkMRMLMarkupsROINode", "roi")

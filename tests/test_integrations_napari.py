@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -12,7 +14,11 @@ import pytest
 
 import vvgt_cli
 from tests.test_integrations_slicer import heaviest
+from tests.vtk_scenes import camera_at, psnr
+from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.splat import render
 
 ROOT = Path(__file__).parents[1]
 MANIFEST = ROOT / "vvgt_cli" / "integrations" / "napari.yaml"
@@ -152,3 +158,22 @@ def test_layers_apart_are_whole_and_unlit(viewer, tmp_path) -> None:
     away = np.linalg.norm(gaussians.means / header.scale + header.centre - world, axis=1)
     assert (away < 2).any()
     assert header.light is None
+
+
+@pytest.mark.long
+def test_the_picture_is_naparis_own(viewer, display, tmp_path) -> None:
+    """Of a colour map with opacity of its own; napari shows depth the other way round, and its window says so."""
+    words = [sys.executable, ROOT / "tests" / "napari_scene.py", tmp_path]
+    more = {"DISPLAY": display, "QT_QPA_PLATFORM": "xcb", "PYTHONPATH": str(ROOT), "HOME": str(tmp_path)}
+    done = subprocess.run(words, env=os.environ | more, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    facts, theirs = json.loads((tmp_path / "facts.json").read_text()), np.load(tmp_path / "napari.npy")
+    gaussians, header = open_gaussians(str(tmp_path / "a.splats.ply"))
+    camera = camera_at(facts["eye"], facts["at"], facts["up"], facts["angle"], header, len(theirs))
+    found = psnr(render(gaussians, camera, INRIA)[:, ::-1], theirs)
+    print(f"napari's translucent rendering against our Gaussians: {found:.1f} dB")
+    assert found > 40
+    assert header.affine is not None
+    assert np.reshape(header.affine, (3, 4)) @ (14, 22, 17, 1) == pytest.approx(facts["at"], abs=0.01)
+    side = "the side of depth (towards you in napari's 3D view, which is a mirror image of x, y, z)"
+    assert facts["said"] == [f"not taken from the layers: {side}"]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -28,6 +28,7 @@ ROOT = Path(__file__).parent.parent
 ROOM = ROOT / "vvgt_cli" / "integrations"
 STARTS = f"env PYTHONPATH={ROOT} NUMBA_NUM_THREADS=1 {sys.executable} -m vvgt_cli.cli.main"
 SYSTEM = "/usr/bin/python3"
+MPI = ("mpirun", "--allow-run-as-root", "--oversubscribe", "--mca", "mpi_yield_when_idle", "1", "-n", "2")
 FEW = ("MaximumGaussians=10000", "Steps=40")
 
 
@@ -48,25 +49,15 @@ def run(*words: Any, **more: str) -> str:
     return done.stdout + done.stderr
 
 
-@pytest.fixture(scope="module")
-def display() -> Iterator[str]:
-    """Start an X server without a screen; ParaView of Debian wants one."""
-    found("pvpython", "Xvfb")
-    with subprocess.Popen(
-        ["Xvfb", "-noreset", "-displayfd", "1", "-screen", "0", "640x480x24"], stdout=subprocess.PIPE
-    ) as server:
-        assert server.stdout is not None
-        yield f":{server.stdout.readline().decode().strip()}"
-        server.terminate()
-
-
-def paraview(display: str, volume: Path, name: Path, *given: str) -> tuple[np.ndarray, str]:
+def paraview(
+    display: str, volume: Path, name: Path, *given: str, by: tuple[str, ...] = ("pvpython",), **more: str
+) -> tuple[np.ndarray, str]:
     """Show a volume in ParaView and save it; return ParaView's picture and what it printed."""
     from PIL import Image
 
+    found("pvpython")
     picture, script = name.with_name("view.png"), ROOT / "tests" / "paraview_script.py"
-    words = ("pvpython", script, ROOM / "paraview_plugin.py", volume, picture, name, *given)
-    said = run(*words, DISPLAY=display)
+    said = run(*by, script, ROOM / "paraview_plugin.py", volume, picture, name, *given, DISPLAY=display, **more)
     return np.asarray(Image.open(picture).convert("RGB")), said
 
 
@@ -79,6 +70,15 @@ def volume_file(path: Path, width: float = 4.0) -> Path:
     writer.SetInputData(lump(width))
     assert writer.Write()
     return path
+
+
+def series_file(folder: Path) -> Path:
+    """Write lumps of three time steps and their .pvd."""
+    files = [volume_file(folder / f"lump_{k}.vti", 2.0 + k) for k in range(3)]
+    sets = "".join(f'<DataSet timestep="{2.5 * k}" file="{file.name}"/>' for k, file in enumerate(files))
+    index = folder / "lump.pvd"
+    index.write_text(f'<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>')
+    return index
 
 
 def ours(path: Path, said: str) -> np.ndarray:
@@ -188,12 +188,10 @@ def test_beside_paraviews_own_picture(
 @pytest.mark.long
 def test_all_time_steps_are_frames_of_one_page(display: str, tmp_path: Path) -> None:
     """Shown at their times; under one function."""
-    files = [volume_file(tmp_path / f"lump_{k}.vti", 2.0 + k) for k in range(3)]
-    sets = "".join(f'<DataSet timestep="{2.5 * k}" file="{file.name}"/>' for k, file in enumerate(files))
-    index = tmp_path / "lump.pvd"
-    index.write_text(f'<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>')
     page = tmp_path / "a.splat.html"
-    _, said = paraview(display, index, page, "MaximumGaussians=2000", "Steps=0", "WriteTimeSteps=1", "Light=2")
+    _, said = paraview(
+        display, series_file(tmp_path), page, "MaximumGaussians=2000", "Steps=0", "WriteTimeSteps=1", "Light=2"
+    )
     text = page.read_text()
     assert len(re.findall('id="splats-[0-9]+"', text)) == 3, said
     assert re.search('"name": "[^"]*2.5[^"]*"', text)
@@ -208,15 +206,34 @@ def test_an_error_is_one_line(display: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_two_ranks_leave_one_file_a_time_step(tmp_path: Path) -> None:
+def test_two_ranks_of_pvbatch_save_a_file_a_time_step(display: str, tmp_path: Path) -> None:
+    """Each its own block, by `SaveData`; beside ParaView's picture of the first step."""
+    found("mpirun", "pvbatch")
+    starts, heard = tmp_path / "vvgt", tmp_path / "commands"
+    starts.write_text(f'#!/bin/sh\ntee -a {heard} | {STARTS} "$@"\n')
+    starts.chmod(0o755)
+    given = ("MaximumGaussians=10000", "WriteTimeSteps=1")
+    ranks, index = (*MPI, "pvbatch", "--symmetric"), series_file(tmp_path)
+    theirs, said = paraview(display, index, tmp_path / "a.splats.ply", *given, by=ranks, VVGT=str(starts))
+    assert sorted(path.name for path in tmp_path.glob("*.ply")) == [f"a_{k:04d}.splats.ply" for k in range(3)], said
+    commands = [json.loads(line) for line in heard.read_text().splitlines()]
+    shares = [words[words.index("--shard") + 1] for words in commands if words[0] == "init"]
+    assert sorted(shares) == ["1/2"] * 6 + ["2/2"] * 6  # two passes a step
+    measured = psnr(ours(tmp_path / "a_0000.splats.ply", said), theirs)
+    print(f"two ranks: {measured:.1f} dB")
+    assert measured > 40
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("program", [(SYSTEM,), ("pvbatch", "--symmetric")], ids=["python", "pvbatch"])
+def test_two_ranks_leave_one_file_a_time_step(program: tuple[str, ...], tmp_path: Path) -> None:
     """Each hands over its slab; the file is that of the whole volume, wherever the slabs meet."""
-    found("mpirun")
+    found("mpirun", program[0])
     if subprocess.run([SYSTEM, "-c", "import mpi4py, paraview.catalyst"], capture_output=True).returncode:
         pytest.skip(f"{SYSTEM} has no paraview or no mpi4py (Debian: python3-paraview, python3-mpi4py)")
     script = ROOT / "tests" / "catalyst_simulation.py"
     settings = {"VVGT_OUTPUT": str(tmp_path / "dye_{:02d}.ply"), "VVGT_TF": "viridis", "VVGT_GAUSSIANS": "3000"}
-    mpi = ("mpirun", "--allow-run-as-root", "--oversubscribe", "--mca", "mpi_yield_when_idle", "1", "-n", "2")
-    said = run(*mpi, SYSTEM, script, ROOM / "catalyst.py", 2, 40, tmp_path / "whole.vti", **settings)
+    said = run(*MPI, *program, script, ROOM / "catalyst.py", 2, 40, tmp_path / "whole.vti", **settings)
     print(re.search("simulation .*", said))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dye_00.ply", "dye_01.ply", "whole.vti"]
     words = ["init", str(tmp_path / "whole.vti"), "-o", str(tmp_path / "one.ply"), "--tf", "viridis", "--quiet"]

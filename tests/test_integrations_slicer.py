@@ -131,6 +131,15 @@ def test_segments_keep_names_and_colours_and_hidden_ones_are_left(scene) -> None
 
 
 @pytest.mark.long
+def test_the_modules_logic_takes_nodes_and_the_first_view(scene) -> None:
+    folder, facts = scene
+    assert facts["logic"] == []
+    header = read_ply(folder / "logic.ply")[1]
+    assert header.camera == pytest.approx((*facts["eye"], *facts["at"][:3], facts["angle"]))
+    assert header.count > 1000
+
+
+@pytest.mark.long
 def test_a_region_of_interest_hides_what_is_outside(scene) -> None:
     folder, facts = scene
     gaussians, header = open_gaussians(str(folder / "cropped.ply"))

@@ -1,7 +1,8 @@
 """Save Selected Layers as Gaussian splats in napari: image and labels layers, in their colours and places.
 
-Image layers have the opacity of their intensity within the contrast limits, with gamma: napari's views by maximum or
-sum have no other. Several layers are drawn together, and a first axis of four is time.
+Image layers have the opacity of their colour map; where it has none, of their intensity within the contrast limits,
+with gamma, as napari's views by maximum or sum have no other. Several layers are drawn together, and a first axis of
+four is time.
 
 Tried: napari 0.9.2
 Enable:
@@ -17,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from napari import current_viewer
 from napari.layers import Layer
+from napari.utils.notifications import show_warning
 
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.errors import UsageError
@@ -26,13 +29,14 @@ from vvgt_cli.integrations.layers import together
 from vvgt_cli.library.functions import read_volume
 from vvgt_cli.library.inputs import Look
 
-NODES = 33  # of a colour map, which napari interpolates between 256 colours
+NODES = 256  # of a colour map, which may have steps
+STEP = 0.8  # voxels between samples of napari's translucent rendering
 
 
 def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[str]:
     """Write the visible layers among ``layers`` (data, attributes, kind) to a page or file; return its path.
 
-    One warning names what is drawn otherwise.
+    One warning names what is drawn otherwise, in the window where there is one.
 
     Raises:
         UsageError: none is visible, or one has no three axes in space; napari passes over a ValueError.
@@ -43,8 +47,13 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
         raise UsageError("no visible layer; show one of those that are saved")
     steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
     lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer))]
-    if lost:
+    window = current_viewer()
+    if window is not None and str(window.camera.handedness) == "right":  # by napari's order of axes, z y x
+        lost.append("the side of depth (towards you in napari's 3D view, which is a mirror image of x, y, z)")
+    if lost and window is None:
         warnings.warn(f"not taken from the layers: {'; '.join(lost)}", stacklevel=2)
+    elif lost:  # its dialog keeps Python's warnings to itself
+        show_warning(f"not taken from the layers: {'; '.join(lost)}")
     found = [_converted(shown, step) for step in range(steps)]
     if steps == 1:
         found[0].save(path)
@@ -61,7 +70,8 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
 
 def _converted(layers: Sequence[Any], step: int) -> Any:
     """Convert a time step of all layers, unlit: napari's views of images have no light."""
-    return together([(Content((_volume(layer, step),)), _look(layer)) for layer in layers], "none")
+    volumes = [_volume(layer, step) for layer in layers]
+    return together([(Content((v,)), _look(layer, v)) for layer, v in zip(layers, volumes, strict=True)], "none")
 
 
 def _lost(layer: Any) -> list[str]:
@@ -99,8 +109,8 @@ def _volume(layer: Any, step: int) -> Any:
     return replace(read_volume(data, affine=affine), unit=unit, name=layer.name)
 
 
-def _look(layer: Any) -> Look:
-    """Return the colours and opacity of a layer."""
+def _look(layer: Any, volume: Any) -> Look:
+    """Return the colours and opacity of a layer, that of its colour map a sample where it has any."""
     if type(layer).__name__ == "Labels":
         names = (
             dict(zip(layer.features["index"], layer.features["name"], strict=True)) if "name" in layer.features else {}
@@ -116,11 +126,11 @@ def _look(layer: Any) -> Look:
                 }
         return Look(labels=table)
     low, high = layer.contrast_limits
-    share = np.linspace(0, 1, NODES)
-    level = share**layer.gamma
-    colors = layer.colormap.map(level)
-    points = [
-        {"x": low + t * (high - low), "rgb": color[:3].tolist(), "opacity": float(s * color[3] * layer.opacity)}
-        for t, s, color in zip(share, level, colors, strict=True)
-    ]
-    return Look({"name": layer.name, "points": points})
+    share = np.array([0, *np.linspace(1e-6, 1 - 1e-6, NODES), 1])  # at the ends a map may have colours of their own
+    colors = layer.colormap.map(share**layer.gamma)
+    own = bool((colors[:, 3] < 1).any())
+    opacity = colors[:, 3] * layer.opacity * (1 if own else share**layer.gamma)
+    columns = low + share * (high - low), colors[:, :3].tolist(), opacity
+    points = [{"x": x, "rgb": rgb, "opacity": float(a)} for x, rgb, a in zip(*columns, strict=True)]
+    unit = {"opacity_unit_distance": STEP * float(np.mean(volume.spacing))} if own else {}
+    return Look({"name": layer.name, "points": points, **unit})
