@@ -1,6 +1,6 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads).
 import fs from 'node:fs';
 import path from 'node:path';
@@ -72,6 +72,7 @@ const steps = {
   },
   resize: (width, height) => page.setViewportSize({ width, height }),
   eval: (text) => page.evaluate(text),
+  until: async (text) => { await page.waitForFunction(text); },
   shot: async (file) => { await page.screenshot({ path: file }); },
   bare: async (file) => {
     const style = await page.addStyleTag({ content: HIDE });

@@ -216,7 +216,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
 
   let looks = [];
   return {
-    root, toggle, found: (place) => found(base.toIndex(place)),
+    root, toggle, text, found: (place) => found(base.toIndex(place)),
     get open() { return Boolean(base) && !root.hidden; },
     // 0: not on the cut; another number: another look
     get face() { return base && !root.hidden && face.getAttribute('aria-pressed') === 'true' ? version + 1 : 0; },
