@@ -153,3 +153,17 @@ def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, 
     person("eval", "document.querySelector('#live .node').focus()")
     person("press", "PageDown")
     np.testing.assert_allclose(person("eval", nodes), shifted - np.ptp(before) / 50)
+
+
+def test_escape_closes_what_is_open_and_the_focus_goes_back(person: Person, pages: dict[str, str]) -> None:
+    person("open", pages["slices"])
+    person("eval", "window.vvgt.where.lens.canvas.focus()")
+    for key, name in (("h", "help"), ("i", "about"), ("p", "sizes"), ("m", "marks"), ("s", "slices")):
+        person("press", key)
+        if name in ("marks", "slices"):
+            person("eval", f"document.querySelector('#{name} button').focus()")
+        assert person("eval", f"document.getElementById('{name}').contains(document.activeElement)"), name
+        person("press", "Escape")
+        back = {"marks": "#tools .measure", "slices": "#tools .slices"}.get(name, "#view canvas")
+        closed = f"[document.getElementById('{name}').hidden, document.activeElement.matches('{back}')]"
+        assert person("eval", closed) == [True, True], name

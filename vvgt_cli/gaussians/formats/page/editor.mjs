@@ -70,7 +70,8 @@ export function editor(apply, layer, key, history) {
   root.className = 'function';
   root.innerHTML = HTML;
   const find = (selector) => root.querySelector(selector), [lo, hi] = layer.values, span = hi - lo || 1;
-  const across = (x) => 6 + ((WIDE - 12) * (x - lo)) / span, value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
+  const across = (x) => 6 + ((WIDE - 12) * (Math.min(Math.max(x, lo), hi) - lo)) / span,  // nodes beyond the values at the edge
+     value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
   const ready = presets(layer), opener = find('.preset'), menu = find('.presets'), svg = find('svg');
   const whole = (nodes) => ({ nodes: fewer(nodes), exact: nodes, chosen: 0 });  // exact: until an edit
   let now = whole(layer.nodes), due = false;

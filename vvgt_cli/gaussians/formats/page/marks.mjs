@@ -1,5 +1,6 @@
 // Rulers, angles and notes: places of the world, drawn over the picture, listed, and as text of a link.
 import { shown } from './facts.mjs';
+import { hide } from './keys.mjs';
 import { plus } from './lens.mjs';
 import { drawPath, drawPlace } from './ruler.mjs';
 import { label } from './svg.mjs';
@@ -55,7 +56,8 @@ export function marksOf(worldNow, changed, save) {
     changed();
   }
   function show(open) {
-    root.hidden = !open;
+    if (open) root.hidden = false;
+    else hide(root, document.querySelector('#tools .measure'));
     choose(kind);
   }
   buttons.forEach((button) => button.addEventListener('click', () => choose(button.dataset.kind)));
