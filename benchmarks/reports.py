@@ -33,7 +33,9 @@ def row(found: dict) -> dict[str, str]:
     chosen = {"quickest": runs[front[0]], "knee": runs[found["knee"]], "nearest": runs[front[-1]]}
     chosen |= {name: by_label[name] for name in COLUMNS[3:] if name in by_label}
     return {
-        name: f"{run['scores']['psnr']:.1f} dB, {run['cost']:.1f} s ({run['label']})" for name, run in chosen.items()
+        name: f"{run['scores']['psnr']:.1f} dB, {run['cost']:.1f} s"
+        + (f" ({run['label']})" if run["label"] != name else "")
+        for name, run in chosen.items()
     }
 
 

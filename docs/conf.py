@@ -1,8 +1,8 @@
 """Configuration of the documentation's site, which `make docs` builds from the Markdown of the repository.
 
-Only what the pages do not contain is added by the build: the navigation, from the links of the index; the options of
-a command, in place of its line ``Options: `vvgt NAME --help`.``; the table of options that cannot be combined; and the
-docstrings of the library.
+Only what the pages do not contain is added by the build: the navigation, from the links of the index; options and
+examples of a command, in place of its line ``Options and examples: `vvgt NAME --help`.``; the table of options that
+cannot be combined; and the docstrings of the library.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ smartquotes = False
 html_theme = "furo"
 html_copy_source = False
 
-OPTIONS = re.compile(r"^Options: `vvgt ([a-z -]+) --help`\.$", re.M)
+OPTIONS = re.compile(r"^Options and examples: `vvgt ([a-z -]+) --help`\.$", re.M)
 COMBINATIONS = re.compile(r"^Combinations that are refused: .*$", re.M)
 LIBRARY = re.compile(r"^Functions and classes: .*$", re.M)
 
@@ -58,8 +58,13 @@ def escaped(text: str) -> str:
     return re.sub(r"([\\`*_{}<>\[\]|$])", r"\\\1", text)
 
 
+def examples(command: click.Command) -> list[str]:
+    """Return the lines of the examples in a command's help."""
+    return [line.strip() for line in re.split(r"Examples?:\n", command.help or "")[-1].strip().splitlines()]
+
+
 def options(match: re.Match[str]) -> str:
-    """Return the options of the command that a line names, under the headings that its ``--help`` has."""
+    """Return options and examples of the command that a line names, under the headings that its ``--help`` has."""
     command: click.Command = cli
     for name in match[1].split():
         assert isinstance(command, click.Group)
@@ -74,7 +79,7 @@ def options(match: re.Match[str]) -> str:
             lines += ["", f"### {section}"]
         for name, text in filter(None, rows):
             lines += ["", f"```{{option}} {name}", escaped(text), "```"]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", "```", *examples(command), "```"])
 
 
 def combinations(match: re.Match[str]) -> str:

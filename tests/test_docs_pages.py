@@ -47,7 +47,9 @@ def test_every_command_has_a_page_on_which_the_site_lists_its_options(page, comm
     assert place[1] == name
     listed = re.findall(r"^```{option} (.*)$", SITE["options"](place), re.M)
     assert sorted(re.findall(r"(?<![\w-])-{1,2}[a-z][\w-]*", " ".join(listed))) == sorted(options(command))
-    for example in re.findall(r"^vvgt (.*)$", text, re.M):
+    shown = SITE["examples"](command)
+    assert any(line.startswith("vvgt ") for line in shown)
+    for example in re.findall(r"^vvgt (.*)$", "\n".join([text, *shown]), re.M):
         for option in re.findall(r"(?<!\S)(--[a-z-]+|-[a-z])(?=\s|$)", example.split(" | ")[0]):
             owner = example.split()[0]
             assert any(option in options(sub) for name, sub in commands() if name == owner), f"{example}: {option}"
