@@ -91,6 +91,9 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
         print(f"{person.size} {named[k + 1]}: {own:.1f} dB from what the page shows then, {other:.1f} from the other")
         assert own > max(24, other + 6)
     assert person("eval", "[window.vvgt.live.lamp.state().kind, window.vvgt.live.nodes()[0].x]") == ["none", -30]
+    right = "document.querySelector('#live .function svg').getBoundingClientRect().right"
+    dots = "[...document.querySelectorAll('#live .node .dot')].map((dot) => dot.getBoundingClientRect().right)"
+    assert person("eval", f"Math.max(...{dots}) < {right}")  # of 3000 HU, too, beyond all values
     person("press", "Escape")
     closed = "[document.activeElement.className, document.querySelector('.presets').hidden]"
     assert person("eval", closed) == ["preset", True]

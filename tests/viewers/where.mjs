@@ -88,7 +88,9 @@ const steps = {
     await page.evaluate(() => {
       const focusable = [...document.querySelectorAll('a[href], button, input, select, summary, [tabindex="0"]')];
       window.missed = new Set(focusable.filter((e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled));
-      document.activeElement.blur();
+      document.body.tabIndex = -1;  // begin at the first, wherever the focus was
+      document.body.focus();
+      document.body.removeAttribute('tabindex');
     });
     const unseen = [];
     for (let n = 0; n < 300; n++) {
