@@ -12,13 +12,13 @@ from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
-from vvgt_cli.conversion.plan import MOST_STEPS, Planner, check_memory
+from vvgt_cli.conversion.plan import Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import view_count
-from vvgt_cli.defaults import STEPS
+from vvgt_cli.defaults import MOST_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import Workload, expected_wide

@@ -92,7 +92,7 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
         read_ply(tmp_path / "d.ply")
 
 
-def test_labels_in_the_header_of_a_file_without_their_column_are_let_be(tmp_path: Path) -> None:
+def test_labels_in_the_header_of_a_file_without_their_column_are_ignored(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", cloud(), options())
     content = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(

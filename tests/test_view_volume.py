@@ -404,6 +404,7 @@ def test_names_to_save_under() -> None:
     assert plain_name("example:blob:12") == "blob-12"
     assert plain_name("/x/</b>.nii.gz") == "b"
     assert plain_name("..") == "volume"
+    assert plain_name("head.v4.spz") == "head"
     assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"
 
 

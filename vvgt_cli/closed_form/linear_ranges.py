@@ -13,9 +13,9 @@ _last: tuple[np.ndarray, float, np.ndarray] | None = None  # nodes, bend and wha
 def linear_ranges(optics: Optics) -> np.ndarray:
     """Return the u (n + 1,) float64 up to which the optics are linear from bin i on.
 
-    Of a window of bins the slopes of tau and tau * (r, g, b) may differ by 4 `BEND` times the smallest slope of tau
-    (all of one sign), or so little that what adds up is within 4 `BEND` of the smallest tau. So a part of a straight
-    window is straight.
+    Within a window of bins, the slopes of tau and tau * (r, g, b) may differ by 4 `BEND` times the smallest slope of
+    tau (all of one sign), or so little that what adds up is within 4 `BEND` of the smallest tau. So a part of a
+    straight window is straight.
     """
     global _last
     bend = BEND

@@ -2,8 +2,8 @@
 
 A base cell is a box of ``2^e`` voxels along each axis (e may be negative). Its moments are integrals of the extinction
 ``tau(trilinear(scalar))`` by midpoint quadrature, each point averaged over the scalar's spread within its own box
-(so that a step function needs no finer points). Of cells of whole voxels, one under whose values the function is
-straight takes one point for eight.
+(so that a step function needs no finer points). A cell of whole voxels takes one point for eight if the function is
+straight over its values.
 """
 
 from __future__ import annotations

@@ -80,7 +80,8 @@ def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gauss
         half: (3,) half extents of the box.
 
     Returns:
-        As many, in their order; colours of degree 0 between `DARKEST` and `BRIGHTEST`, or what they were, if more.
+        The same number in the same order; colours of degree 0 between `DARKEST` and `BRIGHTEST`, or what they were, if
+        more.
     """
     if len(gaussians) < 2:
         return gaussians

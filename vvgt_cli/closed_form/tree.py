@@ -136,8 +136,8 @@ def split_score(tree: Tree, plain: float = PLAIN) -> np.ndarray:
 def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
     """Score as `split_score`, but by the variance of values, not of colours: any function may separate what differs.
 
-    Of a scene whose red is the value, as a share of its range, and green its square. ``filled``: all that is visible
-    has the same extinction, what is empty counts as another value, and blue is how much a part counts.
+    The scene's red is the value, as a share of its range, and its green the square of that. ``filled``: all that is
+    visible has the same extinction, what is empty counts as another value, and blue is how much a part counts.
     """
     mass = np.maximum(tree.moments[:, MASS], np.finfo(np.float64).tiny)
     mean, spread = tree.moments[:, RED] / mass, split_score(tree, np.inf)

@@ -419,7 +419,7 @@ def _resource(content: bytes, kind: str) -> Resource:
 
 def plain_name(path: str) -> str:
     """Return a file's name to save under: letters, digits, dot, underscore, blank and dash."""
-    known = next((suffix for suffix in reversed(SUFFIXES) if path.lower().endswith(suffix)), "")
+    known = max((suffix for suffix in SUFFIXES if path.lower().endswith(suffix)), key=len, default="")
     name = volume_name(Path(path.removeprefix("example:")[: len(path) - len(known)]))
     found = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
     return found or "volume"

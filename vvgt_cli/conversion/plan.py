@@ -20,14 +20,12 @@ from vvgt_cli.conversion.stages import (
     ViewingConditions,
 )
 from vvgt_cli.conversion.stages.views import view_count
-from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import UPRIGHT, Axes
 
-MOST_STEPS = 400  # where a target or a time limit decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
 ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
 FINISHING = 20  # steps on whole views after those on regions: few enough that cells by error are left out
@@ -176,7 +174,7 @@ class Planner:
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
         small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
-        steps = wanted = self.fit.steps if self.fit.steps is not None else MOST_STEPS if open_end else STEPS
+        steps = wanted = self.fit.most_steps(open_end)
         while left is not None and steps > 0 and self._seconds(workload, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):

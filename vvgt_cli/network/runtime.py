@@ -80,9 +80,8 @@ class Model:
     ) -> Gaussians:
         """Return the network's Gaussians, in the given order.
 
-        Of more views than the model is made for, a subset is read (`farthest_cameras`), another part of it in each
-        round. More Gaussians than ``points`` are divided along the Z-order into equal parts, each treated as a scene of
-        its own.
+        If there are more views than the model is made for, each round reads another subset (`farthest_cameras`). More
+        Gaussians than ``points`` are divided along the Z-order into equal parts, each treated as a scene of its own.
 
         Args:
             gaussians: start, unit frame.

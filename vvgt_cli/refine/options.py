@@ -31,16 +31,16 @@ class OptimizeOptions:
     """Options of gradient descent: the method, and when to stop.
 
     Attributes:
-        steps: of one view each, at most; rates fall to zero over them. None: as many as the time budget allows.
+        steps: maximum number, one view each; rates fall to zero over them. None: as many as the time budget allows.
         method: "frame" steps along each Gaussian's own axes, "adam" on the file's fields with the rates of 3DGS, "3dgs"
             as that, and the number of Gaussians grows and shrinks as in 3DGS.
-        max_gaussians: that "3dgs" may grow to; None: as many as it begins with.
+        max_gaussians: the number that "3dgs" may grow to; None: as many as it begins with.
         time_budget: seconds from the first step on after which no other is begun; rates fall to zero over it if it
             ends first. Runs with one do not repeat to the byte.
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
-        texture: weight of what of r changes from pixel to pixel, squared, where the view is smooth
+        texture: weight of the square of the high-frequency part of r, where the view is smooth
             (`vvgt_cli.refine.texture`).
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.

@@ -161,8 +161,8 @@ def adam_sizes(
 ) -> None:  # fmt: skip
     """Write numerators ``towards`` and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
 
-    Of one in ``every`` runs of `RUN` Gaussians, in that order; ``slopes`` (COUNT, K) are new, ``first``, ``second``
-    (COUNT, K) the running moments without them.
+    One in ``every`` runs of `RUN` Gaussians is read, in that order; ``slopes`` (COUNT, K) are new, ``first``,
+    ``second`` (COUNT, K) the running moments without them.
     """
     b1, b2, fix1, fix2 = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     for row in iterations(thread, COUNT):
@@ -197,7 +197,7 @@ def adam_directions(
 def regress(thread: ThreadSlice, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
     """Write ``weights`` (KNOWN, FEATURES): ``gain`` x ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
 
-    Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
+    Only shared directions, all finite. Sums have one order for any number of threads, unlike BLAS'.
     """
     whole = directions.shape[1] // LANES * LANES
     for f in iterations(thread, FEATURES):

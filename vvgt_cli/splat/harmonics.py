@@ -1,7 +1,7 @@
 """Numba kernels of colours that depend on the view. Twin: `vvgt_cli.gaussians.harmonics`.
 
-Of K Gaussians, float32: ``means`` (K, 3), ``colors`` (K, 3), ``harmonics`` (K, M, 3), M = 3, 8 or 15; ``eye`` (3,)
-float64. Sums are float64 and rounded once.
+Arrays of K Gaussians, float32: ``means`` (K, 3), ``colors`` (K, 3), ``harmonics`` (K, M, 3), M = 3, 8 or 15; ``eye``
+(3,) float64. Sums are float64 and rounded once.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Numba kernels of the splatter's first half: projection and tile lists. Twin: `splat.reference`.
 
-Of K Gaussians: ``means`` (K, 3), ``log_scales`` (K, 3), ``quats`` (K, 4), ``logits`` (K,), ``factors`` (K, 3, 3), all
-float32, unit frame. Of the camera, float64: ``rot`` (3, 3) and ``trans`` (3,) world to camera, ``lens`` (6,) fx, fy,
-cx, cy, width, height, pixels. ``rule`` (5,) float64 from `Rule.projecting`. Per Gaussian: ``flat`` (K, 7) float32
+Arrays of K Gaussians: ``means`` (K, 3), ``log_scales`` (K, 3), ``quats`` (K, 4), ``logits`` (K,), ``factors`` (K, 3,
+3), all float32, unit frame. The camera, float64: ``rot`` (3, 3) and ``trans`` (3,) world to camera, ``lens`` (6,) fx,
+fy, cx, cy, width, height, pixels. ``rule`` (5,) float64 from `Rule.projecting`. Per Gaussian: ``flat`` (K, 7) float32
 centre x, y (px), conic a, b, c (px^-2), opacity as drawn and as given; ``depth`` (K,) float32, unit frame; ``extent``
 (K, 4) int32 pixel box x0, y0, x1, y1, empty where nothing is seen.
 """

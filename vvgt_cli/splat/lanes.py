@@ -202,7 +202,7 @@ def screen_slope(
 ) -> tuple[float, ...]:  # fmt: skip
     """Return gradients by the projected centre (u, v) and the projected covariance (H, symmetric).
 
-    Of the conic a, b, c as drawn and the first six of a Gaussian's sums. Where opacity is compensated by
+    Takes the conic a, b, c as drawn and the first six of a Gaussian's sums. Where opacity is compensated by
     sqrt(det S / det S'), half of S^-1 - S'^-1 for each part of its gradient is added.
     """
     du, dv = a * t1 + b * t2, b * t1 + c * t2

@@ -1,6 +1,6 @@
 """Numba kernels of the splatter's second half: blending tiles and back-projecting images. Twin: `splat.reference`.
 
-Of a projection: ``flat`` (K, 7) float32, ``extent`` (K, 4) int32, ``start`` (tiles + 1,), ``members`` (pairs,),
+A projection is ``flat`` (K, 7) float32, ``extent`` (K, 4) int32, ``start`` (tiles + 1,), ``members`` (pairs,),
 ``slots`` (pairs,), ``first`` (K + 1,) as `splat.kernel` fills them; ``tiles`` (n,) int64 the tiles to draw, in the
 order in which threads take them, ``tiles_x`` in a row of the image; ``rule`` (6,) float32 from `Rule.blending`.
 ``colors`` (K, 3) float32. In a tile: ``entries`` (m,) its Gaussians, (``ox``, ``oy``) its corner in pixels, ``buf`` its

@@ -16,7 +16,7 @@ import numpy as np
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.part_descent import PartDescent
 from vvgt_cli.conversion.place import placement_warnings
-from vvgt_cli.conversion.plan import FEWEST_STEPS, MOST_STEPS
+from vvgt_cli.conversion.plan import FEWEST_STEPS
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.shards.cut import cut_of
 from vvgt_cli.conversion.shards.merge import closed_form, write_merged
@@ -25,7 +25,6 @@ from vvgt_cli.conversion.shards.regions import Refiner, make_regions
 from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.conversion.shards.streamed import folder_of
 from vvgt_cli.conversion.stages.refinement import HARMONICS
-from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.blocked import Blocked, MissingBlocks, Pass
@@ -129,7 +128,7 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     """Return the refiner of a request's steps, as many as there is time for; None for no steps."""
     fit, limits = request.fit, request.limits
     ended = limits.target_psnr is not None or limits.time_budget is not None
-    steps = fit.steps if fit.steps is not None else MOST_STEPS if ended else STEPS
+    steps = fit.most_steps(ended)
     degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
     chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
     if chosen.is_file():

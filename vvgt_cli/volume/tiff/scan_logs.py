@@ -20,8 +20,8 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | 
     """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None, and a warning, if unsure.
 
     Slices must have the ``size`` (x, y) in pixels that the log states. Their distance goes by the ``step`` of their
-    numbers, or the log's. Sizes that are ``given`` replace the log's. Of several logs that one counts whose name is the
-    longest that the name of the ``first`` slice begins with.
+    numbers, or the log's. Sizes that are ``given`` replace the log's. If there are several logs, the one
+    with the longest name that the name of the ``first`` slice begins with counts.
 
     Raises:
         DataError: a size in the log is no number.
