@@ -132,7 +132,7 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
     shot = after(tmp_path / "all.ply", [{"select": "#series select", "text": "frame 1"}], tmp_path)
     print(f"the second frame: {psnr(wanted[1], shot):.2f} dB, not {psnr(wanted[0], shot):.2f}")
     assert psnr(wanted[1], shot) > max(32, psnr(wanted[0], shot) + 5)
-    ramp: Actions = [{"select": "#live select[aria-label=function]", "text": "step"}]
+    ramp: Actions = [{"click": "#live .preset"}, {"click": "#live .presets [title=step]"}]
     other = after(tmp_path / "all.ply", [*ramp, {"select": "#series select", "text": "frame 1"}], tmp_path)
     again = after(tmp_path / "all.ply", [{"select": "#series select", "text": "frame 1"}, *ramp], tmp_path)
     assert psnr(other, again) > 40

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_page_where import DESK, PHONE, Person, marked  # noqa: F401
 
 from vvgt_cli.cli.main import run
+from vvgt_cli.images.metrics import psnr
 
 pytestmark = pytest.mark.long
 PAGES = ("slices", "series", "labels", "fixed")
@@ -40,6 +44,62 @@ def person(request: pytest.FixtureRequest) -> Iterator[Person]:
     someone = Person(request.param)
     yield someone
     someone.process.communicate(timeout=60)
+
+
+DRAWN = (
+    "[...document.querySelectorAll('#live .presets canvas')].every((one) => one.getContext('2d')"
+    ".getImageData(0, 0, 84, 84).data.some((x, k) => x && k % 4 < 3))"
+)
+NAMES = "[...document.querySelectorAll('#live .presets button')].map((one) => one.textContent)"
+CHOSEN = "[document.activeElement.textContent, document.activeElement.getAttribute('aria-pressed')]"
+PICTURE = "document.activeElement.querySelector('canvas').toDataURL().split(',')[1]"
+SEEN = "(({ middle, canvas }) => [middle, canvas.clientWidth, canvas.clientHeight])(window.vvgt.where.lens)"
+
+
+def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: Path) -> None:
+    """A scan of the file's function over soft tissue: the pictures are what the page then shows."""
+    nib = pytest.importorskip("nibabel")
+    radius = np.linalg.norm(np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 24)], indexing="ij")), axis=0)
+    values = np.select([radius < 0.4, radius < 0.55, radius < 0.8], [40.0, 900.0, 60.0], -1000.0)
+    nib.save(nib.Nifti1Image(values.astype(np.int16), np.eye(4)), tmp_path / "ct.nii")
+    command = ["convert", str(tmp_path / "ct.nii"), "--tf", "ct-skin", "--live", "--max-gaussians", "2000", "--quiet"]
+    assert run([*command, "-o", str(tmp_path / "ct.html")]) == 0
+    person("open", (tmp_path / "ct.html").as_uri())
+    person("eval", "document.querySelector('#live.folded .fold')?.click()")
+    before = person.picture(tmp_path, "before.png")
+    person("eval", "document.querySelector('#live .preset').focus()")
+    person("press", "Enter")
+    person("until", DRAWN)
+    assert np.abs(person.picture(tmp_path, "drawn.png") - before).max() < 0.02  # as it was
+    named = ["as in the file", "ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "step", "ramp", "band"]
+    assert person("eval", NAMES) == named
+    assert person("axe") == []
+    pictures = []
+    for name in named[1:3]:
+        while person("eval", CHOSEN)[0] != name:
+            person("press", "Tab")
+        person("press", "Enter")
+        whole = Image.fromarray((255 * person.picture(tmp_path, f"{name}.png")).round().astype(np.uint8))
+        assert person("eval", CHOSEN) == [name, "true"]
+        (left, top), wide, high = person("eval", SEEN)
+        half = min(left, wide - left, top, high - top)
+        wanted = whole.resize((84, 84), Image.Resampling.BOX, (left - half, top - half, left + half, top + half))
+        small = Image.open(io.BytesIO(base64.b64decode(person("eval", PICTURE)))).convert("RGB")
+        pictures.append([np.asarray(one, np.float32) / 255 for one in (wanted, small)])
+    for k, (wanted, small) in enumerate(pictures):
+        own, other = psnr(wanted, small), psnr(pictures[1 - k][0], small)
+        print(f"{person.size} {named[k + 1]}: {own:.1f} dB from what the page shows then, {other:.1f} from the other")
+        assert own > max(24, other + 6)
+    assert person("eval", "[window.vvgt.live.lamp.state().kind, window.vvgt.live.nodes()[0].x]") == ["none", -30]
+    right = "document.querySelector('#live .function svg').getBoundingClientRect().right"
+    dots = "[...document.querySelectorAll('#live .node .dot')].map((dot) => dot.getBoundingClientRect().right)"
+    assert person("eval", f"Math.max(...{dots}) < {right}")  # of 3000 HU, too, beyond all values
+    person("press", "Escape")
+    closed = "[document.activeElement.className, document.querySelector('.presets').hidden]"
+    assert person("eval", closed) == ["preset", True]
+    person("press", "Control+z")
+    person("press", "Control+z")
+    assert np.abs(person.picture(tmp_path, "undone.png") - before).max() < 0.02
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -96,3 +156,17 @@ def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, 
     person("eval", "document.querySelector('#live .node').focus()")
     person("press", "PageDown")
     np.testing.assert_allclose(person("eval", nodes), shifted - np.ptp(before) / 50)
+
+
+def test_escape_closes_what_is_open_and_the_focus_goes_back(person: Person, pages: dict[str, str]) -> None:
+    person("open", pages["slices"])
+    person("eval", "window.vvgt.where.lens.canvas.focus()")
+    for key, name in (("h", "help"), ("i", "about"), ("p", "sizes"), ("m", "marks"), ("s", "slices")):
+        person("press", key)
+        if name in ("marks", "slices"):
+            person("eval", f"document.querySelector('#{name} button').focus()")
+        assert person("eval", f"document.getElementById('{name}').contains(document.activeElement)"), name
+        person("press", "Escape")
+        back = {"marks": "#tools .measure", "slices": "#tools .slices"}.get(name, "#view canvas")
+        closed = f"[document.getElementById('{name}').hidden, document.activeElement.matches('{back}')]"
+        assert person("eval", closed) == [True, True], name

@@ -219,7 +219,9 @@ def test_the_quality_is_that_of_the_certificate(tmp_path: Path) -> None:
         return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get(fact)
 
     assert error(given) == "41.2 dB PSNR on test views of 400 px (higher is better)"
-    assert error(replace(given, live_psnr=33.33)) == "33.3 dB PSNR on test views of 400 px (higher is better)"
+    assert error(replace(given, live_psnr=33.33)) == (
+        "33.3 dB PSNR on test views of 400 px (higher is better), under its own function and light"
+    )
     assert [error(replace(given, live_psnr=dB), "far") for dB in (None, 28.0)] == ["", ""]
     assert "27.9 dB" in error(replace(given, live_psnr=27.94), "far")
     assert "without --live" in error(replace(given, live_psnr=27.94), "far")

@@ -23,7 +23,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.live import BYTES, ROW
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.gaussians.formats.page_live import nodes_of, planes_of
+from vvgt_cli.gaussians.formats.page_live import nodes_of, planes_of, presets_of
 from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.live import Looks, Table, apply_look, baked
@@ -48,6 +48,19 @@ def page_of(gaussians: Gaussians, options: PlyOptions, name: str = "a.html") -> 
 def options(**given: Any) -> PlyOptions:
     affine = (1.0, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 1.0, 0)
     return replace(PlyOptions(up="y", scale=0.1, unit_distance=0.5, affine=affine, live=facts()), **given)
+
+
+def test_presets_suit_the_values_and_are_per_the_files_distance() -> None:
+    """Twice as opaque per a distance twice as long; none where Hounsfield units would be a guess."""
+    known = replace(facts(), lo=-1000.0, hi=400.0, unit="HU")
+    one, two = (presets_of(known, {"name": "ct-skin", "unit_distance": length}) for length in (2 / 256, 4 / 256))
+    assert [found["name"] for found in one] == ["ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung"]
+    assert [bool(found["light"]) for found in one] == [True, False, True, False]
+    bone = {node["x"]: node["y"] for node in one[0]["nodes"]}
+    assert (bone[250], bone[450]) == (0.06, 0.25)
+    assert {node["x"]: node["y"] for node in two[0]["nodes"]}[450] == pytest.approx(1 - 0.75**2, abs=1e-6)
+    other = replace(known, unit="")
+    assert [presets_of(other, {"name": name, "unit_distance": 1.0}) for name in ("ct-bone", "bone")] == [[], []]
 
 
 def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> None:

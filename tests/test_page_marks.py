@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from test_page_where import CENTRE, DOTS, SCALE, Person, dots, found, marked, person  # noqa: F401
 
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+
 pytestmark = pytest.mark.long
 LIST = (
     "[...document.querySelectorAll('#marks li')]"
@@ -127,3 +130,29 @@ def test_keys_alone_measure(marked: str, person: Person) -> None:
     least = [size for size in person("eval", small) if size]
     assert len(least) == 5
     assert min(least) >= 24
+
+
+def test_pictures_of_two_sizes_that_are_asked_for_at_once_are_both_drawn(marked: str, person: Person) -> None:
+    person("open", marked)
+    asked = "Promise.all([[300, 200], [150, 100]].map((size) => window.vvgt.where.picture(size)))"
+    sizes = f"{asked}.then((all) => Promise.all(all.map((one) => createImageBitmap(one))))"
+    assert person("eval", f"{sizes}.then((all) => all.map(({{ width, height }}) => [width, height]))") == [
+        [300, 200], [150, 100]
+    ]  # fmt: skip
+
+
+def test_lengths_are_in_the_unit_of_the_frame_that_is_shown(person: Person, tmp_path: Path) -> None:
+    columns = (np.full((2, 3), -3, np.float32), np.eye(4, dtype=np.float32)[[0, 0]], np.full(2, 4, np.float32))
+    for k, space in enumerate(("RAS", None)):
+        affine = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
+        options = PlyOptions(scale=SCALE, centre=(0.0, 0.0, 0.0), space=space, affine=affine, up="z")
+        write_ply(
+            tmp_path / f"f{k}.ply", Gaussians(DOTS.astype(np.float32), *columns, np.ones((2, 3), np.float32)), options
+        )
+    assert run(["view", str(tmp_path / "f?.ply"), "-o", str(tmp_path / "f.html"), "--quiet"]) == 0
+    person("open", (tmp_path / "f.html").as_uri())
+    person("eval", "window.vvgt.where.marks.part.set('[[\"ruler\", [[0, 0, 0], [3, 4, 0]]]]')")
+    assert person("eval", LIST) == ["ruler 5 mm"]
+    person("eval", "window.vvgt.show(1)")
+    person("settled")
+    assert person("eval", LIST) == ["ruler 5"]

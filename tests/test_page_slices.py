@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians.formats.page_slices import packed, slices_of, unpacked
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
@@ -129,6 +131,16 @@ def test_a_volume_of_few_voxels_is_exact():
     assert (facts["step"], facts["unit"]) == (1, "HU")
     flat = slices_of([(Volume(np.full((2, 2, 2), 7, np.int16)), None)])
     np.testing.assert_array_equal(unpacked(flat.contents[0], flat.facts[0]), 7)
+
+
+@pytest.mark.parametrize("stretched", [False, True])
+def test_values_are_hounsfield_units_where_a_function_of_those_says_so(stretched):
+    """A scan whose file states no unit: air, and tissue; a histogram alone says too little."""
+    data = np.full((8, 8, 8), -1000, np.int16)
+    data[4:] = np.linspace(20, 60, 64).reshape(8, 8)
+    source = SourceRequest(Volume(data), tf="ct-soft-tissue", tf_range="rescale" if stretched else "data")
+    found = [load(one).slices() for one in (source, replace(source, tf=None, tf_range="data"))]
+    assert [one.facts[0]["unit"] for one in found] == ["" if stretched else "HU", ""]
 
 
 def test_huge_ranges_fit_into_16_bits():

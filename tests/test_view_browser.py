@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import render
 
 pytestmark = pytest.mark.long
+NOTE = 'a </script> & $& "note"'
 SHELL = {
     "points": [
         {"x": 0, "rgb": [1, 0.2, 0.1], "opacity": 0}, {"x": 0.35, "rgb": [1, 0.8, 0.2], "opacity": 0.02},
@@ -37,7 +40,7 @@ SHELL = {
 def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tuple[int, int], tmp_path: Path) -> None:
     (tmp_path / "shell.json").write_text(json.dumps(SHELL))
     with shown("example:blob:24", "--tf", "shell.json", folder=tmp_path) as (_, url):
-        job = {"browser": browser(), "url": url, "size": size, "folder": str(tmp_path)}
+        job = {"browser": browser(), "url": url, "size": size, "folder": str(tmp_path), "note": NOTE}
         (tmp_path / "job.json").write_text(json.dumps(job))
         command = ["node", str(PAGES / "served.mjs"), str(tmp_path / "job.json"), str(packages())]
         done = subprocess.run(command, capture_output=True, text=True, timeout=2400)
@@ -52,6 +55,10 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     assert noted["slices"] == [24, 24, 24]
     assert b'id="slices-0"' in (tmp_path / "blob-24.html").read_bytes()
     assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', (tmp_path / "blob-24.html").read_text("utf-8"), re.S)[1])
+    link = dict(part.split("=", 1) for part in scene["link"].split("&"))
+    assert json.loads(unquote(link["marks"])) == [["note", [[0, 0, 0]], NOTE]]
+    assert "view" in link
     function = json.loads((tmp_path / "tf.json").read_text())
     assert [point["x"] for point in function["points"]] != [point["x"] for point in SHELL["points"]]
     pictures = {name: square(read_png(tmp_path / f"{name}.png")[..., :3]) for name in ("live", "better")}

@@ -92,6 +92,7 @@ noted.better = await shown();
 noted.moved = (await place()).map((v, i) => Math.abs(v - before[i]));
 await page.screenshot({ path: path.join(job.folder, 'page-better.png') });
 await shoot('better.png');
+await page.evaluate((note) => window.vvgt.where.marks.part.set(JSON.stringify([['note', [[0, 0, 0]], note]])), job.note);
 noted.saved = [await save('.ply'), await save('.html'), await save('tf.json')];
 await page.selectOption('#live .axis', { index: 1 });
 noted.cut = await shown();

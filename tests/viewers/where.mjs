@@ -1,6 +1,6 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; wheel DY; drag X Y X Y; resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads).
 import fs from 'node:fs';
 import path from 'node:path';
@@ -72,6 +72,7 @@ const steps = {
   },
   resize: (width, height) => page.setViewportSize({ width, height }),
   eval: (text) => page.evaluate(text),
+  until: async (text) => { await page.waitForFunction(text); },
   shot: async (file) => { await page.screenshot({ path: file }); },
   bare: async (file) => {
     const style = await page.addStyleTag({ content: HIDE });
@@ -87,7 +88,9 @@ const steps = {
     await page.evaluate(() => {
       const focusable = [...document.querySelectorAll('a[href], button, input, select, summary, [tabindex="0"]')];
       window.missed = new Set(focusable.filter((e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled));
-      document.activeElement.blur();
+      document.body.tabIndex = -1;  // begin at the first, wherever the focus was
+      document.body.focus();
+      document.body.removeAttribute('tabindex');
     });
     const unseen = [];
     for (let n = 0; n < 300; n++) {

@@ -11,6 +11,7 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.resolve import unit_of_values
 
 VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
 
@@ -61,7 +62,7 @@ def _legend(source: Source) -> str | None:
     """Return the legend of one function or label table."""
     if len(source.layers) > 1:
         return None
-    labelled, volume = isinstance(source.tf, LabelTable), source.volume
-    numbers = None if labelled else source.statistics
-    lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
-    return legend_text(source.tf, lo, hi, volume.values_in, volume.quantity)
+    tf, numbers = source.tf, source.statistics
+    if isinstance(tf, LabelTable):
+        return legend_text(tf, 0.0, 0.0, "", source.volume.quantity)
+    return legend_text(tf, numbers.lo, numbers.hi, unit_of_values(source.volume, tf), source.volume.quantity)

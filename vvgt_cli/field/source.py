@@ -189,13 +189,7 @@ class Source:
         """
         from vvgt_cli.gaussians.formats.page_slices import slices_of
 
-        return slices_of(
-            [
-                None if layer.colors else (layer.volume, layer.tf if isinstance(layer.tf, LabelTable) else None)
-                for layer in self.layers
-            ],
-            room,
-        )
+        return slices_of([None if layer.colors else (layer.volume, layer.tf) for layer in self.layers], room)
 
     def with_function(self, tf: TransferFunction) -> Source:
         """Return the same volume under another function on data values, unlit.

@@ -15,6 +15,7 @@ from vvgt_cli.look.convert import to_text
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label
 from vvgt_cli.look.readers.minimal import read
+from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
@@ -78,7 +79,7 @@ class LiveFacts:
         counts = tuple(int(n) for n in numbers.histogram)
         lo, hi = numbers.lo, numbers.hi
         function = function_text(tf, lo, hi, several)
-        return cls(lo, hi, volume.dims, counts, volume.values_in, function, quantity=volume.quantity)
+        return cls(lo, hi, volume.dims, counts, unit_of_values(volume, tf), function, quantity=volume.quantity)
 
     def statistics(self) -> Statistics:
         """Return the statistics that place functions on the data."""

@@ -301,6 +301,7 @@ class TransferFunction:
             opacity_nodes=replace(opacity, x=positions[np.searchsorted(points, opacity.x)]),
             color_map=replace(colors, x=positions[np.searchsorted(points, colors.x)]),
             domain=domain,
+            otherwise=None,
         )
 
     def rescaled(self, lo: float, hi: float) -> TransferFunction:

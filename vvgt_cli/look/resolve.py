@@ -110,6 +110,11 @@ def resolve(
     return tf.rescaled(lo, hi)
 
 
+def unit_of_values(volume: Volume, tf: TransferFunction | None) -> str:
+    """Return the unit of a volume's values: the file's, else HU under a function that is over those; "" if unknown."""
+    return volume.values_in or ("HU" if tf is not None and tf.otherwise is not None else "")
+
+
 def _in_hounsfield(statistics: StatisticsLike) -> bool:
     counts = np.asarray(statistics.histogram, dtype=np.float64)
     return bool(counts.any()) and in_hounsfield(counts, np.asarray(statistics.edges, dtype=np.float64))

@@ -157,7 +157,10 @@ def _read(content: bytes, name: str) -> Splats:
         node = document["nodes"][number]
         place = above @ _matrix(node)
         root = place if root is None else root
-        on = on and node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+        shown = node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+        if not isinstance(shown, bool):
+            raise ValueError(f"{VISIBILITY} of node {number}: visible is {shown!r}")
+        on = on and shown
         open_nodes += [(child, root, place, on) for child in reversed(node.get("children", []))]
         if "mesh" in node:
             offset = offset_in(root, place, comments, name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,10 +25,12 @@ from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MATTE, MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
+from vvgt_cli.look.readers.names import named_function, names
+from vvgt_cli.look.resolve import resolve
 from vvgt_cli.volume.types import triple
 
 HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
-SAMPLED = 96  # nodes for colours that are not interpolated linearly in RGB
+SAMPLED, FEW = 96, 12  # nodes for colours that are not interpolated linearly in RGB: of the file's function, of presets
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
@@ -201,7 +203,8 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
     distances = [layer.distance or options.unit_distance or 1.0 for layer in facts.layers]
     found = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
     for own, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
-        own |= {"nodes": [] if layer.labels else nodes_of(layer), "opacity_unit_distance": distance}
+        own |= {"opacity_unit_distance": distance}
+        own |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, own)}
     axes = _axes(upright(options).up)
     return found | {
         "held": [f"{HELD}-{k}" for k in range(len(clouds))],
@@ -260,10 +263,37 @@ def _axes(up: str) -> np.ndarray:
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
     """Return nodes with opacity and colour, between which both are linear; there are two at a step."""
-    tf = read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function")
+    return _nodes(read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED)
+
+
+def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the named functions for values in Hounsfield units, or of the kind of the file's own named function.
+
+    Args:
+        facts: of the layer.
+        own: its part of the scene, whose ``unit_distance`` opacities become per.
+    """
+    named, found = names(), []
+    kind = "ct" if facts.unit == "HU" else own["name"].split("-")[0] if own["name"] in named else ""
+    for name in [name for name in named if name.split("-")[0] == kind and name != own["name"]]:
+        tf = named_function(name)
+        if tf.otherwise is not None and facts.unit != "HU":  # a guess
+            continue
+        tf = resolve(tf, facts.statistics(), hounsfield=True)
+        assert tf.opacity_unit_share is not None
+        times = own["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
+        nodes = [node | {"y": round(1 - (1 - node["y"]) ** times, 6)} for node in _nodes(tf, FEW)]
+        light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
+        if tf.support(facts.lo, facts.hi):
+            found.append({"name": name, "shows": named[name], "nodes": nodes, "light": light})
+    return found
+
+
+def _nodes(tf: TransferFunction, sampled: int) -> list[dict[str, Any]]:
+    """Return nodes, with so many more for colours that are not interpolated linearly in RGB."""
     places = [tf.opacity_nodes.x, tf.color_map.x]
     if tf.color_map.space != "RGB":
-        places.append(np.linspace(tf.color_map.x[0], tf.color_map.x[-1], SAMPLED))
+        places.append(np.linspace(tf.color_map.x[0], tf.color_map.x[-1], sampled))
     nodes = []
     for x in np.unique(np.concatenate(places)).tolist():
         below, above = (_limit(tf, x, side) for side in (-np.inf, np.inf))

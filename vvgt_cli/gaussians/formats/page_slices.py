@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
 from vvgt_cli.volume.types import Volume
 
@@ -27,6 +29,8 @@ LEVELS = 4096  # steps of the range of most values
 MOST_OF = (0.1, 99.9)  # percentiles that bound most values
 CODES = 1 << 16
 EXACT = 1e-6  # steps by which rounding may move a mean of equal values
+
+Layer = tuple[Volume, TransferFunction | LabelTable | None]
 
 
 class Slices(NamedTuple):
@@ -68,11 +72,12 @@ class Slices(NamedTuple):
         return f"slices of the volume ({', '.join(grids)} voxels{', coarser for --max-size' if self.limited else ''})"
 
 
-def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None], room: float | None = None) -> Slices | None:
+def slices_of(layers: Sequence[Layer | None], room: float | None = None) -> Slices | None:
     """Return the grids of layers, read part by part.
 
     Args:
-        layers: of each its volume, and the table of a label map; None for one with colours, which has no grid.
+        layers: of each its volume, and its function or the table of a label map; None for one with colours, which has
+            no grid.
         room: bytes that they may take on a page.
 
     Returns:
@@ -88,15 +93,13 @@ def slices_of(layers: Sequence[tuple[Volume, LabelTable | None] | None], room: f
     return found
 
 
-def _grids(
-    layers: Sequence[tuple[Volume, LabelTable | None] | None], most: int, limited: bool = False
-) -> Slices | None:  # fmt: skip
+def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Slices | None:
     """Return the grids of layers, of at most so many cells together, as `slices_of` does."""
     shown = [(number, *layer) for number, layer in enumerate(layers) if layer is not None]
     facts, contents = [], []
-    for number, volume, table in shown:
+    for number, volume, look in shown:
         dims = coarser(volume, most // len(shown))
-        own, codes = _values(volume, dims) if table is None else _labels(table, volume, dims)
+        own, codes = _labels(look, volume, dims) if isinstance(look, LabelTable) else _values(volume, look, dims)
         stretch = np.array(volume.dims) / dims
         affine = volume.affine[:3] @ np.vstack([np.diag([*stretch, 1.0])[:3], [0, 0, 0, 1.0]])
         affine[:, 3] += volume.affine[:3, :3] @ ((stretch - 1) / 2)  # the middle of the first cell
@@ -111,7 +114,9 @@ def _grids(
     return Slices(tuple(facts), tuple(contents), limited) if facts else None
 
 
-def _values(volume: Volume, dims: tuple[int, int, int]) -> tuple[dict[str, Any], np.ndarray]:
+def _values(
+    volume: Volume, tf: TransferFunction | None, dims: tuple[int, int, int]
+) -> tuple[dict[str, Any], np.ndarray]:
     """Return facts and codes (nz, ny, nx) of the means of values."""
     values = averaged(volume, dims)
     known = values[np.isfinite(values)]
@@ -126,7 +131,7 @@ def _values(volume: Volume, dims: tuple[int, int, int]) -> tuple[dict[str, Any],
     codes = np.rint((np.nan_to_num(values, nan=lo - missing * step) - lo) / step) + missing
     window = [(a + b) / 2, (b - a) or step]
     facts = {
-        "lo": lo, "step": step, "missing": missing, "unit": volume.values_in, "quantity": volume.quantity,
+        "lo": lo, "step": step, "missing": missing, "unit": unit_of_values(volume, tf), "quantity": volume.quantity,
         "level": window[0], "window": window[1],
     }  # fmt: skip
     return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16)

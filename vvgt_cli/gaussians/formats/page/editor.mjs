@@ -10,8 +10,9 @@ const WIDER = 60;  // px of a drag upwards after which all is e times as wide
 const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one; drag beside the nodes to shift and widen the whole">
 <defs><linearGradient></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
-<div><select aria-label="function" title="function"></select><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>
-<button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div>`;
+<div><button class="preset" aria-expanded="false" title="presets"></button><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>
+<button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div><div class="presets" role="group" aria-label="presets" hidden></div>`;
+const PRESET = `<canvas width="84" height="84" aria-hidden="true"></canvas><span></span>`;
 
 const height = (y) => HIGH - 4 - (HIGH - 8) * Math.cbrt(y), opacity = (h) => Math.min(Math.max((HIGH - 4 - h) / (HIGH - 8), 0), 1) ** 3;
 const copy = (nodes) => nodes.map(({ x, y, rgb }) => ({ x, y, rgb: [...rgb] }));
@@ -33,8 +34,8 @@ function fewer(nodes) {
   return copy(nodes.filter((_, k) => kept.has(k)));
 }
 
-// Functions to begin with: the file's own, and three at places of the values but the commonest (background)
-function presets({ values: [lo, hi], histogram, nodes }) {
+// Functions to begin with, {name, shows, nodes, light}: the file's own, those that suit its values, and three at places of the values but the commonest (background)
+function presets({ values: [lo, hi], histogram, nodes, light, presets: named = [] }) {
   const most = histogram.indexOf(Math.max(...histogram)), counts = histogram.map((n, k) => (k === most ? 0 : n));
   const all = counts.reduce((a, b) => a + b, 0) || 1, share = (q) => {
     let sum = 0;
@@ -43,12 +44,12 @@ function presets({ values: [lo, hi], histogram, nodes }) {
   };
   const made = (...list) => list.map(([x, y]) => ({ x, y, rgb: functionAt(nodes, x).rgb }));
   const middle = share(0.5), wide = Math.max((share(0.7) - share(0.3)) / 2, (hi - lo) / 40);
-  return {
-    'as in the file': nodes,
-    step: made([lo, 0], [middle, 0], [Math.min(middle + (hi - lo) / 100, hi), 0.8], [hi, 0.8]),
-    ramp: made([lo, 0], [share(0.1), 0], [hi, 0.5]),
-    band: made([lo, 0], [Math.max(middle - wide, lo), 0], [middle, 0.5], [Math.min(middle + wide, hi), 0], [hi, 0]),
-  };
+  return [
+    { name: 'as in the file', nodes, light }, ...named,
+    { name: 'step', nodes: made([lo, 0], [middle, 0], [Math.min(middle + (hi - lo) / 100, hi), 0.8], [hi, 0.8]) },
+    { name: 'ramp', nodes: made([lo, 0], [share(0.1), 0], [hi, 0.5]) },
+    { name: 'band', nodes: made([lo, 0], [Math.max(middle - wide, lo), 0], [middle, 0.5], [Math.min(middle + wide, hi), 0], [hi, 0]) },
+  ];
 }
 
 // nodes as a link has them, and back
@@ -69,8 +70,9 @@ export function editor(apply, layer, key, history) {
   root.className = 'function';
   root.innerHTML = HTML;
   const find = (selector) => root.querySelector(selector), [lo, hi] = layer.values, span = hi - lo || 1;
-  const across = (x) => 6 + ((WIDE - 12) * (x - lo)) / span, value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
-  const ready = presets(layer), list = find('select'), svg = find('svg');
+  const across = (x) => 6 + ((WIDE - 12) * (Math.min(Math.max(x, lo), hi) - lo)) / span,  // nodes beyond the values at the edge
+     value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
+  const ready = presets(layer), opener = find('.preset'), menu = find('.presets'), svg = find('svg');
   const whole = (nodes) => ({ nodes: fewer(nodes), exact: nodes, chosen: 0 });  // exact: until an edit
   let now = whole(layer.nodes), due = false;
 
@@ -96,7 +98,10 @@ export function editor(apply, layer, key, history) {
     });
     find('input[type=color]').value = hex(nodes[chosen].rgb);
     find('.remove').disabled = nodes.length < 3;
-    list.value = Object.keys(ready).find((name) => ready[name] === exact) ?? EDITED;
+    const begun = ready.findIndex((one) => one.nodes === exact);
+    opener.textContent = ready[begun]?.name ?? EDITED;
+    opener.setAttribute('aria-label', `presets: ${opener.textContent}`);
+    [...menu.children].forEach((button, k) => button.setAttribute('aria-pressed', String(k === begun)));
   }
 
   function show() {
@@ -206,12 +211,29 @@ export function editor(apply, layer, key, history) {
   });
   find('input[type=color]').addEventListener('change', () => { coloring = false; });
 
-  list.append(...[...Object.keys(ready), EDITED].map((name) => new Option(name)));
-  list.lastChild.hidden = true;
-  list.addEventListener('change', () => {
-    history.keep();
-    now = whole(ready[list.value]);
-    show();
+  const pictures = ready.map(({ name, shows, nodes, light }) => {
+    const button = Object.assign(document.createElement('button'), { innerHTML: PRESET, title: shows ?? name });
+    button.lastChild.textContent = name;
+    button.addEventListener('click', () => {
+      history.keep();
+      now = whole(nodes);
+      show();
+      history.light(light);
+    });
+    menu.append(button);
+    return button.firstChild.getContext('2d');
+  });
+  function open(now) {
+    menu.hidden = !now;
+    opener.setAttribute('aria-expanded', String(now));
+    if (now) history.sketch(ready, (k, draw) => draw(pictures[k]), () => !menu.hidden);
+  }
+  opener.addEventListener('click', () => open(menu.hidden));
+  root.addEventListener('keydown', (event) => {
+    if (event.key !== 'Escape' || menu.hidden) return;
+    event.preventDefault();
+    open(false);
+    opener.focus();
   });
 
   const counts = layer.histogram, most = Math.log1p(Math.max(...counts)) || 1, bar = (WIDE - 12) / counts.length;

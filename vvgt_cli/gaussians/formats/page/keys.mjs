@@ -3,7 +3,7 @@ import { fill } from './about.mjs';
 
 const TURN = 5, STEP = 24, NEARER = 1.1;  // degrees, pixels and times of a key
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .handle`;  // what has keys, or arrows, of its own
+const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .listed, .handle`;  // what has keys, or arrows, of its own
 
 // rows of the help: [keys, what]; `buttons` are {title, key}
 export function helpRows(buttons, { live, values, picks, sliced }) {
@@ -20,15 +20,26 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
   ];
 }
 
+// hides a section; the focus that is in it goes back
+export function hide(root, back) {
+  const inside = root.contains(document.activeElement);
+  root.hidden = true;
+  if (inside) back?.focus();
+}
+
 // {root, toggle()} of a panel of rows, or without them of what the caller puts there; of all of them one is open at a time
 const panels = [];
 export function listed(id, name, rows) {
   const root = Object.assign(document.createElement('section'), { id, className: 'listed', hidden: true, tabIndex: 0, innerHTML: `<h2></h2><${rows ? 'dl' : 'div'}></${rows ? 'dl' : 'div'}>` });
   root.firstChild.textContent = name;
   root.setAttribute('aria-label', name);
-  let button = null;
+  let button = null, back = null;
   const show = (open) => {
-    root.hidden = !open;
+    if (open) {
+      back = document.activeElement;
+      root.hidden = false;
+      root.focus();
+    } else hide(root, back);
     button?.setAttribute('aria-expanded', String(open));
   };
   const panel = {

@@ -121,6 +121,7 @@ export async function liveLook({ app }, live) {
     gsplat.setParameter('vvgtToward', [...from, kind === 'headlight' ? 1 : 0]);
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
+  look.ready = () => new Promise((done) => { shown = done; });  // once what was set is drawn
   look.light(live.light);
   gsplat.setParameter('vvgtOpaque', [live.sharp, live.dilation, ...live.tail]);
   gsplat.setParameter('vvgtSpread', [live.widest, live.bend]);
@@ -136,6 +137,6 @@ export async function liveLook({ app }, live) {
   set('vvgtTable', table);
   set('vvgtLabels', labels);
   gsplat.setWorkBufferModifier({ glsl: modifier });
-  await new Promise((done) => { shown = done; });
+  await look.ready();
   return look;
 }

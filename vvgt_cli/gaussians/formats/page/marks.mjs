@@ -1,5 +1,6 @@
 // Rulers, angles and notes: places of the world, drawn over the picture, listed, and as text of a link.
 import { shown } from './facts.mjs';
+import { hide } from './keys.mjs';
 import { plus } from './lens.mjs';
 import { drawPath, drawPlace } from './ruler.mjs';
 import { label } from './svg.mjs';
@@ -18,7 +19,7 @@ export function amountOf({ kind, places }) {
 }
 
 // worldNow(): of where.mjs; changed(): what is drawn; save(): this page, or null where it cannot be saved.
-// {root, open, toggle(), stop(), take(place): clicked; list, begun: places of the next; draw(group, all), part: of links}
+// {root, open, toggle(), stop(), renew(), take(place): clicked; list, begun: places of the next; draw(group, all), part: of links}
 export function marksOf(worldNow, changed, save) {
   const root = Object.assign(document.createElement('section'), { id: 'marks', hidden: true, innerHTML: HTML });
   root.setAttribute('aria-label', 'rulers, angles and notes');
@@ -44,10 +45,9 @@ export function marksOf(worldNow, changed, save) {
     row.append(`${k + 1}`, said, gone);
     return row;
   }
-  function put(now) {
-    const made = now.map(rowOf);
+  function put(now = list) {
+    rows.replaceChildren(...now.map(rowOf));
     list = now;
-    rows.replaceChildren(...made);
     changed();
   }
   function choose(now) {
@@ -56,7 +56,8 @@ export function marksOf(worldNow, changed, save) {
     changed();
   }
   function show(open) {
-    root.hidden = !open;
+    if (open) root.hidden = false;
+    else hide(root, document.querySelector('#tools .measure'));
     choose(kind);
   }
   buttons.forEach((button) => button.addEventListener('click', () => choose(button.dataset.kind)));
@@ -65,7 +66,7 @@ export function marksOf(worldNow, changed, save) {
   choose(kind);
 
   return {
-    root, toggle: () => show(root.hidden), stop: () => show(false),
+    root, toggle: () => show(root.hidden), stop: () => show(false), renew: () => put(),  // in another unit
     get open() { return !root.hidden; },
     get list() { return list; },
     get begun() { return begun; },

@@ -4,10 +4,11 @@ import { editor } from './editor.mjs';
 import { KINDS } from './grey.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
+import { sketches } from './shot.mjs';
 
 const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
 <output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="drawn as" title="drawn as (k)"></select>`;
-const STEPS = 200;  // that undo goes back
+const STEPS = 200, SMALL = 84;  // that undo goes back; px of a small picture
 
 // the file's name and what kind it is
 export function named(kind = '', element = document.createElement('header')) {
@@ -27,7 +28,7 @@ export function panel(look, viewer, live) {
   document.body.append(root);
   named('', root.querySelector('.named'));
   const find = (selector) => root.querySelector(selector), list = find('.layer'), undone = [], parts = [], layers = [];
-  let told = () => {}, chosen = 0;
+  let told = () => {}, chosen = 0, sketching = false;
 
   const enable = () => root.querySelectorAll('.undo').forEach((button) => { button.disabled = !undone.length; });
   const history = {
@@ -40,6 +41,7 @@ export function panel(look, viewer, live) {
     add: (part) => parts.push(part),
     chosen: () => { find('output').textContent = layers[chosen]?.told?.() ?? ''; },
     changed(alone = true) { history.chosen(); told(alone); },
+    light: (to) => lamp.set(lit(to)),
   };
 
   function undo() {
@@ -53,10 +55,26 @@ export function panel(look, viewer, live) {
     const after = k ? `-${k}` : '';
     layers.push({ layer, ...(layer.labels.length
       ? organs((rows) => look.labels(rows, k), layer.labels, `labels${after}`, history)
-      : editor((nodes) => look.apply(nodes, k), layer, `function${after}`, history)) });
+      : editor((nodes) => look.apply(nodes, k), layer, `function${after}`, { ...history, sketch: (...what) => sketch(k, ...what) })) });
   });
   root.append(...layers.map((one) => one.root), cut.root, light(look, viewer, live.light, history));
   const lamp = parts.at(-1), begun = lamp.state();
+  // the light under a preset's: its coefficients, null for none, undefined for as it is
+  function lit(to) {
+    const now = lamp.state(), kind = to === undefined ? now.kind : to === null ? 'none' : to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
+    return [begun, now].find((one) => JSON.stringify(one) === JSON.stringify(next)) ?? next;
+  }
+  // small pictures of presets {nodes, light} of a layer, as shot.mjs draws them, while going()
+  function sketch(k, looks, done, going) {
+    const put = (nodes, light) => {
+      look.apply(nodes, k);
+      look.light(light);
+      return look.ready();
+    }, show = async (j) => going() && (await put(looks[j].nodes, lit(looks[j].light)), true);
+    const begin = (now) => { sketching = now; told(true); };
+    begin(true);
+    return sketches(viewer, SMALL, looks.length, show, done, () => { begin(false); return put(layers[k].nodes(), lamp.state()); });
+  }
 
   function choose(k) {
     chosen = k;
@@ -111,7 +129,7 @@ export function panel(look, viewer, live) {
   return {
     root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
     drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
-    alone: () => drawn > 0 || cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
+    alone: () => sketching || drawn > 0 || cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };
 }

@@ -14,29 +14,60 @@ export function sizesOf({ graphicsDevice: { gl, canvas } }) {
   return [1, 2, 4].map((times) => [times * canvas.width, times * canvas.height]).filter((size, k) => !k || Math.max(...size) <= most);
 }
 
-// a PNG of `size`, [wide, high]; one frame is drawn so large, and the viewer gives the canvas its own size in the next one
-export async function pictureOf({ app }, svg, size) {
-  const { graphicsDevice: { canvas: source, gl } } = app, picture = document.createElement('canvas'), context = picture.getContext('2d');
-  const [wide, high] = size ?? [source.width, source.height];
-  const enlarge = () => { if (source.width !== wide || source.height !== high) [source.width, source.height] = [wide, high]; };  // after the viewer's
-  const tooLarge = () => new Error(`this browser cannot draw ${wide} × ${high} px: choose a smaller picture`);
-  app.once('framerender', enlarge);
+// one after the other, as each changes the canvas
+let last = Promise.resolve();
+const alone = (task) => (last = last.catch(() => {}).then(task));
+const sized = (canvas, [wide, high]) => { if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high]; };
+
+// a canvas with what the engine draws at a `size`, [wide, high]; the viewer gives its own canvas the window's size in the next frame
+async function drawn(app, size) {
+  const { canvas: source, gl } = app.graphicsDevice, picture = document.createElement('canvas'), context = picture.getContext('2d');
+  app.once('framerender', () => sized(source, size));  // after the viewer's
   await new Promise((done, fail) => {
     app.once('frameend', () => {  // later the engine's picture is gone
       app.renderNextFrame = true;
-      if (gl.drawingBufferWidth !== wide || gl.drawingBufferHeight !== high) return fail(tooLarge());
-      [picture.width, picture.height] = [wide, high];
-      context.fillRect(0, 0, wide, high);
+      if (gl.drawingBufferWidth !== size[0] || gl.drawingBufferHeight !== size[1]) return fail(tooLarge(size));
+      sized(picture, size);
+      context.fillRect(0, 0, ...size);
       context.drawImage(source, 0, 0);
       return done();
     });
     app.renderNextFrame = true;
   });
-  context.drawImage(await drawingOf(svg, wide / source.clientWidth), 0, 0, wide, high);
-  const blob = await new Promise((done) => picture.toBlob(done, 'image/png'));
-  if (!blob) throw tooLarge();
-  return blob;
+  return picture;
 }
+const tooLarge = (size) => new Error(`this browser cannot draw ${size.join(' × ')} px: choose a smaller picture`);
+
+// a PNG of `size`, by default the window's
+export const pictureOf = ({ app }, svg, size) => alone(async () => {
+  const { canvas } = app.graphicsDevice, all = size ?? [canvas.width, canvas.height], picture = await drawn(app, all);
+  picture.getContext('2d').drawImage(await drawingOf(svg, all[0] / canvas.clientWidth), 0, 0, ...all);
+  const blob = await new Promise((done) => picture.toBlob(done, 'image/png'));
+  if (!blob) throw tooLarge(all);
+  return blob;
+});
+
+// The middle of the view, `edge` pixels wide, of each of several looks: show(k) is done when the engine has look k, and says false to end; done(k, draw(context)).
+// What was seen stays in the window meanwhile; back() when all have been drawn.
+export const sketches = ({ app }, edge, count, show, done, back) => alone(async () => {
+  const { canvas } = app.graphicsDevice, { clientWidth: wide, clientHeight: high } = canvas, { camera } = app.root.findComponent('camera');
+  const { x, y } = camera.projectionOffset, [left, top] = [((1 - x) * wide) / 2, ((1 + y) * high) / 2], half = Math.min(left, wide - left, top, high - top), scale = edge / (2 * half);
+  const still = await drawn(app, [canvas.width, canvas.height]), size = [wide, high].map((n) => Math.ceil(n * scale)), small = () => sized(canvas, size);
+  let seen = true;
+  for (const event of ['pointerdown', 'wheel']) canvas.addEventListener(event, () => { seen = false; }, { once: true });  // who turns the view wants to see it
+  canvas.after(still);
+  app.on('framerender', small);
+  try {
+    for (let k = 0; k < count && seen && await show(k); k++) {
+      const picture = await drawn(app, size);
+      done(k, (to) => to.drawImage(picture, (left - half) * scale, (top - half) * scale, edge, edge, 0, 0, edge, edge));
+    }
+  } finally {
+    app.off('framerender', small);
+    await back();
+    still.remove();
+  }
+});
 
 // this page as its file was, but that it begins with `link`
 export function pageOf(source, link) {

@@ -1,4 +1,5 @@
 // Slices of the volume beside the picture: three planes that cross at a place, windowed, with the value under the pointer.
+import { hide } from './keys.mjs';
 import { placeText } from './ruler.mjs';
 import { gridOf, viewsOf } from './volume.mjs';
 
@@ -200,7 +201,8 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     choose(bases[0]);
   }
   async function toggle(shown = root.hidden) {
-    root.hidden = !shown;
+    if (shown) root.hidden = false;
+    else hide(root, document.querySelector('#tools .slices'));
     document.body.classList.toggle('sliced', shown);
     if (shown) await open().catch(({ message }) => { said.textContent = `The slices cannot be shown: ${message}.`; });
     draw();
@@ -213,10 +215,11 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   face.hidden = !cuts;
   face.addEventListener('click', () => onFace(face.getAttribute('aria-pressed') !== 'true'));
   find('.close').addEventListener('click', () => toggle(false));
+  root.addEventListener('keydown', ({ key }) => { if (key === 'Escape') toggle(false); });
 
   let looks = [];
   return {
-    root, toggle, found: (place) => found(base.toIndex(place)),
+    root, toggle, text, found: (place) => found(base.toIndex(place)),
     get open() { return Boolean(base) && !root.hidden; },
     // 0: not on the cut; another number: another look
     get face() { return base && !root.hidden && face.getAttribute('aria-pressed') === 'true' ? version + 1 : 0; },

@@ -57,14 +57,15 @@ export function where(viewer, scene, live, show) {
     if (marks.open) marks.take(place);
     live?.select(place);
     slices?.to(place.world);
-    site.say('picked', { place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
+    report(place, { label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
   });
+  const report = (place, more) => site.say('picked', { text: placeText(place, world), place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, ...more });
   const labelled = (layer) => live && live.look.layers[layer].labels.map((_, k) => live.look.rows[live.look.layers[layer].row + k]);
   const slices = scene.slices && slicesOf(scene, {
     world: () => world, cuts: Boolean(live), rows: labelled, moved: () => again(),
     picked(place) {
       if (place && marks.open) marks.take(place);
-      if (place) site.say('picked', { place: place.world, unit: world.unit, value: place.value ?? place.names[0] ?? null, in: place.in, layer: place.layer });
+      if (place) report(place, { text: slices.text(place), value: place.value ?? place.names[0] ?? null });
     },
   });
   const faces = slices && live && facesOf(viewer);
@@ -76,7 +77,9 @@ export function where(viewer, scene, live, show) {
   function take(now) {  // another frame is another file
     data = now;
     facts = factsOf(now.comments);
+    const { unit } = world ?? {};
     world = worldOf(facts, scene.enlarged);
+    if (world.unit !== unit) marks.renew();
     sides(world).forEach(([, axis, sign], k) => {
       const { made, title } = buttons[k];
       made.textContent = world.letters[axis][sign < 0 ? 0 : 1];
