@@ -30,7 +30,7 @@ from vvgt_cli.gaussians.types import SH_C0
 from vvgt_cli.score.viewing import VIEWS
 from vvgt_cli.splat import render
 
-COUNT, SIZE = 100_000, 512
+COUNT, SIZE, SCORED = 100_000, 512, 1080
 REPORTED = (1_000, 7_000, 30_000)  # steps
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "colors": 2.5e-3}
 D_SSIM, SMALL, FAINT = 0.2, 0.01, 0.01  # weights: of D-SSIM, of size, of opacity
@@ -81,7 +81,7 @@ def gaussians(splats: dict[str, torch.nn.Parameter]) -> Gaussians:
 def main(listing: str, data: str, functions: str, name: str, output: str, steps: int, views: int, device: str) -> None:
     """Train on a scene, print seconds and dB at some steps, and write the last Gaussians."""
     scene = next(read_scenes(listing, data, functions, (name,)))[1].scene()
-    cameras = [default_views("test", size=1080)[n] for n in VIEWS]
+    cameras = [default_views("test", size=SCORED)[n] for n in VIEWS]
     tests = [(camera, np.clip(render_view(scene, camera)[..., :3], 0, 1)) for camera in cameras]
     begun = time.perf_counter()
     cameras = default_views("train", views, size=SIZE)
@@ -125,7 +125,8 @@ def main(listing: str, data: str, functions: str, name: str, output: str, steps:
         slower.step()
         strategy.step_post_backward(splats, adams, state, step, info, lr=slower.get_last_lr()[0])
         if step + 1 in (*REPORTED, steps):
-            torch.cuda.synchronize()
+            if device == "cuda":
+                torch.cuda.synchronize()
             spent += time.perf_counter() - begun
             found = gaussians(splats)
             db = [-10 * np.log10(np.mean((np.clip(render(found, c)[..., :3], 0, 1) - r) ** 2)) for c, r in tests]
