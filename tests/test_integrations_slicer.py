@@ -127,7 +127,9 @@ def test_segments_keep_names_and_colours_and_hidden_ones_are_left(scene) -> None
     assert [name for name, _ in legend["labels"]] == ["left kidney, upper", "cyst"]
     assert legend["labels"][0][1].lower() == "336699"
     assert heaviest(folder / "segments.ply") == pytest.approx(facts["at"][:3], abs=0.2)  # mm; refined
-    assert read_ply(folder / "both.ply")[1].count > 1000
+    both = read_ply(folder / "both.ply")[1]
+    assert both.count > 1000
+    assert json.loads(both.legend) == legend
 
 
 @pytest.mark.long

@@ -111,12 +111,12 @@ def plan_conversion(request: ConvertRequest, console: Console | None = None) -> 
     """
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
+    if by_regions(request) and (request.blocks or automatic(request.source, run.console)) is not None:
+        raise UsageError(
+            f"--dry-run with more than {MANY:,} Gaussians in blocks: each region is refined by itself, without a plan; "
+            "remove --dry-run, or lower --max-gaussians"
+        )
     with open_field(run, replace(request, output=None)) as field:
-        if isinstance(field, Blocked) and by_regions(request):
-            raise UsageError(
-                f"--dry-run with more than {MANY:,} Gaussians in blocks: each region is refined by itself, without a "
-                "plan; remove it"
-            )
         work, _, plan = _planned(run, request, field)
         report_target(run, work.fit, request.megabytes)
         return plan

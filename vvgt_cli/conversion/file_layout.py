@@ -59,10 +59,8 @@ def _example(request: ConvertRequest) -> str | None:
 
 
 def _legend(source: Source) -> str | None:
-    """Return the legend of one function or label table."""
-    if len(source.layers) > 1:
-        return None
+    """Return the legend of one function, or of all label tables."""
     tf, numbers = source.tf, source.statistics
-    if isinstance(tf, LabelTable):
-        return legend_text(tf, 0.0, 0.0, "", source.volume.quantity)
+    if len(source.layers) > 1 or isinstance(tf, LabelTable):
+        return legend_text([layer.tf for layer in source.layers], 0.0, 0.0, "")
     return legend_text(tf, numbers.lo, numbers.hi, unit_of_values(source.volume, tf), source.volume.quantity)

@@ -202,10 +202,11 @@ def _options(
     from vvgt_cli.conversion.gaussian_files import layout_of
 
     old, live = header if isinstance(header, PlyOptions) else layout_of(header), header.live
+    tf = [one for one, _ in shown.looks] if isinstance(shown, SeveralLooks) else shown
     return replace(
         old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
         sh_degree=None, function=shown.name, optics=None,
-        legend=None if live is None else legend_text(shown, live.lo, live.hi, live.unit, live.quantity),
+        legend=None if live is None else legend_text(tf, live.lo, live.hi, live.unit, live.quantity),
     )  # fmt: skip
 
 
@@ -275,7 +276,7 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
     tf_range = parse_tf_range(function.tf_range)
     given = read_transfer_function(function.tf) if isinstance(function.tf, str) else function.tf
     tf = given or facts.tf(name)
-    return tf, resolve(tf, facts.statistics(), tf_range)
+    return tf, resolve(tf, facts.statistics(), tf_range, facts.unit == "HU" or given is None)
 
 
 def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:

@@ -340,14 +340,15 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
     """Return one line of JSON: value range, unit, quantity, nodes (value, opacity, colour); or labels (name, colour).
 
     Args:
-        tf: function on data values or label table; anything else has no legend, and None is returned.
+        tf: function on data values or label table; of several layers a list, whose label tables have a legend. Anything
+            else has none, and None is returned.
         lo: smallest value.
         hi: largest value.
         unit: unit of the values, "" if unknown.
         quantity: what the values are, "" if unknown.
     """
-    if isinstance(tf, LabelTable):
-        shown = [label for label in tf.labels if label.opacity > 0]
+    if tables := [one for one in (tf if isinstance(tf, list) else [tf]) if isinstance(one, LabelTable)]:
+        shown = [label for table in tables for label in table.labels if label.opacity > 0]
         rows = [[label.name, _hex(label.color)] for label in shown[:MOST_LABELS]]
         while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
             rows.pop()

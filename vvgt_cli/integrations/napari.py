@@ -31,12 +31,13 @@ from vvgt_cli.library.inputs import Look
 
 NODES = 256  # of a colour map, which may have steps
 STEP = 0.8  # voxels between samples of napari's translucent rendering
+BY_DEPTH = ("translucent", "translucent_no_depth", "opaque")
 
 
 def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[str]:
     """Write the visible layers among ``layers`` (data, attributes, kind) to a page or file; return its path.
 
-    One warning names what is drawn otherwise, in the window where there is one.
+    Warnings name what is drawn otherwise, in the window where there is one.
 
     Raises:
         UsageError: none is visible, or one has no three axes in space; napari passes over a ValueError.
@@ -46,15 +47,19 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
     if not shown:
         raise UsageError("no visible layer; show one of those that are saved")
     steps = max(len(_values(layer)) if _values(layer).ndim == 4 else 1 for layer in shown)
-    lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer))]
+    lost = [f"{layer.name}: {', '.join(notes)}" for layer in shown if (notes := _lost(layer, len(shown) > 1))]
+    said = [f"not taken from the layers: {'; '.join(lost)}"] if lost else []
     window = current_viewer()
-    if window is not None and str(window.camera.handedness) == "right":  # by napari's order of axes, z y x
-        lost.append("the side of depth (towards you in napari's 3D view, which is a mirror image of x, y, z)")
-    if lost and window is None:
-        warnings.warn(f"not taken from the layers: {'; '.join(lost)}", stacklevel=2)
-    elif lost:  # its dialog keeps Python's warnings to itself
-        show_warning(f"not taken from the layers: {'; '.join(lost)}")
-    found = [_converted(shown, step) for step in range(steps)]
+    if window is not None and window.dims.ndisplay == 3 and str(window.camera.handedness) == "right":
+        said.append("napari's 3D view is a mirror image of x, y, z (its depth points to you); the file is not mirrored")
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        found = [_converted(shown, step) for step in range(steps)]
+    for text in dict.fromkeys([*said, *(str(one.message) for one in heard if one.category is UserWarning)]):
+        if window is None:
+            warnings.warn(text, stacklevel=2)
+        else:  # its dialog keeps Python's warnings to itself
+            show_warning(text)
     if steps == 1:
         found[0].save(path)
         return [path]
@@ -74,9 +79,13 @@ def _converted(layers: Sequence[Any], step: int) -> Any:
     return together([(Content((v,)), _look(layer, v)) for layer, v in zip(layers, volumes, strict=True)], "none")
 
 
-def _lost(layer: Any) -> list[str]:
-    """Return notes on how napari draws a layer, and its Gaussians do not."""
+def _lost(layer: Any, several: bool) -> list[str]:
+    """Return notes on how napari draws a layer, one of ``several`` or not, and its Gaussians do not."""
+    own, scale = type(layer).__name__ != "Labels" and _colors(layer)[2], np.abs(layer.scale[-3:])
     lost = {
+        f"blending {layer.blending} (mixed by depth instead)": several and layer.blending not in BY_DEPTH,
+        "the layer's opacity of a whole pixel (of each sample instead)": own and layer.opacity < 1,
+        "opacity by voxels, which are uneven (by length instead)": own and scale.max() > 1.01 * scale.min(),
         f"rendering {layer.rendering} (translucent instead)": layer.rendering not in ("translucent", "iso_categorical"),
         "nearest-neighbour interpolation (linear instead)": getattr(layer, "interpolation3d", "") == "nearest",
         "one plane (all instead)": layer.depiction != "volume",
@@ -118,19 +127,22 @@ def _look(layer: Any, volume: Any) -> Look:
         table = {}
         for number in np.unique(_values(layer)):
             if number and (color := layer.get_color(number)) is not None:
-                name = str(names.get(number, number))
-                table[int(number)] = {
-                    "name": name,
-                    "color": color[:3].tolist(),
-                    "opacity": float(color[3] * layer.opacity),
-                }
+                name, alpha = str(names.get(number, number)), float(color[3] * layer.opacity)
+                table[int(number)] = {"name": name, "color": color[:3].tolist(), "opacity": alpha}
         return Look(labels=table)
     low, high = layer.contrast_limits
-    share = np.array([0, *np.linspace(1e-6, 1 - 1e-6, NODES), 1])  # at the ends a map may have colours of their own
-    colors = layer.colormap.map(share**layer.gamma)
-    own = bool((colors[:, 3] < 1).any())
+    share, colors, own = _colors(layer)
     opacity = colors[:, 3] * layer.opacity * (1 if own else share**layer.gamma)
     columns = low + share * (high - low), colors[:, :3].tolist(), opacity
     points = [{"x": x, "rgb": rgb, "opacity": float(a)} for x, rgb, a in zip(*columns, strict=True)]
-    unit = {"opacity_unit_distance": STEP * float(np.mean(volume.spacing))} if own else {}
+    coarse = layer.downsample_factors[-1][-3:][::-1] if layer.multiscale else 1  # in 3D napari shows the coarsest level
+    unit = {"opacity_unit_distance": STEP * float(np.mean(np.multiply(volume.spacing, coarse)))} if own else {}
     return Look({"name": layer.name, "points": points, **unit})
+
+
+def _colors(layer: Any) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return shares (n,) of the contrast limits, RGBA (n, 4) there, and whether opacity is the colour map's."""
+    share = np.array([0, *np.linspace(1e-6, 1 - 1e-6, NODES), 1])  # at the ends a map may have colours of their own
+    colors = layer.colormap.map(share**layer.gamma)
+    inner = colors if layer.rendering == "translucent" else colors[1:-1]  # elsewhere a clear end hides nothing else
+    return share, colors, bool((inner[:, 3] < 1).any())

@@ -1,11 +1,10 @@
 """The loop: a view a step, looks at the check views in between, the best kept.
 
-3DGS as it was published (Kerbl et al. 2023), for comparison: Gaussians are cloned, split and pruned on the way.
-
-There, of 30,000 steps, every 100th from the 500th to the 15,000th densifies; here the same shares of the run, but not
-before `FEWEST` views have been seen since the last time. Opacities are reset in every 3,000th step, where that
-leaves `RECOVERY` steps to recover in. Clones share the opacity of what they were cloned from,
-``1 - sqrt(1 - o)`` each (Rota Bulo et al. 2024): twice the original would darken the picture.
+`Densified` is 3DGS as it was published (Kerbl et al. 2023), for comparison: Gaussians are cloned, split and pruned on
+the way. There, of 30,000 steps, every 100th from the 500th to the 15,000th densifies; here the same shares of the run,
+but not before `FEWEST` views have been seen since the last time. Opacities are reset in every 3,000th step, where that
+leaves `RECOVERY` steps to recover in. Clones share the opacity of what they were cloned from, ``1 - sqrt(1 - o)`` each
+(Rota Bulo et al. 2024): twice the original would darken the picture.
 """
 
 from __future__ import annotations

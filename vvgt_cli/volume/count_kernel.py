@@ -1,4 +1,4 @@
-"""The kernels under `tallies`: how often each whole number occurs; range and histogram of other numbers."""
+"""Kernels of `vvgt_cli.field.counting`: how often each whole number occurs; range and histogram of others."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Random shapes like those of CT, MR and simulations (`SHAPES`), float32 with values near [0, 1].
+"""Synthetic volumes, float32 with cubic voxels, centred on 0, longest edge 2.
 
-A seed gives the same volume on every machine up to the last bits of Fourier transforms.
+Random shapes like those of CT, MR and simulations (`SHAPES`, values near [0, 1]), and volumes with a closed form (the
+`example:` sources). A seed gives the same volume on every machine up to the last bits of Fourier transforms.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Kernels of `codebooks`: optimal intervals of numbers, clusters of rows."""
+"""Kernels of `vvgt_cli.gaussians.formats.sog`: optimal intervals of numbers, clusters of rows."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 A plain (raw, appended) array is memory-mapped instead; a compressed one may be unpacked box by box (`packed`). The XML
 is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
 
-Compressed arrays are unpacked as far as a box needs them: behind the words that `vtk_blocks` checks, the packed blocks
+Compressed arrays are unpacked as far as a box needs them: behind the words that `blocks` checks, the packed blocks
 follow each other, in base64 as one string. Each is unpacked by itself (vtkXMLDataParser::ReadBlock).
 """
 

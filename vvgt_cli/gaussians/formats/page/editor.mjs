@@ -118,7 +118,8 @@ export function editor(apply, layer, key, history) {
   const choose = (chosen) => { now = { ...now, chosen }; draw(); history.chosen(); };
 
   function move(k, x, y) {
-    const { nodes } = now, at = { x: Math.min(Math.max(x, k ? nodes[k - 1].x : lo), k < nodes.length - 1 ? nodes[k + 1].x : hi), y: Math.min(Math.max(y, 0), 1) };
+    const { nodes } = now, last = nodes.length - 1, low = k ? nodes[k - 1].x : Math.min(lo, nodes[0].x), high = k < last ? nodes[k + 1].x : Math.max(hi, nodes[last].x);
+    const at = { x: Math.min(Math.max(x, low), high), y: Math.min(Math.max(y, 0), 1) };
     change(nodes.map((node, j) => (j === k ? { ...node, ...at } : node)));
   }
 

@@ -70,10 +70,10 @@ export function panel(look, viewer, live) {
       look.apply(nodes, k);
       look.light(light);
       return look.ready();
-    }, show = async (j) => going() && (await put(looks[j].nodes, lit(looks[j].light)), true);
-    const begin = (now) => { sketching = now; told(true); };
-    begin(true);
-    return sketches(viewer, SMALL, looks.length, show, done, () => { begin(false); return put(layers[k].nodes(), lamp.state()); });
+    };
+    const then = parts.map((part) => part.state()), same = () => parts.every((part, n) => part.state() === then[n]);  // or who looks has chosen meanwhile
+    const show = async (j) => going() && same() && (await put(looks[j].nodes, lit(looks[j].light)), true), begin = (now) => { sketching = now; told(true); };
+    return sketches(viewer, SMALL, looks.length, () => begin(true), show, (j, draw) => { if (same()) done(j, draw); }, () => { begin(false); return put(layers[k].nodes(), lamp.state()); });
   }
 
   function choose(k) {

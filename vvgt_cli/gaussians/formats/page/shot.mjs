@@ -47,9 +47,9 @@ export const pictureOf = ({ app }, svg, size) => alone(async () => {
   return blob;
 });
 
-// The middle of the view, `edge` pixels wide, of each of several looks: show(k) is done when the engine has look k, and says false to end; done(k, draw(context)).
-// What was seen stays in the window meanwhile; back() when all have been drawn.
-export const sketches = ({ app }, edge, count, show, done, back) => alone(async () => {
+// The middle of the view, `edge` pixels wide, of each of several looks: begin() before the first; show(k) is done when the engine has look k, and says false to end;
+// done(k, draw(context)). What was seen stays in the window meanwhile; back() when all have been drawn.
+export const sketches = ({ app }, edge, count, begin, show, done, back) => alone(async () => {
   const { canvas } = app.graphicsDevice, { clientWidth: wide, clientHeight: high } = canvas, { camera } = app.root.findComponent('camera');
   const { x, y } = camera.projectionOffset, [left, top] = [((1 - x) * wide) / 2, ((1 + y) * high) / 2], half = Math.min(left, wide - left, top, high - top), scale = edge / (2 * half);
   const still = await drawn(app, [canvas.width, canvas.height]), size = [wide, high].map((n) => Math.ceil(n * scale)), small = () => sized(canvas, size);
@@ -58,6 +58,7 @@ export const sketches = ({ app }, edge, count, show, done, back) => alone(async 
   canvas.after(still);
   app.on('framerender', small);
   try {
+    begin();
     for (let k = 0; k < count && seen && await show(k); k++) {
       const picture = await drawn(app, size);
       done(k, (to) => to.drawImage(picture, (left - half) * scale, (top - half) * scale, edge, edge, 0, 0, edge, edge));

@@ -215,7 +215,11 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   face.hidden = !cuts;
   face.addEventListener('click', () => onFace(face.getAttribute('aria-pressed') !== 'true'));
   find('.close').addEventListener('click', () => toggle(false));
-  root.addEventListener('keydown', ({ key }) => { if (key === 'Escape') toggle(false); });
+  root.addEventListener('keydown', (event) => {
+    if (event.key !== 'Escape' || event.defaultPrevented) return;
+    event.preventDefault();  // or what is measured would end, too
+    toggle(false);
+  });
 
   let looks = [];
   return {
