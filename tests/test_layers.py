@@ -245,6 +245,22 @@ def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     assert "several components" in table.error
 
 
+def test_names_of_labels_are_kept_beside_other_layers(vvgt, tmp_path: Path) -> None:
+    nibabel.save(nibabel.Nifti1Image(balls().astype(np.float32), np.eye(4)), tmp_path / "v.nii")
+    nibabel.save(nibabel.Nifti1Image(balls().astype(np.int16), np.eye(4)), tmp_path / "l.nii")
+    names = ["left kidney", "right kidney"]
+    table = {k: {"name": name, "color": [1, k / 3, 0], "opacity": 0.5} for k, name in zip((1, 3), names, strict=True)}
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    given = (tmp_path / "v.nii", "--tf", "gray", "--layer", f"{tmp_path / 'l.nii'},labels={tmp_path / 't.json'}")
+    for options, out in (((), "a.ply"), (("--live",), "b.ply")):
+        done = vvgt("init" if not options else "convert", *given, *SMALL[:4], *options, "-o", tmp_path / out)
+        assert done.code == 0, done.err
+    assert vvgt("recolor", tmp_path / "b.ply", "-o", tmp_path / "c.ply").code == 0
+    for out in ("a.ply", "c.ply"):
+        legend = json.loads(library.read_ply(tmp_path / out)[1].legend)
+        assert [name for name, _ in legend["labels"]] == names
+
+
 def test_rgb_looks_as_vtk_draws_dependent_components() -> None:
     """vtkGPUVolumeRayCastMapper's picture of RGBA, independent components off, at the same steps."""
     from tests.stiff_scenes import camera
