@@ -94,6 +94,13 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     right = "document.querySelector('#live .function svg').getBoundingClientRect().right"
     dots = "[...document.querySelectorAll('#live .node .dot')].map((dot) => dot.getBoundingClientRect().right)"
     assert person("eval", f"Math.max(...{dots}) < {right}")  # of 3000 HU, too, beyond all values
+    assert person("eval", "window.vvgt.live.at().named().name") == named[2]  # as what is saved is named
+    last = person("eval", "window.vvgt.live.nodes().at(-1).x")
+    person("eval", "[...document.querySelectorAll('#live .node')].at(-1).focus()")
+    person("press", "ArrowUp")
+    assert person("eval", "window.vvgt.live.nodes().at(-1).x") == last > 900
+    person("press", "Control+z")
+    person("eval", "document.querySelector('#live .preset').focus()")
     person("press", "Escape")
     closed = "[document.activeElement.className, document.querySelector('.presets').hidden]"
     assert person("eval", closed) == ["preset", True]

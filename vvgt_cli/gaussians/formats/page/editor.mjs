@@ -248,5 +248,6 @@ export function editor(apply, layer, key, history) {
     read: (said) => (said ? { nodes: read(said), exact: null, chosen: 0 } : whole(layer.nodes)),
   });
   draw();
-  return { root, nodes, told: () => text(now.nodes[now.chosen]), set: (to) => { history.keep(); now = { nodes: copy(to), exact: null, chosen: 0 }; show(); } };
+  const named = () => ({ ...layer, name: ready.find((one) => one.shows && one.nodes === now.exact)?.name ?? layer.name });  // the preset's name, if one is chosen
+  return { root, nodes, named, told: () => text(now.nodes[now.chosen]), set: (to) => { history.keep(); now = { nodes: copy(to), exact: null, chosen: 0 }; show(); } };
 }

@@ -39,7 +39,7 @@ export function messages({ live, lens, views, axes, moving }, app) {
     camera: rounded({ ...lens.pose(), orthographic: lens.flat }),
     ...(live && {
       cut: rounded(cut()), light: rounded(light()),
-      layers: live.layers.map(({ layer, nodes, rows }) => (nodes ? { function: functionFile(nodes(), layer) } : { labels: rows() })),
+      layers: live.layers.map(({ named, nodes, rows }) => (nodes ? { function: functionFile(nodes(), named()) } : { labels: rows() })),
     }),
   });
   const set = {

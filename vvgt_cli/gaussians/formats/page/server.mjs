@@ -94,7 +94,7 @@ export async function served(panel, viewer, server, converted) {
   text.setAttribute('role', 'status');
   root.append(text, row);
   const better = substitute(viewer);
-  const look = ({ layer, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), layer) });
+  const look = ({ named, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), named()) });
   const shown = () => (layers.length > 1 ? { layers: layers.map(look) } : look(layers[0]));
   let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
@@ -166,7 +166,7 @@ export async function served(panel, viewer, server, converted) {
 
   async function save(file) {
     if (file === 'json') {
-      const { layer, rows, nodes } = panel.at(), content = rows ? labelsFile(rows()) : functionFile(nodes(), layer);
+      const { named, rows, nodes } = panel.at(), content = rows ? labelsFile(rows()) : functionFile(nodes(), named());
       return download(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: 'application/json' }), rows ? 'labels.json' : 'tf.json');
     }
     try {
