@@ -19,7 +19,6 @@ import torch
 import torch.nn.functional as functional
 from dvr_scenes import read_scenes
 from gsplat import MCMCStrategy, rasterization
-from scipy.spatial import cKDTree
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import RADIUS
@@ -40,8 +39,9 @@ def starts(half: np.ndarray, device: str) -> dict[str, torch.nn.Parameter]:
     """Return the parameters of random Gaussians in a box of half extents ``half``."""
     rng = np.random.default_rng(0)
     means = rng.uniform(-1, 1, (COUNT, 3)) * half
-    near = cKDTree(means).query(means, 4)[0][:, 1:]
-    scale = np.log(0.1 * np.sqrt((near**2).mean(axis=1)))
+    there = torch.tensor(means, device=device)
+    near = torch.cat([torch.cdist(some, there).topk(4, largest=False).values for some in there.split(1000)])[:, 1:]
+    scale = np.log(0.1 * (near**2).mean(dim=1).sqrt().cpu().numpy())
     made = {
         "means": means,
         "scales": np.repeat(scale[:, None], 3, axis=1),
