@@ -6,7 +6,7 @@ look is baked in, for programs that ignore the values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from vvgt_cli.conversion.plan import report_target
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.result import Conversion
-from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import DataError, NoLiveForm, NothingVisible, UsageError
@@ -118,6 +118,9 @@ def convert_live(
         report_target(run, fit, request.megabytes)
     lighting, pixel = box_lighting(source), pixel_width(fit.size)
     check_layers(source)
+    axes = headset_axes(source.volume, ply_options(request, source).up)
+    scores = [TestViews(request.scored_whole), ViewingConditions(fit.target, axes)] if scored else []
+    field.views.expect([picture for stage in scores for picture in stage.views(fit)])
     if len(source.layers) > 1:
         gaussians, facts = _several_layers(run, request, field)
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
@@ -129,7 +132,7 @@ def convert_live(
     if unscored is not None:
         unscored(found)
     if scored:
-        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel))
+        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel), scores)
         found.ply = with_certificate(found.ply, run, field, fit, found.gaussians, request.command, psnr)
     return found
 
@@ -197,8 +200,10 @@ def check_layers(source: Source) -> None:
         )
 
 
-def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> float:
-    """Score Gaussians as other viewers show the file, and return the PSNR (dB) as `vvgt recolor` shows it."""
+def _score(
+    run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians, scores: Sequence[Stage]
+) -> float:
+    """Return the PSNR (dB) of Gaussians as `vvgt recolor` shows them; ``scores`` are those of other viewers."""
     from vvgt_cli.dvr import RenderSettings
 
     fit, source = request.fit, field.source
@@ -209,10 +214,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
         )
         stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as other viewers show it"
     work = Work(run, field, fit, gaussians=gaussians)
-    for stage_of_scores in (
-        TestViews(request.scored_whole),
-        ViewingConditions(fit.target, headset_axes(source.volume, ply_options(request, source).up)),
-    ):
+    for stage_of_scores in scores:
         stage_of_scores.run(work)
     return live.psnr
 
