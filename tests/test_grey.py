@@ -113,7 +113,7 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", values)
     source = load(SourceRequest(str(tmp_path / "a.npy"), tf="viridis"))
     scene, eye = source.scene(), camera()
-    origin, rays = reference.rays(eye, render.RAYS)
+    origin, rays = reference.rays(eye, render.MIP_RAYS)
     flat = rays.reshape(-1, 3)
     with np.errstate(divide="ignore"):
         near, far = (-scene.half - origin) / flat, (scene.half - origin) / flat

@@ -44,6 +44,13 @@ from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
+Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
+MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
+SUFFIXES = (".gif", ".mp4")
+RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
+_QUALITY = "18"  # of x264: visually almost lossless
+_MOST = 1 << 16  # colours that a palette is computed from
+_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
 
 
 @dataclass(frozen=True)
@@ -278,11 +285,6 @@ def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[C
     return f"{request.output}: {len(cameras) / RATE:.1f} s, {size / 1e6:.2f} MB"
 
 
-RAYS = 2  # along a pixel's edge
-STEP = 0.25  # voxels between samples
-Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
-
-
 def as_xray(source: Source) -> Source:
     """Return a volume under the extinction of its X-ray, unlit.
 
@@ -337,7 +339,7 @@ def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarr
     from vvgt_cli.dvr.render import Box as Frame
     from vvgt_cli.dvr.render import camera_arrays
 
-    n, frame, dims = RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
+    n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
     larger = replace(
         camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
         width=n * camera.width, height=n * camera.height,
@@ -346,7 +348,7 @@ def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarr
     out = np.zeros((larger.height, larger.width), np.float32)
     for box, lo, hi in parts:
         faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])
-        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, STEP, out)
+        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, MIP_STEP, out)
     mean: np.ndarray = out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
     return mean
 
@@ -355,13 +357,6 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
     """Return tables whose coordinate goes from 0 to 1 over the range of data values."""
     width = (statistics.hi - statistics.lo) or 1.0
     return Optics.linear(1.0)._replace(lo=(statistics.lo - intercept) / slope, inv_width=slope / width)
-
-
-SUFFIXES = (".gif", ".mp4")
-RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
-_QUALITY = "18"  # of x264: visually almost lossless
-_MOST = 1 << 16  # colours that a palette is computed from
-_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
 
 
 def movie_ready(path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""The header of a 3DGS `.ply`, which is parsed and checked before any data is read."""
+"""The header of a 3DGS `.ply`, checked before any data is read; its facts, legends and certificates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of the arguments of the Python API to requests."""
+"""Arguments of the Python API: their types, the requests that they stand for, and volumes made of arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layers of both transformers: attention, MLP, pre-norm block; names as in DINOv2's checkpoints."""
+"""Layers of both transformers, named as in DINOv2's checkpoints, and attention of tokens to views (Eq. 7)."""
 
 from __future__ import annotations
 

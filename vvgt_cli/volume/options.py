@@ -1,4 +1,4 @@
-"""`ReadOptions`: how to read a volume, where its file does not say or a caller wants something else."""
+"""Options of reading a volume, where its file does not say or a caller wants something else; crop and mask."""
 
 from __future__ import annotations
 

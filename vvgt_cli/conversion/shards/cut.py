@@ -1,4 +1,4 @@
-"""Cuts of a tiled pyramid by thresholds, as Gaussians region by region."""
+"""The plan of a conversion by blocks, and cuts of its tiled pyramid, as Gaussians region by region."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion to a file in blocks and regions: count, integrate, cut, refine, write; or by shards."""
+"""Conversion to a file in blocks and regions, or by shards: count, integrate, cut, refine, write, score."""
 
 from __future__ import annotations
 
@@ -59,6 +59,9 @@ if TYPE_CHECKING:
 
 DERIVED = ("coarse", "trees", "closed-", "errors-", "written-")  # what a merge adds to a folder of blocks
 A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
+BLOCKS_A_VIEW = 64  # of 16 x 16 px, by which test views are scored
+RAYS_A_PIXEL = 2  # along its edge
+A_GAUSSIAN = 400  # bytes to draw a Gaussian
 
 
 def writes_streaming(request: ConvertRequest) -> bool:
@@ -372,18 +375,13 @@ def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]
                 shutil.copyfileobj(sink, stream)
 
 
-FEW = 64  # blocks of 16 x 16 px of each test view
-RAYS = 2  # rays along a pixel's edge
-A_GAUSSIAN = 400  # bytes to draw a Gaussian
-
-
 def scored_views(size: int) -> list[Picture]:
     """List the blocks of three test views of ``size`` px."""
     from vvgt_cli.dvr import RenderSettings
 
     cameras = default_views("test", size=size)
-    settings = RenderSettings(samples=RAYS)
-    return [Picture(cameras[i], settings, spread_blocks(size, size, i, FEW)) for i in PREVIEW_VIEWS]
+    settings = RenderSettings(samples=RAYS_A_PIXEL)
+    return [Picture(cameras[i], settings, spread_blocks(size, size, i, BLOCKS_A_VIEW)) for i in PREVIEW_VIEWS]
 
 
 def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:

@@ -1,4 +1,4 @@
-"""One scene through the network: its loss with gradients, and its gain for the record."""
+"""One scene through the network: its loss with gradients, its gain for the record, and splatters for autograd."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The directories of a TIFF file, walked before a library sees them: no circles, no sizes that the file cannot hold."""
+"""Checks of the directories of a TIFF file, before a library reads them, and slices that stay in TIFF files."""
 
 from __future__ import annotations
 

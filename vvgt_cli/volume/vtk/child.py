@@ -41,6 +41,7 @@ SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 KEYS = ("dims", "spacing", "array", "component", "time")
+MOST_ROWS = 50  # of blocks or steps that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
 
 
@@ -290,10 +291,6 @@ def main() -> None:
     os._exit(0)  # whatever a damaged file left behind is not taken apart
 
 
-HEAD = 4096
-LISTED = 50  # blocks and steps
-
-
 def datasets(program: str, path: Path, time: int | None, array: str | None = None) -> tuple[list[Leaf], list[float]]:
     """Read the datasets of a time step, and the times of all steps.
 
@@ -321,7 +318,7 @@ def _indexed(index: Index, time: int | None, above: tuple[Path, ...]) -> Iterato
 def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
     """Read the datasets in a file that an index names."""
     with open(path, "rb") as file:
-        head = file.read(HEAD)
+        head = file.read(HEAD_BYTES)
     kind = xml_kind(head)
     if kind in INDEXES:
         yield from _indexed(read_index(path), None, above)
@@ -370,8 +367,8 @@ def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any
 
 
 def _short(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    left = len(rows) - LISTED
-    return rows if left <= 0 else [*rows[:LISTED], {"more": left}]
+    left = len(rows) - MOST_ROWS
+    return rows if left <= 0 else [*rows[:MOST_ROWS], {"more": left}]
 
 
 def _array(info: ArrayInfo, leaves: Sequence[Leaf]) -> dict[str, Any]:
