@@ -176,11 +176,7 @@ class Cloud:
 
 
 def parse_labels(sent: Any) -> LabelTable:
-    """Return the labels of a page: a list of number, color (RGB in [0, 1]) and opacity.
-
-    Raises:
-        DataError: labels that are not valid.
-    """
+    """Return the labels of a page, a list of number, color (RGB in [0, 1]) and opacity, or raise DataError."""
     what = "the page's labels"
     if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
         raise DataError(f"{what}: expected a list of at most {MOST_LABELS} objects")
@@ -196,11 +192,7 @@ def parse_labels(sent: Any) -> LabelTable:
 
 
 def parse_function(sent: Any) -> TransferFunction:
-    """Return the function of a page.
-
-    Raises:
-        DataError: no function, or one without an opacity unit distance.
-    """
+    """Return the function of a page; raise DataError without one, or without an opacity unit distance."""
     what = "the page's function"
     if not isinstance(sent, dict) or not isinstance(sent.get("points"), list) or len(sent["points"]) > NODES:
         raise DataError(f"{what}: expected an object with a list of at most {NODES} points")

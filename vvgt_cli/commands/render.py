@@ -264,11 +264,7 @@ def _pictures(request: RenderRequest, console: Console, draw: Draw, cameras: lis
 
 
 def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
-    """Write one movie; return its name and what it holds.
-
-    Raises:
-        UsageError: views of several sizes.
-    """
+    """Write one movie, and return its name and what it holds; raise UsageError for views of several sizes."""
     from vvgt_cli.images import over
 
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
@@ -286,11 +282,7 @@ def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[C
 
 
 def as_xray(source: Source) -> Source:
-    """Return a volume under the extinction of its X-ray, unlit.
-
-    Raises:
-        UsageError: labels, channels or layers.
-    """
+    """Return a volume under the extinction of its X-ray, unlit; raise UsageError for an optics grid."""
     source.require_scalar_field()
     layer = source.layers[0]
     assert isinstance(layer.tf, TransferFunction)
@@ -360,11 +352,7 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
 
 
 def movie_ready(path: str | Path) -> None:
-    """Check that a movie of this name can be written.
-
-    Raises:
-        DataError: a library that it needs is not installed.
-    """
+    """Check that a movie of this name can be written; raise DataError if a library that it needs is not installed."""
     if Path(path).suffix.lower() == ".mp4":
         _ffmpeg(str(path))
 

@@ -183,11 +183,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _parsed(content: bytes) -> Any:
-    """Parse JSON that was sent.
-
-    Raises:
-        DataError: not JSON.
-    """
+    """Parse JSON that was sent, or raise DataError."""
     try:
         return json.loads(content.decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:

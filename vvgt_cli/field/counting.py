@@ -85,11 +85,7 @@ class CountBlocks:
         )
 
     def merged(self) -> Tally:
-        """Return the sum over all boxes.
-
-        Raises:
-            DataError: a result is missing or damaged.
-        """
+        """Return the sum over all boxes; raise DataError if a result is missing or damaged."""
         whole: Tally | None = None
         for number in range(len(self)):
             part = self.store.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
@@ -161,11 +157,7 @@ class BlockAccess:
         return self._places[id(volume)][1]
 
     def counts(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
-        """Return the counting task of a volume, its counts and its statistics.
-
-        Raises:
-            DataError: no voxel has a finite value.
-        """
+        """Return a volume's counting task, its counts and its statistics; raise DataError if no voxel is finite."""
         if id(volume) not in self._done:
             self._done[id(volume)] = self._counted(volume)
         return self._done[id(volume)]
@@ -198,11 +190,7 @@ class BlockAccess:
         return self.counts(volume)[2]
 
     def labels(self, volume: Volume) -> list[int]:
-        """Return the labels that a volume holds, ascending.
-
-        Raises:
-            DataError: data values are not integers, or there are too many distinct ones.
-        """
+        """Return a volume's labels, ascending; raise DataError for too many, or data that are not integers."""
         task, whole, _ = self.counts(volume)
         if counted(volume):
             kind = volume.data.dtype.newbyteorder("=")

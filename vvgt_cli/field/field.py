@@ -75,11 +75,7 @@ class Field(Protocol):
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """Return mean value, spread, axis of the normals and gradient under Gaussians of the box frame, (K, 8) float32.
-
-        Raises:
-            UsageError: the source is an optics grid, which has no scalar values.
-        """
+        """Return mean value, spread, normals' axis and gradient under Gaussians of the box frame, (K, 8) float32."""
 
     def with_look(self, source: Source) -> Field:
         """Return the field of the same volume with another look.

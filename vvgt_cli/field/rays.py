@@ -67,11 +67,7 @@ class RayFile:
 
     @classmethod
     def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
-        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
+        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``, or raise DataError."""
         arrays: dict[str, np.ndarray] = {}
         for k, bundle in enumerate(bundles):
             eye, basis, lens = camera_arrays(frame, bundle.camera)
@@ -87,11 +83,7 @@ class RayFile:
         return cls(str(path), name)
 
     def bundles(self) -> list[KernelBundle]:
-        """Return the bundles for the kernels, read once per process.
-
-        Raises:
-            DataError: the file is damaged or missing.
-        """
+        """Return the bundles for the kernels, read once per process; raise DataError if they are damaged or missing."""
         return _read(self.path)
 
 

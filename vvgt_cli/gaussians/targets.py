@@ -54,11 +54,7 @@ TARGETS = {
 
 
 def target_of(name: str | None) -> Target | None:
-    """Return a target by its name; None for none.
-
-    Raises:
-        UsageError: there is no such target.
-    """
+    """Return a target by its name, None for none; raise UsageError if it is unknown."""
     if name is not None and name not in TARGETS:
         raise UsageError(f"target {name!r}; expected one of {', '.join(TARGETS)}")
     return None if name is None else TARGETS[name]

@@ -193,11 +193,7 @@ def score_views(reference: Iterable[np.ndarray], ours: Iterable[np.ndarray], *, 
 
 
 def mean_scores(views: list[ViewScore]) -> Scores:
-    """Average scores over views as described in `Scores`.
-
-    Raises:
-        DataError: there are no views.
-    """
+    """Average scores over views as described in `Scores`; raise DataError if there are no views."""
     if not views:
         raise DataError("no views to score; expected at least one")
     seen = [view for view in views if view.psnr_foreground is not None]

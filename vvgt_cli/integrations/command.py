@@ -16,11 +16,7 @@ ENDED = "vvgt: ended: "  # a status, as vvgt_cli/cli/main.py says of each of sev
 
 
 def command() -> list[str]:
-    """Return the words that start ``vvgt``: those of the environment variable VVGT, else its place in PATH.
-
-    Raises:
-        RuntimeError: there is none.
-    """
+    """Return the words that start ``vvgt``, of the variable VVGT or its place in PATH, or raise RuntimeError."""
     given = os.environ.get("VVGT")
     whole = shutil.which(given or "vvgt")  # a path may hold spaces and backslashes
     found = [whole] if whole else shlex.split(given or "")

@@ -14,11 +14,7 @@ from vvgt_cli.look.resolve import BY
 
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
-    """Return the function on data values, its nodes stretched to ``limits`` if given.
-
-    Raises:
-        UsageError: fractions of a range without limits, or limits for percentiles.
-    """
+    """Return the function on data values, stretched to ``limits``; raise UsageError where they do not suit it."""
     if tf.domain in BY:
         if limits is not None:
             raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")

@@ -154,11 +154,7 @@ class LabelTable:
 
 
 def check_labels(looks: Sequence[Named]) -> None:
-    """Refuse looks that hide everything; one of several layers may hide all its labels.
-
-    Raises:
-        DataError: all labels are transparent.
-    """
+    """Raise DataError for looks that hide everything; one of several layers may hide all its labels."""
     if all(isinstance(look, LabelTable) and not any(e.opacity > 0 for e in look.labels) for look in looks):
         raise DataError(f"{looks[0].name}: none of its labels is visible; expected opacity above 0: try --labels auto")
 

@@ -78,11 +78,7 @@ class Lighting:
 
 
 def parse_lighting(text: str) -> Lighting:
-    """Parse a line of `Lighting.text`.
-
-    Raises:
-        ValueError, UsageError: another text.
-    """
+    """Parse a line of `Lighting.text`; raise ValueError or UsageError for another text."""
     words = text.split()
     numbers: list[Any] = [float(word) for word in words[:4]]
     rest = words[4:]
@@ -173,11 +169,7 @@ def _direction(light: str, space: str | None) -> Direction:
 
 
 def preset_lighting(what: str, shade: bool, fields: dict[str, Any]) -> Lighting | None:
-    """Return the light of a volume property: a headlight if it is shaded, else None.
-
-    Raises:
-        DataError: coefficients out of range.
-    """
+    """Return a volume property's light, a headlight if shaded, else None; raise DataError for invalid coefficients."""
     if not shade:
         return None
     try:

@@ -39,11 +39,7 @@ class StatisticsLike(Protocol):
 
 
 def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]:
-    """Return ``data``, ``rescale`` or two ascending numbers.
-
-    Raises:
-        UsageError: anything else.
-    """
+    """Return ``data``, ``rescale`` or two ascending numbers; raise UsageError for anything else."""
     if spec in ("data", "rescale"):
         return spec
     try:

@@ -173,11 +173,7 @@ class NetworkConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Return the configuration of the values of `to_dict`.
-
-        Raises:
-            DataError: a missing or unknown field, or an invalid value.
-        """
+        """Return the configuration of the values of `to_dict`; raise DataError for missing, unknown or invalid ones."""
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
             known = {name: _exactly(side, values[name]) for name, side in sides.items()}

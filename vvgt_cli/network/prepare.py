@@ -70,11 +70,7 @@ class Prepared:
 
 
 def pack(gaussians: Gaussians) -> np.ndarray:
-    """Return (K, 14) float32; quaternions of norm 1 with the first non-zero component positive (q and -q are equal).
-
-    Raises:
-        DataError: Gaussians with harmonics, which a network does not support.
-    """
+    """Return (K, 14) float32, unit quaternions with their first non-zero component positive, or raise DataError."""
     if gaussians.harmonics is not None:
         raise DataError(
             f"spherical harmonics of degree {gaussians.degree}: a network supports only colours that do not "

@@ -157,11 +157,7 @@ def _seconds(run: Run) -> dict[str, float]:
 
 
 def read_series(path: str) -> Series:
-    """Read the runs of a `report.json`, or the one run of a `--report` of convert.
-
-    Raises:
-        DataError: the file is neither, or has no runs with scores.
-    """
+    """Read the runs of a `report.json`, or the one run of a `--report` of convert, or raise DataError without any."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
         kind = document["format"]

@@ -157,11 +157,7 @@ SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
 
 
 def make_shape(kind: str, size: int = 128, seed: int = 0) -> Volume:
-    """Return a volume of one of `SHAPES`, ``size`` voxels per side.
-
-    Raises:
-        UsageError: the size is below `SMALLEST`, or does not fit in memory.
-    """
+    """Return one of `SHAPES`, ``size`` voxels per side; raise UsageError below `SMALLEST`, or beyond memory."""
     if size < SMALLEST:
         raise UsageError(f"{kind} of {size} voxels per side: expected at least {SMALLEST}")
     check_memory(size**3 * BYTES, f"{kind} of {size} x {size} x {size} voxels")

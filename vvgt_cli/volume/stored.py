@@ -53,11 +53,7 @@ class Stored:
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """Read the block of one to three slices.
-
-        Raises:
-            DataError: a chunk that cannot be read, with its index.
-        """
+        """Read the block of one to three slices; raise DataError with the index of a chunk that cannot be read."""
         keys = key if isinstance(key, tuple) else (key,)
         whole = [*keys, *[slice(None)] * (3 - len(keys))]
         slices = tuple(slice(*k.indices(n)) for k, n in zip(whole, self.shape, strict=True))
@@ -100,11 +96,7 @@ def stored_or_held(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
     stored: bool,
 ) -> Any:  # fmt: skip
-    """Return a `Stored`, or its values in memory where ``stored`` is False; other arguments as `Stored`.
-
-    Raises:
-        DataError: the values do not fit in memory.
-    """
+    """Return a `Stored`, or its values if ``stored`` is False; raise DataError if they do not fit in memory."""
     found = Stored(read, dtype, tuple(shape), chunks, source)
     if stored:
         return found
@@ -129,11 +121,7 @@ def readable_in_blocks(volume: Volume) -> bool:
 
 
 def held(volume: Volume) -> Volume:
-    """Load the values of a volume into memory.
-
-    Raises:
-        DataError: they do not fit.
-    """
+    """Load the values of a volume into memory; raise DataError if they do not fit."""
     if not isinstance(volume.data, Stored):
         return volume
     check_memory(volume.data.nbytes, volume.name, IN_BLOCKS)

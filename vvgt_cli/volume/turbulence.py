@@ -151,11 +151,7 @@ class Solver:
 
 
 def advance(solver: Solver, state: np.ndarray, time: float, progress: ProgressCallback | None = None) -> np.ndarray:
-    """Advance the state by ``time``, in steps of `Solver.courant_step` with a shorter last one.
-
-    Raises:
-        DataError: the state is no longer finite.
-    """
+    """Advance the state by ``time``, in steps of `Solver.courant_step`; raise DataError if it is no longer finite."""
     now = 0.0
     while now < time * (1 - 1e-12):
         dt = min(solver.courant_step(state), time - now)

@@ -41,11 +41,7 @@ class Placed:
 
 
 def placed(comments: tuple[str, ...], name: str) -> Placed:
-    """Return the placement that a file's comments state.
-
-    Raises:
-        DataError: the comments are not valid.
-    """
+    """Return the placement that a file's comments state; raise DataError if they are not valid."""
     facts = facts_in(list(comments), name)
     space = facts.get("space") or "none"
     unit = "mm" if space != "none" else facts.get("length_unit") or ""

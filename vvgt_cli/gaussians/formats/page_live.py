@@ -232,11 +232,7 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
 
 
 def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
-    """Parse the JSON of a light sent by the page of a file with these options, in the format of `_light`.
-
-    Raises:
-        DataError, UsageError: the light is not valid.
-    """
+    """Parse the JSON of a light that a page of these options sends (as `_light` writes), or raise an error."""
     numbers = ("ambient", "diffuse", "specular", "power")
     if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
         raise DataError("the page's light: expected an object of kind none, headlight or direction")

@@ -339,11 +339,7 @@ _LARGEST_TEXT = 1 << 20
 
 
 def sog(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.sog`, along the Morton curve.
-
-    Raises:
-        DataError: there are more Gaussians than a file can hold.
-    """
+    """Encode columns as a `.sog`, along the Morton curve; raise DataError for more Gaussians than a file can hold."""
     if len(splats) > MOST:
         raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
     images, meta = images_of(splats.take(morton_order(splats.means)))
@@ -359,11 +355,7 @@ def sog(splats: Splats, name: str) -> bytes:
 
 
 def read_sog(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.sog` of version 2.
-
-    Raises:
-        DataError: the file is not valid.
-    """
+    """Read the columns of a `.sog` of version 2, or raise DataError."""
     with library_errors(name, "a .sog"), zipfile.ZipFile(io.BytesIO(content)) as archive:
 
         def read(file: str, largest: int = _LARGEST) -> bytes:

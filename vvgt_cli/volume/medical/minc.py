@@ -55,12 +55,7 @@ class _Image:
 
 
 def read_minc(path: Path, options: ReadOptions) -> Volume:
-    """Read a MINC file as float32. A fourth axis is time.
-
-    Raises:
-        DataError: h5py is not installed, a damaged file, values in other files, axes that are no volume.
-        UsageError: time steps (`SeveralSteps`) and none chosen, or a choice that does not exist.
-    """
+    """Read a MINC file as float32. A fourth axis is time."""
     with open(path, "rb") as file:
         packed = file.read(len(MAGIC)) == MAGIC
     with library_errors(str(path), "MINC"):

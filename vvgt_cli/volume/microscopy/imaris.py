@@ -50,10 +50,6 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
         path: of it.
         options: level, time, component.
         checked: the dataset of a path; raises where its values must not be read.
-
-    Raises:
-        DataError: a damaged file.
-        UsageError: several channels or time steps and none chosen, a level that is none.
     """
     if options.array is not None:
         raise UsageError(f"{path}: an Imaris file, which has one image; leave out --array {options.array}")

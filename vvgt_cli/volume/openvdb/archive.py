@@ -86,11 +86,7 @@ class Grid:
 
 
 def read_header(cursor: Cursor) -> list[Grid]:
-    """Read the descriptors of a file's grids; the cursor stands at its beginning.
-
-    Raises:
-        DataError: no OpenVDB file, another version, one that was written as a stream, or damage.
-    """
+    """Read the descriptors of a file's grids, the cursor at its beginning; raise DataError if it is unreadable."""
     if bytes(cursor.take(8)) != MAGIC:
         raise DataError(f"{cursor.name}: does not begin as an OpenVDB file does")
     (version,) = cursor.unpack("I")

@@ -37,11 +37,7 @@ class _Layout:
 
 
 def check_pages(path: Path) -> int:
-    """Count the pages of a file and check that its directories lie in it.
-
-    Raises:
-        DataError: a directory outside the file or in a circle, a tag or pixels that the file cannot hold.
-    """
+    """Count the pages of a file; raise DataError unless its directories, tags and pixels fit into it."""
     try:
         with open(path, "rb") as file:
             return _walk(file, path)

@@ -69,10 +69,6 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         path: the file.
         options: see `ReadOptions`.
         slices: how many slices a volume has, if the file is one of them.
-
-    Raises:
-        DataError: directories or OME-XML that cannot be, damaged or missing pages, pixels of an unknown coding.
-        UsageError: several series, channels or time steps (`SeveralSteps`) and none chosen.
     """
     import tifffile
 
@@ -293,11 +289,7 @@ class Facts:
     length: str = ""
 
     def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], list[str]]:
-        """Return the spacing (x, y, z) to use, and what was assumed for it.
-
-        Raises:
-            UsageError: sizes that cannot be used, and no spacing given.
-        """
+        """Return the spacing (x, y, z) and what was assumed for it; raise UsageError if unusable and none is given."""
         if self.trouble and options.spacing is None:
             raise UsageError(f"{source}: {self.trouble}; try --spacing X Y Z")
         if options.spacing is not None or self.spacing == (None, None, None):

@@ -46,24 +46,14 @@ LARGEST = 1 << 20  # bytes of the line of an answer
 
 
 def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
-    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume.
-
-    Raises:
-        DataError: damaged, or VTK's reader did not come to an end.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume."""
     facts, values = _asked(program, path, options, "volume")
     place = {key: tuple(facts[key]) for key in ("spacing", "origin", "direction")}
     return Volume(values, name=facts["name"], quantity=facts["quantity"], **place)  # type: ignore[arg-type]  # three numbers each
 
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
-    """Read what an index names: a single file as that file's reader does, several as one volume.
-
-    Raises:
-        DataError: damaged, or files that are missing, lie elsewhere or are no datasets.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read what an index names: a single file as that file's reader does, several as one volume."""
     found = _single(read_index(path), options.time)
     if found is None:
         return volume_by_child(INDEX, path, options)
@@ -87,11 +77,7 @@ def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tup
 
 
 def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """List steps, arrays and blocks, each a row with the option that chooses it.
-
-    Raises:
-        DataError: as `volume_by_child`.
-    """
+    """List steps, arrays and blocks, each with the option that chooses it; errors are those of `volume_by_child`."""
     return _asked(program, path, options, "contents")[0]
 
 
@@ -355,11 +341,7 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
 
 
 def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """List steps, arrays and blocks, each a row with the option that chooses it; by default those of the first step.
-
-    Raises:
-        DataError: as `datasets`.
-    """
+    """List steps, arrays and blocks (by default of the first step) with the option of each, or raise DataError."""
     leaves, times = datasets(program, path, options.time or 0)
     steps = [{"step": k, "time": t, "option": f"--time {k}"} for k, t in enumerate(times)] if len(times) > 1 else []
     rows = {"steps": steps, "arrays": [_array(info, leaves) for info in arrays_in(leaves)], "blocks": _blocks(leaves)}

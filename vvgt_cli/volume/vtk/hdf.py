@@ -29,12 +29,7 @@ PLACE = ("WholeExtent", "Spacing", "Origin", "Direction")
 
 
 def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
-    """Read a ``.vtkhdf``.
-
-    Raises:
-        DataError: damaged.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read a ``.vtkhdf``."""
     try:
         import h5py
     except ImportError:

@@ -230,12 +230,7 @@ def _grid(parser: Parser, where: str) -> tuple[tuple[int, ...], list[float], lis
 
 
 def read_legacy(path: Path, options: ReadOptions) -> Volume:
-    """Read a legacy VTK image: point data, or cell data on the grid of cell centres.
-
-    Raises:
-        DataError: another dataset than an image, or sections that do not fit the file.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
+    """Read a legacy VTK image: point data, or cell data on the grid of cell centres."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         parser = Parser(text, path)
         parser.parse()

@@ -65,11 +65,7 @@ class Samples:
 
 
 def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
-    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2).
-
-    Raises:
-        DataError: bounds that are not finite.
-    """
+    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2); raise DataError if these are not finite."""
     if not np.isfinite(bounds).all():
         raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
     size, spacing = _grid(bounds, dims, cells)
