@@ -116,11 +116,7 @@ def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rul
 
 
 def backproject(
-    start: Start,
-    cameras: Sequence[Camera],
-    views: np.ndarray,
-    progress: Progress | None = None,
-    rule: Rule = INRIA,
+    start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None, rule: Rule = INRIA
 ) -> tuple[Gaussians, str]:
     """Improve by views what needs no gradient descent: which cells are split, the style of surfaces, and colours.
 

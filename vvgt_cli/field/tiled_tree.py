@@ -14,16 +14,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.moments import Cells, morton
-from vvgt_cli.closed_form.tree import (
-    Leaves,
-    Tree,
-    build_tree,
-    cap_by_ancestors,
-    leaves_of,
-    pyramid,
-    shown,
-    split_score,
-)
+from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, cap_by_ancestors, leaves_of, pyramid, shown, split_score
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError

@@ -356,12 +356,7 @@ def console_of(progress: bool) -> Console:
 
 
 def volume_in_memory(
-    data: Any,
-    options: ReadOptions,
-    *,
-    origin: Sequence[float] | None = None,
-    affine: Any = None,
-    name: str = "array",
+    data: Any, options: ReadOptions, *, origin: Sequence[float] | None = None, affine: Any = None, name: str = "array"
 ) -> Volume:
     """Make a volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
 

@@ -152,9 +152,7 @@ def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     return first if len(looks) == 1 else None
 
 
-def live_page_data(
-    clouds: Sequence[tuple[Gaussians, PlyOptions]],
-) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
+def live_page_data(clouds: Sequence[tuple[Gaussians, PlyOptions]]) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
     """Return the data of a page of Gaussians (unit frame) that carry values, for one or several clouds.
 
     Returns:

@@ -23,15 +23,7 @@ from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.blocks import check_blocks
 from vvgt_cli.volume.vtk.legacy import Parser
 from vvgt_cli.volume.vtk.resample import resample
-from vvgt_cli.volume.vtk.xml import (
-    GHOSTS,
-    HIDDEN,
-    around,
-    extent_dims,
-    scan,
-    stored_ratio,
-    without,
-)
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, around, extent_dims, scan, stored_ratio, without
 
 
 def check_xml_grid(path: Path) -> str:

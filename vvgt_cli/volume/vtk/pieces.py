@@ -23,16 +23,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
 from vvgt_cli.volume.types import Volume, float_dtype, triple
-from vvgt_cli.volume.vtk.xml import (
-    GHOSTS,
-    HIDDEN,
-    Scan,
-    extent_dims,
-    extent_of,
-    image_grid,
-    image_values,
-    scan,
-)
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
 HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
