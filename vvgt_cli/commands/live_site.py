@@ -18,7 +18,7 @@ from vvgt_cli.commands.converter import ConsoleLine, Converted, Converter, Faile
 from vvgt_cli.commands.server import Resource
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_ply, as_stored
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
@@ -42,9 +42,7 @@ NODES = 4096  # of a function that a page sends
 
 def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
     """Return a `.ply` as the page's viewer reads it."""
-    stream = io.BytesIO()
-    write_ply(stream, replace(gaussians, live=None), replace(upright(options), live=None))
-    return stream.getvalue()
+    return as_ply(replace(gaussians, live=None), replace(upright(options), live=None))
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,7 @@ class Cloud:
             return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, extras))
         if self.ply is not None:
             return Resource(BYTES, lambda: self.ply or b"")
-        stream = io.BytesIO()
-        write_ply(stream, self.gaussians, self.options)
-        return Resource(BYTES, stream.getvalue)
+        return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
     def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
         """Return the cloud under another function, which is on data values and has an opacity_unit_distance.

@@ -149,8 +149,8 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     else:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
-    if request.movie:
-        movie_ready(request.output)
+    if request.movie and request.output.lower().endswith(".mp4"):
+        _ffmpeg(request.output)  # raises where it is not installed
     with ExitStack() as stack:
         if isinstance(request.given, str):
             draw, cameras, by = _gaussians(run, request, request.given)
@@ -349,12 +349,6 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
     """Return tables whose coordinate goes from 0 to 1 over the range of data values."""
     width = (statistics.hi - statistics.lo) or 1.0
     return Optics.linear(1.0)._replace(lo=(statistics.lo - intercept) / slope, inv_width=slope / width)
-
-
-def movie_ready(path: str | Path) -> None:
-    """Check that a movie of this name can be written; raise DataError if a library that it needs is not installed."""
-    if Path(path).suffix.lower() == ".mp4":
-        _ffmpeg(str(path))
 
 
 def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False) -> int:

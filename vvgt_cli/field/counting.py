@@ -6,6 +6,7 @@ figures are those of `stats.statistics`, to the bit, however the volume is cut.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -17,11 +18,12 @@ from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, Place
-from vvgt_cli.field.settings import counted_boxes, slices_at_once
+from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
+from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.label_maps import MOST
 from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
-from vvgt_cli.volume.stored import read_block, readable_in_blocks
+from vvgt_cli.volume.stored import read_block
 
 
 @dataclass(frozen=True)
@@ -165,17 +167,18 @@ class BlockAccess:
     def _counted(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
         suffix = str(self._count) if self._count else ""
         self._count += 1
-        if not readable_in_blocks(volume):
+        if isinstance(volume.data, Packed):
             raise UsageError(
                 f"{volume.name}: compressed as one stream, which cannot be read in blocks; decompress it (raw, .nhdr "
                 "and .nii files are mapped), or store it in chunks (Zarr, HDF5)"
             )
-        edge = self._edge
-        boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
+        shape, spacing = shape_of(volume, self._edge), sample_spacing(volume.dims)
+        x, y, z = (max(e, spacing) for e in shape)  # boxes are aligned to the lattice of samples
         labels = not counted(volume) and volume.data.dtype.kind in "iu"
         first = CountBlocks(
-            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._store, COUNTS + suffix, labels=labels
-        )
+            self.place(volume), Boxes(volume.dims, (x, y, z)), max(math.prod(shape) // (x * y), 1), self._store,
+            COUNTS + suffix, labels=labels,
+        )  # fmt: skip
         self._run(first)
         whole = with_limits(first.merged(), volume)
         histogram = None

@@ -112,18 +112,6 @@ def shape_of(volume: Volume, edge: int) -> Triple:
     return max(across, edge), edge, edge
 
 
-def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
-    """Return the boxes in which values are counted, aligned to the lattice of samples."""
-    x, y, z = (max(e, spacing) for e in shape_of(volume, edge))
-    return Boxes(volume.dims, (x, y, z))
-
-
-def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
-    """Return how many slices of a box hold as many voxels as a block of ``edge``."""
-    x, y, _ = boxes.edge
-    return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
-
-
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least: int = 1) -> CellGrid:
     """Return the grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels.
 

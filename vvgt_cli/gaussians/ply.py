@@ -111,6 +111,13 @@ def write_ply(
     return len(header) + rows.nbytes
 
 
+def as_ply(gaussians: Gaussians, options: PlyOptions | None = None, normals: np.ndarray | None = None) -> bytes:
+    """Return the file that `write_ply` would write, with its errors."""
+    stream = io.BytesIO()
+    write_ply(stream, gaussians, options, normals)
+    return stream.getvalue()
+
+
 def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None = None) -> np.ndarray:
     """Return the rows of a file, (K, properties) float32 little-endian, as `write_ply` writes them, with its errors."""
     _check_rotations(gaussians, "Gaussians to write")

@@ -306,7 +306,7 @@ def with_look(source: SourceRequest, look: Look) -> SourceRequest:
         unit_distance=None if look.unit_distance is None else str(look.unit_distance),
         light=light_of(look.light),
         labels=labels_of(look.labels),
-        layers=tuple(layer_of(layer) for layer in look.layers),
+        layers=tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x)) for x in look.layers),
     )
 
 
@@ -319,11 +319,6 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
     if isinstance(labels, Mapping):
         return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels
-
-
-def layer_of(layer: LayerLike) -> SourceRequest:
-    """Return a layer as it is, or parsed from a value of ``--layer``."""
-    return layer if isinstance(layer, SourceRequest) else parse_layer(os.fspath(layer))
 
 
 def light_of(light: LightLike) -> LightOptions:
@@ -341,12 +336,9 @@ def light_of(light: LightLike) -> LightOptions:
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:
     """Return the path of a ``.ply``, or a result as a stream of its file."""
     if isinstance(ply, Result):
-        from vvgt_cli.gaussians import write_ply
+        from vvgt_cli.gaussians import as_ply
 
-        stream = io.BytesIO()
-        write_ply(stream, ply.gaussians, replace(ply.ply, frame="unit", up="none"))
-        stream.seek(0)
-        return stream
+        return io.BytesIO(as_ply(ply.gaussians, replace(ply.ply, frame="unit", up="none")))
     return os.fspath(ply)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.volume.blocks import IN_BLOCKS, Packed, check_memory
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.types import Volume
 
 Slices = tuple[slice, ...]
@@ -92,6 +92,19 @@ class Stored:
         return DataError(f"{self.source}: cannot be read ({error}); try again")
 
 
+def slice_by_slice(read: Callable[[int], np.ndarray], dtype: np.dtype, shape: tuple[int, ...], source: str) -> Stored:
+    """Return a `Stored` of which ``read`` returns slice z as (ny, nx)."""
+
+    def part(slices: Slices) -> np.ndarray:
+        z, y, x = slices
+        out = np.empty([s.stop - s.start for s in slices], dtype)
+        for k in range(z.start, z.stop):
+            out[k - z.start] = read(k)[y, x]
+        return out
+
+    return Stored(part, dtype, shape, (1, *shape[1:]), source)
+
+
 def stored_or_held(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
     stored: bool,
@@ -113,11 +126,6 @@ def put_overlap(out: np.ndarray, first: Sequence[int], block: np.ndarray, at: Se
             tuple(slice(a - o, b - o) for a, b, o in zip(begin, end, origin, strict=True)) for origin in (first, at)
         )
         out[there] = block[here]
-
-
-def readable_in_blocks(volume: Volume) -> bool:
-    """Tell whether parts of a volume's array can be read without the rest: mapped, `Stored`, bricks, or in memory."""
-    return not isinstance(volume.data, Packed)
 
 
 def held(volume: Volume) -> Volume:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_ply, read_ply
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
 
@@ -66,9 +66,7 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
 def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
     """Return the columns that `write_ply` would write, with its errors."""
-    stream = io.BytesIO()
-    write_ply(stream, gaussians, options)
-    return columns_of(stream.getvalue(), "Gaussians")
+    return columns_of(as_ply(gaussians, options), "Gaussians")
 
 
 def columns_of(content: bytes, name: str) -> Splats:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import size_text
-from vvgt_cli.volume.stored import Slices, Stored
+from vvgt_cli.volume.stored import Stored, slice_by_slice
 from vvgt_cli.volume.tiff.decode import Pages
 
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _DEPTH = 256, 257, 258, 277, 32997
@@ -129,35 +129,27 @@ def lazy_pages(
         file = tifffile.TiffFile(path)
         return file, file.series[number], Pages(path)  # the file to keep it open
 
-    def read(slices: Slices) -> np.ndarray:
-        z, y, x = slices
-        out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), dtype)
-        for k in range(z.start, z.stop):
-            place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
-            with turn:
-                _, series, pages = opened()
-                page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
-            page = page.reshape(inner)[index[len(lead) :]]
-            out[k - z.start] = (page.T if turned else page)[y, x]
-        return out
+    def read(k: int) -> np.ndarray:
+        place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
+        with turn:
+            _, series, pages = opened()
+            page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
+        page = page.reshape(inner)[index[len(lead) :]]
+        return page.T if turned else page
 
-    return Stored(read, dtype, (lead[axis], rows, columns), (1, rows, columns), str(path))
+    return slice_by_slice(read, dtype, (lead[axis], rows, columns), str(path))
 
 
 def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
     """Return slices that stay in their files; ``of`` reads one as (1, y, x), all as ``plane``, the first of them."""
 
-    def read(slices: Slices) -> np.ndarray:
-        z, y, x = slices
-        out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), plane.dtype)
-        for k in range(z.start, z.stop):
-            values = of(files[k])
-            if values.shape != plane.shape or values.dtype != plane.dtype:
-                raise DataError(
-                    f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
-                    f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
-                )
-            out[k - z.start] = values[0, y, x]
-        return out
+    def read(k: int) -> np.ndarray:
+        values = of(files[k])
+        if values.shape != plane.shape or values.dtype != plane.dtype:
+            raise DataError(
+                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
+                f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
+            )
+        return values[0]
 
-    return Stored(read, plane.dtype, (len(files), *plane.shape[1:]), (1, *plane.shape[1:]), source)
+    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)

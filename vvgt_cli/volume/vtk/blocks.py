@@ -145,11 +145,6 @@ def _words(data: bytes, word: np.dtype) -> np.ndarray:
     return np.frombuffer(data[: len(data) // word.itemsize * word.itemsize], word)
 
 
-def table_bytes(words: int, word: np.dtype, coded: bool) -> int:
-    """Return the bytes of the file that so many words before the blocks take."""
-    return 4 * -(-words * word.itemsize // 3) if coded else words * word.itemsize
-
-
 def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:
     """Read the words before the blocks of an array in the appended data, those that are there."""
     size = path.stat().st_size

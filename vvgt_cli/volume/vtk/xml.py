@@ -28,7 +28,7 @@ from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
-from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, table_bytes, walk_xml
+from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
@@ -361,7 +361,8 @@ def packed_array(
             f"{path}: array {info.name!r} has no table of {need} bytes in blocks; check that the file is whole"
         )
     begins = np.concatenate([[0], np.cumsum(sizes)])
-    place = start + table_bytes(len(words), word, coded)
+    size = len(words) * word.itemsize
+    place = start + (4 * -(-size // 3) if coded else size)
     packed = _Blocks(path, compressor, coded, place, begins, each, need)
     _, ny, nx, components = shape
     row = nx * components * dtype.itemsize
