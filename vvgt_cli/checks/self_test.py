@@ -160,12 +160,7 @@ def compare_with_twin(
 ) -> Figure:
     """Measure the mean difference of a view from its float64 twin, relative to the twin's largest value.
 
-    Args:
-        scene: scene to draw.
-        camera: of the view.
-        twin_step: sampling step of the twin, in the smallest voxel edge.
-        limit: largest difference that passes.
-        empty: whether the view may be empty.
+    The twin samples at ``twin_step`` smallest voxel edges; ``limit`` is what passes; ``empty`` views may show nothing.
     """
     image = render_view(scene, camera, FINE)
     require_valid(image)

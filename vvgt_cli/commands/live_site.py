@@ -83,15 +83,7 @@ class Cloud:
         return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
     def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
-        """Return the cloud under another function, which is on data values and has an opacity_unit_distance.
-
-        Args:
-            tf: the function.
-            light: as the page sends it; None: the file's own.
-
-        Raises:
-            DataError, UsageError: the light is not valid, or the Gaussians carry labels.
-        """
+        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's)."""
         facts = self._alone("a function")
         table, facts = self._function(facts, tf)
         distance = tf.opacity_unit_distance
@@ -201,15 +193,9 @@ def parse_function(sent: Any) -> TransferFunction:
 
 
 def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
-    """Return the text of a page, named "", and the file that it loads.
+    """Return the text of a page, named "", and the file that it loads; raise DataError if a library is missing.
 
-    Args:
-        cloud: what it shows, live if possible.
-        converts: whether there is a volume, which can be converted for a function if it has a single layer.
-        sliced: whether the volume has slices.
-
-    Raises:
-        DataError: a library that pages of live Gaussians need is missing.
+    It ``converts`` a volume for functions if that has a single layer, and shows its slices if it is ``sliced``.
     """
     if not cloud.live:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"

@@ -33,15 +33,10 @@ class BlockStore:
     folder: Path
 
     def open(self, settings: dict[str, Any], ours: bool) -> bool:
-        """Create the folder, or reuse it after a run with the same settings; return whether it existed.
+        """Create the folder, or reuse it after a run with the same (plain) settings; return whether it existed.
 
-        Args:
-            settings: everything that the results depend on, plain values.
-            ours: the folder belongs to this program, which removes another run's results.
-
-        Raises:
-            UsageError: the folder holds another run's results, or something else.
-            DataError: the folder cannot be written.
+        A folder that is ``ours`` loses another run's results; else raise UsageError for these, DataError if it is
+        unwritable.
         """
         text = json.dumps(settings, sort_keys=True, indent=1)
         place = self.folder / RUN

@@ -125,14 +125,7 @@ class BlockAccess:
     def __init__(
         self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
-        """Prepare for counting.
-
-        Args:
-            store: destination of the results.
-            edge: edge of blocks in voxels.
-            run: runs the missing blocks of a task.
-            histogram: whether a histogram is needed even for types that are not counted value by value.
-        """
+        """Prepare for counting; a ``histogram`` may be needed even for types that are not counted value by value."""
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}

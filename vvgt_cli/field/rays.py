@@ -122,15 +122,9 @@ def pieces_of(dims: tuple[int, int, int]) -> Boxes:
 
 
 def save_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, store: BlockStore) -> None:
-    """Cast all rays through the pieces of a block, and save what they see.
+    """Cast all rays through the pieces of block ``number`` of ``blocks``, and save what they see.
 
-    Args:
-        rays: the rays.
-        block: voxels of the block, with `HALO` or, under light, `LIT_HALO` voxels around it.
-        number: number of the block.
-        blocks: all blocks, each of whole pieces.
-        light: lighting, None for none.
-        store: destination of the result.
+    ``block`` has `HALO` or, under light, `LIT_HALO` voxels around it.
     """
     pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
     lo, hi = blocks.at(number)

@@ -53,12 +53,6 @@ def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: in
     """Return the number of processes: as many as threads where there is much to do and memory for each.
 
     Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md).
-
-    Args:
-        options: the user's choice.
-        voxels: number of voxels to process.
-        gaussians: budget of Gaussians.
-        threads: threads that the process may use.
     """
     if options.workers is not None or options.scheduler is not None or options.shard is not None:
         return options.workers or 1

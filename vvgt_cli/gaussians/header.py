@@ -163,15 +163,7 @@ def rest_names(degree: int) -> list[str]:
 
 
 def parse_header(content: bytes, name: str) -> PlyHeader:
-    """Parse the header of a file.
-
-    Args:
-        content: the beginning of the file, with the whole header.
-        name: name of the file for errors.
-
-    Raises:
-        DataError: the magic, format, elements, properties or types are not those of a 3DGS `.ply`.
-    """
+    """Parse the header at the beginning of a file; raise DataError if it is not that of a 3DGS `.ply`."""
     lines, size = header_lines(content, name)
     formats, count, comments = [], None, []
     fields: dict[str, str] = {}

@@ -61,11 +61,7 @@ def target_of(name: str | None) -> Target | None:
 
 
 def check_opened(path: str, name: str | None) -> None:
-    """Refuse a file that no program of a target opens; ``name`` is None for none.
-
-    Raises:
-        UsageError: names the ending that most of them open.
-    """
+    """Raise UsageError for a file that no program of a target opens; ``name`` is None for none."""
     target = target_of(name)
     if target is not None and path.lower().endswith(target.unread):
         raise UsageError(f"-o {path} with --for {name}: no program there opens it; expected {target.best}")

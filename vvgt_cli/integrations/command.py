@@ -29,12 +29,7 @@ def command() -> list[str]:
 def run(arguments: Sequence[str], say: Callable[[str], object] = print) -> None:
     """Run a command of ``vvgt``, such as ``["convert", "a.vti", "-o", "a.html"]``.
 
-    Args:
-        arguments: words behind ``vvgt``.
-        say: takes each line of its messages as it comes.
-
-    Raises:
-        RuntimeError: it is not found, or it failed: its error.
+    ``say`` takes each line of its messages as it comes. Raise RuntimeError with its error if it fails, or is not found.
     """
     with _start(arguments, subprocess.DEVNULL) as process:
         _listen(process, say)

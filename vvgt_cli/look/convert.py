@@ -30,15 +30,7 @@ def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> Transfer
 
 
 def to_text(tf: TransferFunction, form: str) -> str:
-    """Return the JSON text of a function on data values or percentiles.
-
-    Args:
-        tf: as `placed` returns it.
-        form: "minimal" or "paraview".
-
-    Raises:
-        DataError: a feature that the format cannot store.
-    """
+    """Return a placed function's JSON in a ``form``, minimal or paraview; raise DataError if it cannot store it."""
     body = _minimal(tf) if form == "minimal" else _paraview(tf)
     return json.dumps(body, indent=1, allow_nan=False) + "\n"
 

@@ -160,11 +160,7 @@ def check_labels(looks: Sequence[Named]) -> None:
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:
-    """Return solid labels in distinct colours, which depend on the label's number alone and repeat above 78.
-
-    Args:
-        numbers: of the labels, ascending; 0 is transparent.
-    """
+    """Return solid labels (``numbers`` ascending, 0 transparent) in colours by their number, which repeat above 78."""
     from matplotlib import colormaps
 
     colors = [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]

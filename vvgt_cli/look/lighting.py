@@ -111,15 +111,7 @@ class LightOptions:
     occlusion: float | None = None
 
     def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
-        """Return the light of a scene, None if it is not lit.
-
-        Args:
-            preset: light of the function's file.
-            space: anatomical space of the world, None if it has none.
-
-        Raises:
-            UsageError: invalid lights, or other options without a light.
-        """
+        """Return a scene's light, None if unlit; ``preset`` is the function file's. Raise UsageError if invalid."""
         given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}
         given |= {"occlusion": self.occlusion} if self.occlusion is not None else {}
         given |= {"shadows": True} if self.shadows else {}

@@ -26,14 +26,7 @@ def draw(
 ) -> None:
     """Write a PNG: the opacity curve, filled with the function's colours, over the histogram (log counts).
 
-    Args:
-        tf: the function; drawn over the data range with ``statistics`` (then on data values), else over its nodes.
-        statistics: of the data, or None.
-        path: the PNG.
-        overwrite: replace an existing file.
-
-    Raises:
-        UsageError: the file exists and ``overwrite`` is not set.
+    Without ``statistics`` the nodes are the range. Raise UsageError if the file exists and ``overwrite`` is not set.
     """
     from matplotlib.figure import Figure
 

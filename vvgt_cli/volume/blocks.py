@@ -251,13 +251,9 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
 
 
 def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """Split ``n`` white-space separated words from ``text``, from ``start`` on, in windows.
+    """Yield ``n`` words of ``text`` from ``start`` on, in windows, with the position behind each.
 
-    Yields:
-        (words, position behind them).
-
-    Raises:
-        DataError: too few words.
+    Raise DataError if there are fewer.
     """
     missing, position = n, start
     while missing:

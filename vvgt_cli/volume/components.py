@@ -159,16 +159,7 @@ def contiguous(field: np.ndarray) -> np.ndarray:
 
 
 def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Take the Euclidean norm of data values over the last axis, slice by slice.
-
-    Args:
-        values: (nz, ny, nx, c) stored values.
-        slope: of the data value ``slope * stored + intercept``.
-        intercept: of the data value.
-
-    Returns:
-        (nz, ny, nx) float32.
-    """
+    """Return the Euclidean norms (nz, ny, nx) float32 of data values ``slope * stored + intercept``, slice by slice."""
     out = np.empty(values.shape[:3], np.float32)
     for z, plane in enumerate(values):
         total = np.zeros(plane.shape[:2])

@@ -311,13 +311,7 @@ ROWS = (
 
 
 def way_out(path: Path, head: bytes, by_name: bool) -> str | None:
-    """Return what a file is and what to do with it, None where that is not known.
-
-    Args:
-        path: the file.
-        head: its first bytes.
-        by_name: its name may decide, too.
-    """
+    """Return what a file is and what to do with it, by its first bytes or, ``by_name``, its name; None if unknown."""
     for begins, ends, what, way in ROWS:
         if not re.match(begins, head) or not (begins or by_name) or not re.search(f"(?:{ends})$", path.name, re.I):
             continue

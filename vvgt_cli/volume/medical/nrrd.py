@@ -270,16 +270,7 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
 
 
 def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
-    """Return file names and how many axes each file holds; None where ``named`` is one file's name.
-
-    Args:
-        path: the header, whose lines behind ``LIST`` are names.
-        named: value of the field.
-        n: axes of the array.
-
-    Raises:
-        DataError: a list without names, a pattern that is none, or axes that do not fit.
-    """
+    """Return names and how many of ``n`` axes each file holds, None if ``named`` is one file, or raise DataError."""
     words = named.split()
     if words and words[0] == "LIST":
         lines = path.read_bytes()[:MAX_HEADER].decode("utf-8", "replace").splitlines()
@@ -315,18 +306,9 @@ def _load_files(
     dtype: np.dtype,
     load: Callable[[str, tuple[int, ...]], np.ndarray],
 ) -> np.ndarray:
-    """Load the blocks of several files, one behind the other along the slowest axes.
+    """Load the blocks of files, in order along the slowest axes; each holds the fastest ``axes``, or a slab of all.
 
-    Args:
-        path: the header, for messages.
-        names: in the order of the array.
-        axes: that each file holds (the fastest ones; all: slabs of the slowest axis).
-        shape: of the whole, slowest first.
-        dtype: of the values.
-        load: name and shape to block.
-
-    Raises:
-        DataError: files and sizes that do not fit.
+    Raise DataError where files and sizes do not fit; ``load`` takes name and shape.
     """
     n = len(shape)
     part = shape[n - axes :]

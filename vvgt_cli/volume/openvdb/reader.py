@@ -196,14 +196,10 @@ class BrickArray:
     def __init__(
         self, fill: np.ndarray, which: np.ndarray, bricks: np.ndarray, first: tuple[int, int, int], shape: Any
     ) -> None:
-        """Take the parts as they are.
+        """Take ``bricks`` (n, 8, 8, 8) by x, y, z, and their rows ``which`` (bz, by, bx) int32, -1 where there is none.
 
-        Args:
-            fill: (bz, by, bx) value of the bricks that do not vary.
-            which: (bz, by, bx) int32 row of ``bricks``, -1 where there is none.
-            bricks: (n, 8, 8, 8) values by x, y, z.
-            first: voxels (z, y, x) of the first bricks that lie before the array.
-            shape: of the array.
+        ``fill`` (bz, by, bx) holds the values of those; ``first`` voxels (z, y, x) of the first bricks lie before the
+        array.
         """
         self.shape: tuple[int, int, int] = tuple(shape)
         self.dtype = fill.dtype

@@ -84,14 +84,7 @@ def check_legacy_grid(path: Path) -> None:
 
 
 def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of a vtkDataSet: an image as it is, any other grid or mesh of cells resampled.
-
-    Args:
-        mesh: vtkDataSet (pyvista's are).
-        options: ``array``, ``component``, ``spacing``, and ``dims`` of what is resampled.
-        source: for messages.
-        name: of the volume.
-    """
+    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled."""
     if not mesh.IsA("vtkDataSet"):
         raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
     if mesh.IsA("vtkPolyData"):
