@@ -39,12 +39,12 @@ from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.recognise import background_bins
-from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.label_maps import extents_of
+from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import triple
 
 FOG_NAME = "fog"
@@ -338,7 +338,7 @@ def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...])
     return replace(gaussians, live=live, harmonics=None)
 
 
-def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> TransferFunction:
+def fog(statistics: Statistics, shown: TransferFunction | None = None) -> TransferFunction:
     """Return a function that is transparent only in the background, and denser the farther a value is from it.
 
     Args:

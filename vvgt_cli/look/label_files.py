@@ -245,17 +245,11 @@ def _dicom(source: str) -> list[Label]:
     """Read the segments of a DICOM segmentation; 0 is the background."""
     found = dicom_segments(source)
     colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
-    return [
-        _label(
-            source,
-            one.number,
-            one.name,
-            list(one.color or colors[one.number]),
-            SOLID if one.number else 0.0,
-            codes=codes_of(one.terms),
-        )
-        for one in found
-    ]
+    labels = []
+    for one in found:
+        color, opacity = list(one.color or colors[one.number]), SOLID if one.number else 0.0
+        labels.append(_label(source, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
+    return labels
 
 
 def table_of(parsed: Any, what: str) -> LabelTable:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.files import atomic_write
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.resolve import StatisticsLike
+from vvgt_cli.volume.stats import Statistics
 
 SAMPLES = 1024
 X_LABEL = {
@@ -22,7 +22,7 @@ X_LABEL = {
 
 
 def draw(
-    tf: TransferFunction, statistics: StatisticsLike | None, path: str | PathLike[str], overwrite: bool = False
+    tf: TransferFunction, statistics: Statistics | None, path: str | PathLike[str], overwrite: bool = False
 ) -> None:
     """Write a PNG: the opacity curve, filled with the function's colours, over the histogram (log counts).
 
@@ -43,7 +43,7 @@ def draw(
         figure.savefig(temporary, format="png", metadata={"Software": None})
 
 
-def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[float, float]:
+def _limits(tf: TransferFunction, statistics: Statistics | None) -> tuple[float, float]:
     """Return the ends of the horizontal axis: the data's range, or the nodes'."""
     lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
     if lo == hi:
@@ -69,7 +69,7 @@ def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
     axes.tick_params(axis="x", pad=10)
 
 
-def _draw_histogram(axes: Any, statistics: StatisticsLike) -> None:
+def _draw_histogram(axes: Any, statistics: Statistics) -> None:
     behind = axes.twinx()
     counts, edges = np.asarray(statistics.histogram), np.asarray(statistics.edges)
     behind.stairs(counts, edges, fill=True, color="0.85")

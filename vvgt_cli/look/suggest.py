@@ -18,8 +18,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.histogram import contours
 from vvgt_cli.look.recognise import AIR, air_and_tissue, background_bins, foreground, in_hounsfield
-from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.volume.bodies import largest
+from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
 
@@ -73,7 +73,7 @@ class Suggestion:
         return json.dumps(document, indent=1) + "\n"
 
 
-def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: float) -> list[Suggestion]:
+def suggest(statistics: Statistics, count: int, voxels: float, spacing: float) -> list[Suggestion]:
     """Return functions for ``count`` bands of the foreground's values, low values first; deterministic.
 
     A band is a trapezoid: transparent outside, constant in its middle half and up to the ends of the data. Its height
@@ -165,7 +165,7 @@ def _rgb(lab: np.ndarray) -> np.ndarray:
     return found.clip(0, 1)
 
 
-def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
+def fitting(statistics: Statistics, volume: Volume) -> str | None:
     """Return the name of a function that shows something of a volume, None if none is made for such data.
 
     Densities get contours. Hounsfield units get the lungs if there are some, else bone if there is any, else soft

@@ -118,18 +118,8 @@ def table(runs: Sequence[Run]) -> str:
     stages = stage_names(runs)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    heads = [
-        "name",
-        "kind",
-        "seconds",
-        "gaussians",
-        "bytes",
-        *SCORES,
-        "worst_condition",
-        "pareto",
-        *(f"seconds: {s}" for s in stages),
-    ]
-    writer.writerow(heads)
+    heads = ("name", "kind", "seconds", "gaussians", "bytes", *SCORES, "worst_condition", "pareto")
+    writer.writerow([*heads, *(f"seconds: {s}" for s in stages)])
     best = {id(run) for run in pareto(runs)}
     for run in runs:
         scores = run.get("scores") or {}

@@ -24,23 +24,10 @@ from vvgt_cli.volume.types import Volume
 
 # vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.
 _TYPES = {
-    "bit": "",
-    "char": "i1",
-    "signed_char": "i1",
-    "unsigned_char": "u1",
-    "short": "i2",
-    "unsigned_short": "u2",
-    "int": "i4",
-    "unsigned_int": "u4",
-    "long": "i8",
-    "unsigned_long": "u8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "vtkidtype": "i4",
-    "colour": "u1",
-    "float": "f4",
-    "double": "f8",
-}
+    "bit": "", "char": "i1", "signed_char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2",
+    "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8",
+    "vtkidtype": "i4", "colour": "u1", "float": "f4", "double": "f8",
+}  # fmt: skip
 _FIXED = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1, "EDGE_FLAGS": 1}
 
 
