@@ -134,8 +134,8 @@ def lazy_pages(
         with turn:
             _, series, pages = opened()
             page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
-        page = page.reshape(inner)[index[len(lead) :]]
-        return page.T if turned else page
+        kept: np.ndarray = page.reshape(inner)[index[len(lead) :]]
+        return kept.T if turned else kept
 
     return slice_by_slice(read, dtype, (lead[axis], rows, columns), str(path))
 
