@@ -18,6 +18,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
 HEAD_BYTES = 4096
+HDF5 = b"\x89HDF\r\n\x1a\n"  # which files of several formats begin with
 
 
 def lazy(name: str, *first: Any) -> Callable[..., Any]:

@@ -46,15 +46,9 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         attributes = dict(array.attrs)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
         return labelled_volume(
-            lambda index: np.asarray(array[index]),
-            array.dtype,
-            axes,
-            attributes,
-            options,
-            str(place),
-            name_in(path, place),
-            array.chunks,
-        )
+            lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
+            name_in(path, place), array.chunks,
+        )  # fmt: skip
 
 
 def _array(zarr: Any, place: Path) -> Any:
