@@ -84,10 +84,6 @@ def test_checkerboard() -> None:
     np.testing.assert_array_equal(coarse, np.kron(data[:2, :2, :2], np.ones((4, 4, 4))))
 
 
-def test_constant() -> None:
-    assert np.unique(shapes.constant(4, 2.5).data).tolist() == [2.5]
-
-
 def test_random_field_is_band_limited_and_seeded() -> None:
     volume = shapes.random_field(32, cycles=5, seed=1)
     assert (volume.data.min(), volume.data.max()) == (0, 1)

@@ -105,7 +105,6 @@ def test_velocity_stays_free_of_divergence_and_within_the_kept_modes():
     state = advance(solver, solver.start(4), 0.3)
     assert divergence(solver, state) < 1e-13
     assert np.abs(state[:, ~solver.kept]).max() == 0
-    assert solver.spectrum(state).sum() == pytest.approx(solver.energy(state[:3]), rel=0.02)  # corners lie beyond
 
 
 def test_products_of_modes_do_not_fold_back():

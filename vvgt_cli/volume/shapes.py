@@ -248,12 +248,6 @@ def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
     return volume_of((x[None, None, :] + y[None, :, None] + z[:, None, None]) % 2, "checkerboard")
 
 
-def constant(size: Size = 16, value: float = 1.0) -> Volume:
-    """Return a volume with the same value everywhere."""
-    nx, ny, nz = _dims(size)
-    return volume_of(np.full((nz, ny, nx), value, np.float32), "constant")
-
-
 def random_field(size: Size = 64, cycles: float = 8.0, seed: int = 0) -> Volume:
     """Return band-limited periodic noise with values over [0, 1]; the same seed gives the same volume.
 

@@ -99,12 +99,6 @@ class Solver:
         """Return nu times the mean of |grad u|^2 + |grad b|^2."""
         return float((np.abs(state) ** 2 * self.weight * self.k2).sum()) * self.flow.viscosity
 
-    def spectrum(self, state: np.ndarray) -> np.ndarray:
-        """Return the kinetic energy of the shells |k| in [i - 1/2, i + 1/2), i from 0 to n / 2."""
-        shell = np.rint(np.sqrt(self.k2)).astype(np.int64).ravel()
-        energy = (np.abs(state[:3]) ** 2 * self.weight).sum(axis=0).ravel() / 2
-        return np.bincount(shell, energy, minlength=self.flow.size // 2 + 1)[: self.flow.size // 2 + 1]
-
     def slope(self, state: np.ndarray) -> np.ndarray:
         """Return d(state)/dt without the viscous terms."""
         flow, u = self.flow, state[:3]
