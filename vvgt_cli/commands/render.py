@@ -46,11 +46,6 @@ VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
 Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
 MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
-SUFFIXES = (".gif", ".mp4")
-RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
-_QUALITY = "18"  # of x264: visually almost lossless
-_MOST = 1 << 16  # colours that a palette is computed from
-_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
 
 
 @dataclass(frozen=True)
@@ -149,8 +144,8 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     else:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
-    if request.movie and request.output.lower().endswith(".mp4"):
-        _ffmpeg(request.output)  # raises where it is not installed
+    if request.movie:
+        movie_ready(request.output)
     with ExitStack() as stack:
         if isinstance(request.given, str):
             draw, cameras, by = _gaussians(run, request, request.given)
@@ -349,6 +344,19 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
     """Return tables whose coordinate goes from 0 to 1 over the range of data values."""
     width = (statistics.hi - statistics.lo) or 1.0
     return Optics.linear(1.0)._replace(lo=(statistics.lo - intercept) / slope, inv_width=slope / width)
+
+
+SUFFIXES = (".gif", ".mp4")
+RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
+_QUALITY = "18"  # of x264: visually almost lossless
+_MOST = 1 << 16  # colours that a palette is computed from
+_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
+
+
+def movie_ready(path: str | Path) -> None:
+    """Check that a movie of this name can be written; raise DataError if a library that it needs is not installed."""
+    if Path(path).suffix.lower() == ".mp4":
+        _ffmpeg(str(path))
 
 
 def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False) -> int:
