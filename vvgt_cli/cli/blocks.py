@@ -68,11 +68,7 @@ shared_block_options = group("blocks", **_options, **_shard_option)
 
 
 def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
-    """Return the options of blocks, None to let the program choose.
-
-    Raises:
-        UsageError: options that do not fit together.
-    """
+    """Return the options of blocks, None to let the program choose; raise UsageError if they do not fit together."""
     from vvgt_cli.field.settings import BlockOptions
 
     if all(value is None for value in blocks.values()):

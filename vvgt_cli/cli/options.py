@@ -190,11 +190,7 @@ class Measure(click.ParamType[float]):
         self.name, self.units = name, units
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number.
-
-        Raises:
-            click.BadParameter: not a number, or an unknown unit.
-        """
+        """Return the number, or raise click.BadParameter."""
         found, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
         with suppress(ValueError, TypeError, KeyError):
             number = float(found[1]) * self.units[found[2]]  # type: ignore[index]  # None: TypeError

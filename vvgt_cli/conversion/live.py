@@ -57,11 +57,7 @@ GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from
 
 
 def check_live(request: ConvertRequest) -> None:
-    """Check that a request has no option that live files do not take.
-
-    Raises:
-        NoLiveForm: names the options.
-    """
+    """Raise NoLiveForm, which names them, for options of a request that live files do not take."""
     fit, limits, light = request.fit, request.limits, request.source.light
     given = {
         "--target-psnr": limits.target_psnr is not None,
@@ -193,11 +189,7 @@ def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Ga
 
 
 def check_layers(source: Source) -> None:
-    """Check that all layers have values or labels.
-
-    Raises:
-        NoLiveForm: a layer has colours.
-    """
+    """Raise NoLiveForm if a layer has colours, neither values nor labels."""
     if any(layer.colors for layer in source.layers):
         raise NoLiveForm(
             f"{source.name}: has colours, which Gaussians cannot carry as one value; expected scalars or labels with "
@@ -252,11 +244,7 @@ def function_table(source: Source) -> Table:
 
 
 def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:
-    """Return the closed form of a fog.
-
-    Raises:
-        NothingVisible: the volume is only background.
-    """
+    """Return the closed form of a fog; raise NothingVisible if the volume is only background."""
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
@@ -291,11 +279,7 @@ def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
 
 
 def live_labels(source: Source) -> tuple[Label, ...]:
-    """Return the labels that Gaussians can belong to, invisible ones included, which other tables may show.
-
-    Raises:
-        DataError: there are more than `MOST_LABELS`.
-    """
+    """Return labels that Gaussians can belong to, invisible ones too; raise DataError for more than `MOST_LABELS`."""
     table = source.tf
     assert isinstance(table, LabelTable)
     found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)

@@ -226,11 +226,7 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Content:
-    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`.
-
-    Raises:
-        DataError, UsageError: see `volume_of`.
-    """
+    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`."""
     if isinstance(volume, str | os.PathLike):
         return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
@@ -242,11 +238,7 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
 
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:
-    """Return the reading options of a caller.
-
-    Raises:
-        UsageError: an option is unknown.
-    """
+    """Return the reading options of a caller; raise UsageError if one is unknown."""
     import numpy as np
 
     given = dict(reading)
@@ -268,11 +260,7 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
 
 
 def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
-    """Return the function of a caller: a path or name as it is, or a mapping read as a JSON file.
-
-    Raises:
-        DataError: the mapping is not a function.
-    """
+    """Return a caller's function: a path or name as it is, or a mapping read as a JSON file, or raise DataError."""
     from vvgt_cli.look import read_transfer_function
 
     if isinstance(tf, Mapping):
@@ -281,11 +269,7 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
 
 
 def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceRequest:
-    """Return the request for a volume under a look.
-
-    Raises:
-        DataError, UsageError: see `volume_of` and `function_of`.
-    """
+    """Return the request for a volume under a look; errors are those of `volume_of` and `function_of`."""
     if isinstance(volume, str | os.PathLike):  # the source opens it: colours and channels are several volumes
         source = SourceRequest(os.fspath(volume), _options(reading))
     else:
@@ -294,11 +278,7 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
-    """Return the request for a source's volume under a look.
-
-    Raises:
-        DataError, UsageError: see `function_of`.
-    """
+    """Return the request for a source's volume under a look; errors are those of `function_of`."""
     return replace(
         source,
         tf=function_of(look.function),
@@ -311,11 +291,7 @@ def with_look(source: SourceRequest, look: Look) -> SourceRequest:
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
-    """Return the label table of a caller: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file.
-
-    Raises:
-        DataError: the mapping is not a table.
-    """
+    """Return a caller's label table: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file."""
     if isinstance(labels, Mapping):
         return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels

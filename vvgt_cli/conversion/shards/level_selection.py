@@ -138,11 +138,7 @@ class ErrorRegions:
 
 
 def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
-    """Make and draw `CUTS` cuts of every node; results of an interrupted run are reused.
-
-    Raises:
-        DataError: a result is damaged.
-    """
+    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's; raise DataError if one is damaged."""
     tree, store = cut.tiled_tree, cut.store
     finest = tree.threshold(cut.plan.budget)
     second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
