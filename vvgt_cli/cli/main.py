@@ -17,7 +17,7 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
+from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
@@ -95,12 +95,6 @@ def _note(message: Warning | str, *_: object, **__: object) -> None:
     print(f"vvgt: note: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _usage(error: click.ClickException) -> int:
-    context = getattr(error, "ctx", None)
-    hint = f" (see '{context.command_path} --help')" if context else ""
-    return _fail(error.format_message() + hint, error.exit_code)
-
-
 def _os_error(error: OSError) -> str:
     what = error.strerror or str(error) or type(error).__name__
     if error.filename:
@@ -152,7 +146,9 @@ def _status(error: BaseException) -> int:
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
     if isinstance(error, click.ClickException):
-        return _usage(error)
+        context = getattr(error, "ctx", None)
+        hint = f" (see '{context.command_path} --help')" if context else ""
+        return _fail(error.format_message() + hint, error.exit_code)
     if isinstance(error, VvgtError):
         return _fail(str(error), error.exit_code)
     if isinstance(error, BrokenPipeError):
@@ -166,7 +162,7 @@ def _status(error: BaseException) -> int:
         return _fail("interrupted", INTERRUPTED)
     if isinstance(error, SystemExit):
         code = error.code if isinstance(error.code, int) else 1
-        name = ended_by(code)
+        name = next((signal.Signals(number).name for number in ENDING if code == 128 + number), None)
         return _fail(f"ended by {name}", code) if name and first_of_group() else code
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
 

@@ -32,7 +32,10 @@ def draw(
 
     figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    lo, hi = _limits(tf, statistics)
+    lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
+    if lo == hi:
+        margin = abs(lo) * 0.5 or 0.5
+        lo, hi = lo - margin, hi + margin
     if statistics is not None:
         _draw_histogram(axes, statistics)
     x = np.unique(np.concatenate([np.linspace(lo, hi, SAMPLES), np.clip(tf.breakpoints(), lo, hi)]))
@@ -41,15 +44,6 @@ def draw(
     axes.set_title(tf.name, parse_math=False)
     with atomic_write(path, overwrite) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})
-
-
-def _limits(tf: TransferFunction, statistics: Statistics | None) -> tuple[float, float]:
-    """Return the ends of the horizontal axis: the data's range, or the nodes'."""
-    lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
-    if lo == hi:
-        margin = abs(lo) * 0.5 or 0.5
-        return lo - margin, hi + margin
-    return lo, hi
 
 
 def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:

@@ -96,16 +96,11 @@ def suggest(statistics: Statistics, count: int, voxels: float, spacing: float) -
         raise DataError("the data have no finite voxel; expected some to choose transfer functions from")
     if lo == hi:
         raise DataError(f"every value of the data is {lo:g}; expected some that differ to choose ranges from")
-    background = _background(counts)
+    first, last = background_bins(counts)  # which no function shows, unless it is all or wide
+    alone = counts[first:last].sum() == counts.sum()
+    background = (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
     data, grid = (counts, edges, background), (voxels, spacing)
     return [_suggestion(band, data, (k, count), grid) for k, band in enumerate(_bands(counts, background, count))]
-
-
-def _background(counts: np.ndarray) -> Bins:
-    """Return the bins [first, last) that no function shows; (0, 0) for none."""
-    first, last = background_bins(counts)
-    alone = counts[first:last].sum() == counts.sum()
-    return (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
 
 
 def _bands(counts: np.ndarray, background: Bins, count: int) -> list[Bins]:
