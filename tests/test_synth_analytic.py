@@ -16,7 +16,6 @@ ALL = [
     shapes.slab,
     shapes.sphere,
     shapes.checkerboard,
-    shapes.constant,
     shapes.random_field,
 ]
 
