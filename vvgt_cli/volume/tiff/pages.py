@@ -150,6 +150,7 @@ def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.nda
                 f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
                 f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
             )
-        return values[0]
+        only: np.ndarray = values[0]
+        return only
 
     return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)
