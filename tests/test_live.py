@@ -25,6 +25,7 @@ from vvgt_cli.closed_form.gaussian_samples import (
     values_of,
 )
 from vvgt_cli.conversion.live import fog
+from vvgt_cli.conversion.recolored import FunctionRequest, resolve_look
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -394,6 +395,18 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)
+
+
+@pytest.mark.parametrize(("tf", "unit"), [("ct-bone", "HU"), ("viridis", "")])
+def test_the_legend_of_another_look_has_the_unit_that_a_conversion_would_state(tf: str, unit: str) -> None:
+    values = np.repeat([-1000.0, 40.0, 900.0], [600, 500, 40])
+    counts = np.histogram(values, 256, (-1024, 1500))[0]
+    known = replace(facts(), lo=-1024.0, hi=1500.0, histogram=tuple(counts.tolist()), unit="")
+    affine = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
+    header = PlyOptions(scale=0.1, unit_distance=1.0, affine=affine, live=known)
+    legend = resolve_look("a.ply", header, FunctionRequest(tf))[1].legend
+    assert legend is not None
+    assert json.loads(legend)["unit"] == unit
 
 
 def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
