@@ -37,6 +37,7 @@ from vvgt_cli.gaussians.live import (
     Table,
     apply_look,
     baked,
+    opacities,
     without_tails,
 )
 from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
@@ -100,7 +101,7 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
 
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
-    some = cloud()
+    some = replace(cloud(), log_scales=np.repeat(np.linspace(-4, -1.6, 40), 3).reshape(40, 3))
     assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
@@ -112,6 +113,13 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
     assert opacity[tau == 0].max() < 1e-5
     seen = tau > 0.1
     np.testing.assert_allclose(shown.colors[seen], RAMP.color(live[seen, 0].astype(float)), atol=2e-2)
+
+
+def test_a_flat_gaussian_is_about_as_opaque_as_face_on() -> None:
+    """It is more opaque by less than half of what the mean over three views would add."""
+    flat, mass = np.array([[0.01, 0.01, 1e-4]]), np.array([0.02])
+    face_on = opacities(mass, np.full((1, 3), 0.01), 0.0)[0]
+    assert 0 < opacities(mass, flat, 0.0)[0] - face_on < 0.5 * (peak_opacity(mass, flat, 0.0)[0] - face_on)
 
 
 def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() -> None:
