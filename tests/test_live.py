@@ -25,6 +25,7 @@ from vvgt_cli.closed_form.gaussian_samples import (
     values_of,
 )
 from vvgt_cli.conversion.live import fog
+from vvgt_cli.conversion.recolored import FunctionRequest, resolve_look
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -36,6 +37,7 @@ from vvgt_cli.gaussians.live import (
     Table,
     apply_look,
     baked,
+    opacities,
     without_tails,
 )
 from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
@@ -99,7 +101,7 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
 
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
-    some = cloud()
+    some = replace(cloud(), log_scales=np.repeat(np.linspace(-4, -1.6, 40), 3).reshape(40, 3))
     assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
@@ -111,6 +113,13 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
     assert opacity[tau == 0].max() < 1e-5
     seen = tau > 0.1
     np.testing.assert_allclose(shown.colors[seen], RAMP.color(live[seen, 0].astype(float)), atol=2e-2)
+
+
+def test_a_flat_gaussian_is_about_as_opaque_as_face_on() -> None:
+    """It is more opaque by less than half of what the mean over three views would add."""
+    flat, mass = np.array([[0.01, 0.01, 1e-4]]), np.array([0.02])
+    face_on = opacities(mass, np.full((1, 3), 0.01), 0.0)[0]
+    assert 0 < opacities(mass, flat, 0.0)[0] - face_on < 0.5 * (peak_opacity(mass, flat, 0.0)[0] - face_on)
 
 
 def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() -> None:
@@ -394,6 +403,18 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)
+
+
+@pytest.mark.parametrize(("tf", "unit"), [("ct-bone", "HU"), ("viridis", "")])
+def test_the_legend_of_another_look_has_the_unit_that_a_conversion_would_state(tf: str, unit: str) -> None:
+    values = np.repeat([-1000.0, 40.0, 900.0], [600, 500, 40])
+    counts = np.histogram(values, 256, (-1024, 1500))[0]
+    known = replace(facts(), lo=-1024.0, hi=1500.0, histogram=tuple(counts.tolist()), unit="")
+    affine = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
+    header = PlyOptions(scale=0.1, unit_distance=1.0, affine=affine, live=known)
+    legend = resolve_look("a.ply", header, FunctionRequest(tf))[1].legend
+    assert legend is not None
+    assert json.loads(legend)["unit"] == unit
 
 
 def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:

@@ -46,6 +46,16 @@ def person(request: pytest.FixtureRequest) -> Iterator[Person]:
     someone.process.communicate(timeout=60)
 
 
+READ = """(() => {
+  const { live: { look }, where } = window.vvgt, { ready } = look, { canvas } = where.lens;
+  const read = () => {
+    canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'Enter', bubbles: true }));
+    return where.clicked.world;
+  };
+  window.read = [read()];
+  look.ready = () => { window.read.push(read()); return ready(); };
+})()"""
+STOP = "document.querySelector('#live linearGradient').lastElementChild.getAttribute"
 DRAWN = (
     "[...document.querySelectorAll('#live .presets canvas')].every((one) => one.getContext('2d')"
     ".getImageData(0, 0, 84, 84).data.some((x, k) => x && k % 4 < 3))"
@@ -67,10 +77,13 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     person("open", (tmp_path / "ct.html").as_uri())
     person("eval", "document.querySelector('#live.folded .fold')?.click()")
     before = person.picture(tmp_path, "before.png")
+    person("eval", READ)
     person("eval", "document.querySelector('#live .preset').focus()")
     person("press", "Enter")
     person("until", DRAWN)
     assert np.abs(person.picture(tmp_path, "drawn.png") - before).max() < 0.02  # as it was
+    first, *meanwhile = person("eval", "window.read")
+    assert meanwhile == [first] * 9  # each picture, and the end: a place is read under the function that is chosen
     named = ["as in the file", "ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "step", "ramp", "band"]
     assert person("eval", NAMES) == named
     assert person("axe") == []
@@ -95,6 +108,9 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     dots = "[...document.querySelectorAll('#live .node .dot')].map((dot) => dot.getBoundingClientRect().right)"
     assert person("eval", f"Math.max(...{dots}) < {right}")  # of 3000 HU, too, beyond all values
     assert person("eval", "window.vvgt.live.at().named().name") == named[2]  # as what is saved is named
+    offset, color = person("eval", f"[{STOP}('offset'), {STOP}('stop-color')]")
+    assert offset == "1"  # of 900 HU, the greatest value
+    np.testing.assert_allclose(list(bytes.fromhex(color[1:])), (245, 217, 173), atol=8)
     last = person("eval", "window.vvgt.live.nodes().at(-1).x")
     person("eval", "[...document.querySelectorAll('#live .node')].at(-1).focus()")
     person("press", "ArrowUp")

@@ -212,6 +212,20 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     assert world_of(splats_of(one(), PlyOptions(legend=long)), tmp_path)["facts"]["legend"] is None
 
 
+def test_a_legend_ends_with_the_colours_at_the_ends_of_the_values(tmp_path: Path) -> None:
+    """Of nodes beyond the values, which no gradient has a place for, and of a step."""
+    rows = [(-50, [0, 0, 0]), (50, [1, 0, 0]), (50, [0, 1, 0]), (150, [0, 0, 1])]
+    nodes = [{"x": x, "y": 0.5, "rgb": rgb} for x, rgb in rows]
+    text = (
+        "const made = { setAttribute(key, x) { this.is[key] = x; }, append(...more) { this.inside.push(...more); } };\n"
+        "globalThis.document = { createElementNS: () => ({ ...made, is: {}, inside: [] }) };\n"
+        "const { drawLegend } = await import('page:legend.mjs'), group = document.createElementNS();\n"
+        f"drawLegend(group, {{ nodes: {json.dumps(nodes)}, live: {{ values: [0, 100] }}, right: 90, bottom: 200 }});\n"
+        "console.log(JSON.stringify(group.inside[1].inside.map(({ is }) => [is.offset, is['stop-color']])));"
+    )
+    assert node(text, tmp_path) == [[0, "#800000"], [0.5, "#ff0000"], [0.5, "#00ff00"], [1, "#008080"]]
+
+
 def test_the_quality_is_that_of_the_certificate(tmp_path: Path) -> None:
     given = Certificate("v", None, "0", 400, "inria", 41.234, 3, 160000)
 

@@ -27,9 +27,10 @@ from vvgt_cli.gaussians.formats.page_live import nodes_of, planes_of, presets_of
 from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.live import Looks, Table, apply_look, baked
-from vvgt_cli.gaussians.live_facts import LABEL_ROW
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, function_text
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.tables import exposed_distance
+from vvgt_cli.look.readers.names import named_function
+from vvgt_cli.look.tables import exposed_distance, extinction
 
 STEP = TransferFunction("step", PiecewiseOpacity(np.array([0.0, 20, 20, 60]), np.array([0.0, 0.1, 0.8, 0.3])), COLORS)
 LAB = TransferFunction("lab", RAMP.opacity_nodes, ColorMap(COLORS.x, COLORS.rgb, space="Lab"))
@@ -50,17 +51,35 @@ def options(**given: Any) -> PlyOptions:
     return replace(PlyOptions(up="y", scale=0.1, unit_distance=0.5, affine=affine, live=facts()), **given)
 
 
-def test_presets_suit_the_values_and_are_per_the_files_distance() -> None:
-    """Twice as opaque per a distance twice as long; none where Hounsfield units would be a guess."""
-    known = replace(facts(), lo=-1000.0, hi=400.0, unit="HU")
-    one, two = (presets_of(known, {"name": "ct-skin", "unit_distance": length}) for length in (2 / 256, 4 / 256))
-    assert [found["name"] for found in one] == ["ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung"]
+CT = ["ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "ct-skin"]
+
+
+def presets(function: TransferFunction, name: str, unit: str = "HU", longer: float = 1.0) -> list[dict[str, Any]]:
+    """Presets of a scan of a function, per a distance so many times as long as theirs."""
+    known = replace(facts(), lo=-1000.0, hi=400.0, unit=unit, function=function_text(function, -1000.0, 400.0))
+    return presets_of(known, {"name": name, "unit_distance": longer * 2 / 256})
+
+
+def test_presets_suit_the_values_and_are_those_that_the_file_does_not_have() -> None:
+    """None where Hounsfield units would be a guess; one of the file's own name, where its function is another one."""
+    skin, bone = named_function("ct-skin"), named_function("ct-bone")
+    one = presets(skin, "ct-skin")
+    assert [found["name"] for found in one] == CT[:-1]
     assert [bool(found["light"]) for found in one] == [True, False, True, False]
-    bone = {node["x"]: node["y"] for node in one[0]["nodes"]}
-    assert (bone[250], bone[450]) == (0.06, 0.25)
-    assert {node["x"]: node["y"] for node in two[0]["nodes"]}[450] == pytest.approx(1 - 0.75**2, abs=1e-6)
-    other = replace(known, unit="")
-    assert [presets_of(other, {"name": name, "unit_distance": 1.0}) for name in ("ct-bone", "bone")] == [[], []]
+    nodes = {node["x"]: node["y"] for node in one[0]["nodes"]}
+    assert (nodes[250], nodes[450]) == (0.06, 0.25)
+    assert [found["name"] for found in presets(bone, "ct-skin")] == CT[1:]
+    assert [found["name"] for found in presets(skin, "ct-skin", longer=2)] == CT
+    assert [presets(bone, name, unit="") for name in ("ct-bone", "bone")] == [[], []]
+
+
+@pytest.mark.parametrize("longer", [0.2, 8, 16])
+def test_presets_keep_their_extinction_per_the_files_distance(longer: float) -> None:
+    values = np.linspace(-1000, 3000, 9973)
+    for found in presets(RAMP, "", longer=longer):
+        x, y = (np.array([node[key] for node in found["nodes"]]) for key in "xy")
+        wanted = longer * extinction(named_function(found["name"]).opacity(values), 1)
+        np.testing.assert_allclose(extinction(PiecewiseOpacity(x, y)(values), 1), wanted, rtol=0.01, atol=1e-5)
 
 
 def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> None:

@@ -51,6 +51,7 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     assert float(noted["better"].split()[1]) > 30
     assert max(noted["moved"]) < 2e-3  # it may still glide
     assert (noted["cut"], noted["uncut"], noted["changed"]) == ("preview", noted["better"], "preview")
+    assert (noted["lit"][0], noted["lit"][1].split()[0]) == ("preview", "converted,")
     assert noted["refused"] == "not now"
     assert noted["slices"] == [24, 24, 24]
     assert b'id="slices-0"' in (tmp_path / "blob-24.html").read_bytes()

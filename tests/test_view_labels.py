@@ -68,7 +68,7 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> Non
     console = MessageConsole(told.append)
     volume = LoadedVolume(source, "eight", console)
     volume.send_live(console)
-    volume.convert(parse_labels(rows({2: 1.0})), console)
+    volume.convert((parse_labels(rows({2: 1.0})), None), console)
     _, made, scored = [one for one in told if isinstance(one, Converted | Scored)]
     assert isinstance(made, Converted)
     gaussians = Cloud.of(made.ply, "x").gaussians

@@ -69,7 +69,7 @@ def test_the_end_of_a_scoring_process_is_reported() -> None:
             os.kill(converter.process, signal.SIGKILL)
 
     with Converter(SourceRequest("example:blob:12", tf="viridis"), "x", hear) as converter:
-        converter.submit(parse_function(FUNCTION))
+        converter.submit((parse_function(FUNCTION), None))
         until(lambda: any(isinstance(one, Converted | Failed) for one in messages))
         until(lambda: isinstance(messages[-1], Failed), AT_ONCE)
         assert any(isinstance(one, Converted) for one in messages)

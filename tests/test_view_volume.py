@@ -38,6 +38,7 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_live import live_page_data
+from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console
@@ -47,6 +48,7 @@ FUNCTION = {
     "points": [{"x": 0.2, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.9, "rgb": [1, 1, 0], "opacity": 0.5}],
     "opacity_unit_distance": 0.1,
 }
+AT_EYE = {"kind": "headlight", "from": [0, 0, 1], "ambient": 0.2, "diffuse": 1, "specular": 0, "power": 4}
 AT_ONCE = 30.0  # seconds: a moment, on a busy machine
 
 
@@ -113,9 +115,9 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         until(lambda: state_of(url)["state"] != "working")
         state = state_of(url)
         assert (state["number"], state["state"]) == (3, "done")
-        # the next function ends no scores, and goes on from what they are of
+        # the next look ends no scores, and goes on from what they are of
         second = set(workers(child.pid))
-        assert send(url, "function", FUNCTION) == (200, b'{"number": 4}')
+        assert send(url, "function", {**FUNCTION, "light": AT_EYE}) == (200, b'{"number": 4}')
         assert set(workers(child.pid)) == second
         until(lambda: state_of(url).get("scored", False))
         state = state_of(url)
@@ -128,6 +130,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         kept = Cloud.of(saved, "x")
         assert status == 200
         assert (kept.options.up, kept.options.unit_distance) == ("none", 0.1)
+        assert kept.options.light == Lighting(True, (), 0.2, 1.0, 0.0, 4.0)
         assert len(kept.gaussians) == len(shown_now) > 10
         assert kept.options.certificate is not None
         assert len(read_html(send(url, "save", {"file": "html", "number": 4})[1], "x")) == len(shown_now)
@@ -341,6 +344,23 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple
     for wrong in ([], {}, {"kind": "sun"}, base | {"from": [0, 0, 0]}, base | {"from": 1}, base | {"ambient": "x"},
                   base | {"power": None}, base | {"diffuse": -1}, base | {"from": [1e999, 0, 0]}):  # fmt: skip
         assert send(url, "save", {"file": "ply", "function": FUNCTION, "light": wrong})[0] == 400
+
+
+def test_a_conversion_has_the_light_of_the_file_or_of_the_page(
+    controller: tuple[str, PageController], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, of = controller
+    jobs: list[Any] = []
+    monkeypatch.setattr(of.converter, "submit", lambda job: jobs.append(job) or len(jobs))
+    side = {**AT_EYE, "kind": "direction", "from": [3, 0, 4]}
+    for sent in (None, AT_EYE, side, {**AT_EYE, "kind": "none"}):
+        assert send(url, "function", {**FUNCTION, "light": sent})[0] == 200
+    assert send(url, "function", {**FUNCTION, "light": {**AT_EYE, "kind": "sun"}})[0] == 400
+    assert jobs[0][1] is None
+    head, other, none = [options.lighting(Lighting(ambient=0.7), "RAS") for _, options in jobs[1:]]
+    assert (head, none) == (Lighting(True, (), 0.2, 1, 0, 4), None)
+    assert (other.headlight, other.ambient, other.diffuse) == (False, 0.2, 1)
+    np.testing.assert_allclose(np.array(other.directions) @ up_matrix("y").T * (-1, -1, 1), [[0.6, 0, 0.8]], atol=1e-12)
 
 
 def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:

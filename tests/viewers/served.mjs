@@ -1,7 +1,7 @@
 // served.mjs JOB.json MODULES: the page of `vvgt view VOLUME` in headless Chromium, by mouse: it waits, is live, a node is
 // dragged, the better form comes, another change goes back, files are saved. JOB: {"browser", "url", "size": [w, h], "folder"};
 // pictures live.png and better.png (square, where the page begins) and what is saved go to the folder; prints what the page
-// said: {"began", "dragging", "live", "better", "cut", "uncut", "changed", "moved", "saved", "refused"}.
+// said: {"began", "dragging", "live", "better", "cut", "uncut", "lit", "changed", "moved", "saved", "refused"}.
 import fs from 'node:fs';
 import path from 'node:path';
 import { createRequire } from 'node:module';
@@ -98,6 +98,12 @@ await page.selectOption('#live .axis', { index: 1 });
 noted.cut = await shown();
 await page.selectOption('#live .axis', { index: 0 });
 noted.uncut = await shown();
+await page.evaluate(() => document.querySelector('#live .light').closest('details').setAttribute('open', ''));
+await page.selectOption('#live .light select', 'headlight');
+noted.lit = [await shown()];
+await until('document.querySelector("#live .named i").textContent.startsWith("converted, ")');
+noted.lit.push(await shown());
+await page.keyboard.press('Control+z');
 await page.evaluate(() => {  // the same function, of the live form
   const post = window.fetch;
   window.fetch = (to, how) => (to === 'function' ? Promise.reject(new Error('not now')) : post(to, how));

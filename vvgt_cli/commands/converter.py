@@ -26,6 +26,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.resources import memory_limit
 
 
@@ -96,7 +97,8 @@ class Start:
     memory: int | None
 
 
-Job = TransferFunction | LabelTable | None  # the look to convert for; None: the live form
+# the look to convert for, and its light, by default that of the first look; None: the live form
+Job = tuple[TransferFunction | LabelTable, LightOptions | None] | None
 
 
 class Converter:

@@ -95,11 +95,13 @@ class LoadedVolume:
     def convert(self, job: Job, console: MessageConsole) -> None:
         """Send a conversion for labels, or for a function on data values with an opacity unit distance."""
         assert job is not None
-        if isinstance(job, LabelTable):
-            source = replace(self.source, labels=self._labels(job))
+        look, light = job
+        source = replace(self.source, light=light or self.source.light)
+        if isinstance(look, LabelTable):
+            source = replace(source, labels=self._labels(look))
         else:
-            lit = replace(job, lighting=self.lighting)
-            source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
+            lit = replace(look, lighting=self.lighting)
+            source = replace(source, tf=lit, tf_range="data", unit_distance=None)
         self.last = PreviousLook(self._converted(ConvertRequest(source), console, _plain_file))
 
     def _converted(

@@ -29,6 +29,7 @@ from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
@@ -283,24 +284,27 @@ class PageController:
         return json.dumps({"facts": found.facts, "contents": contents}).encode()
 
     def function(self, sent: Any) -> Resource:
-        """Convert the volume for a function or labels that the page sends; None ends the running conversion.
+        """Convert the volume for a function or labels, and a light, that the page sends; None ends the conversion.
 
         Raises:
-            DataError: neither a function nor labels.
+            DataError, UsageError: neither a function nor labels, or a light that is not valid.
         """
         assert self.converter is not None
-        tf: Job = None
+        assert self.first is not None
+        job: Job = None
         if sent is not None:
-            tf = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
-            check_labels([tf])
+            light = sent.pop("light", None) if isinstance(sent, dict) else None
+            look = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
+            check_labels([look])
+            job = look, None if light is None else LightOptions.of(parse_light(light, self.first().options))
         with self.converter.lock:
             self.resources.pop(f"{self.state['number']}.ply", None)
             self.better = None
-            if tf is None:
+            if job is None:
                 self.converter.cancel()
                 self.state = {"number": -1, "state": "none", "said": ""}
             else:
-                number = self.converter.submit(tf)
+                number = self.converter.submit(job)
                 self.state = {"number": number, "state": "working", "said": "beginning"}
             answer = json.dumps({"number": self.state["number"]}).encode()
         return Resource(JSON, lambda: answer)

@@ -63,4 +63,4 @@ def _legend(source: Source) -> str | None:
     tf, numbers = source.tf, source.statistics
     if len(source.layers) > 1 or isinstance(tf, LabelTable):
         return legend_text([layer.tf for layer in source.layers], 0.0, 0.0, "")
-    return legend_text(tf, numbers.lo, numbers.hi, unit_of_values(source.volume, tf), source.volume.quantity)
+    return legend_text(tf, numbers.lo, numbers.hi, unit_of_values(source.volume.values_in, tf), source.volume.quantity)

@@ -19,6 +19,7 @@ from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable, check_labels, distinct
 from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Volume
 
 
@@ -199,10 +200,11 @@ def _options(
 
     old, live = header if isinstance(header, PlyOptions) else layout_of(header), header.live
     tf = [one for one, _ in shown.looks] if isinstance(shown, SeveralLooks) else shown
+    unit = "" if live is None else unit_of_values(live.unit, tf)
     return replace(
         old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
         sh_degree=None, function=shown.name, optics=None,
-        legend=None if live is None else legend_text(tf, live.lo, live.hi, live.unit, live.quantity),
+        legend=None if live is None else legend_text(tf, live.lo, live.hi, unit, live.quantity),
     )  # fmt: skip
 
 

@@ -8,8 +8,8 @@ voxel's edge g. The Gaussian's extinction E covers as much as the values do on a
 weighted by w, minus what neighbours, whose values have a wider spread, will mix in. Weighted by w, z = (v - m) / s has
 a mean and a variance, by which the Gaussian moves along the gradient and becomes thinner in that direction. Where only
 a tail of the distribution is seen, the extinction is lowered. Opaque Gaussians, with a large 1 - exp(-E L), become flat
-in the surface whose normal is the gradient. The opacity is that of the optical mass E L^3
-(`vvgt_cli.gaussians.opacity`). The means are tabulated over m and s.
+in the surface, whose normal is the gradient, or the axis of the normals as far as that explains little. The opacity is
+that of the optical mass E L^3 (`vvgt_cli.gaussians.opacity`). The means are tabulated over m and s.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import factored, rotations
-from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_ID
+from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT, LABEL_ROW, LAYER_ID
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
 from vvgt_cli.look.function import TransferFunctionLike
@@ -41,6 +41,7 @@ TAIL = 1.4, 2.0  # mean abs(z) of what is seen, from which on it counts less, an
 AROUND = 1.6  # spread of the values of a Gaussian and its neighbours, which overlap it, per its own spread
 AMOUNT = 0.45  # share of the neighbours' effect on its colour to compensate (as in `closed_form.sharpen`)
 OPAQUE = 1 - 1e-6  # largest opacity of a look; the smallest is 1 minus this, so that logits are finite
+FACE_ON = 1.5  # power of the areas that opacities are weighted by: seen edge on, Gaussians of a sheet lie in a row
 THINNEST = 0.15  # smallest factor of the width along the gradient
 TAU, FIRST, SECOND = 3, 4, 5  # channels of a table, after r, g and b
 VALUE, SPREAD, LENGTH = 0, 1, 2  # columns of `Gaussians.live`
@@ -203,18 +204,15 @@ def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussi
     along, explained = directions(gaussians)
     opaque, facing = -np.expm1(-tau * gaussians.live[:, LENGTH]), explained**2
     thin = np.sqrt(np.maximum(1 - facing * (1 - variance), THINNEST**2) * (1 - opaque * facing * (1 - SHARP)))
-    axes = rotations(gaussians.quaternions.astype(np.float64))
-    axes *= np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    arm = np.einsum("kij,kj->ki", axes, along)
-    quaternions, log_scales = factored(axes + (arm * (thin - 1)[:, None])[:, :, None] * along[:, None, :])
-    variances = np.exp(2 * log_scales)
-    shortest = np.arange(3) == variances.argmin(axis=1)[:, None]
-    variances *= 1 - shortest * (opaque * (1 - SHARP) * (1 - facing))[:, None]
+    flat = np.sqrt(1 - opaque * (1 - facing) * (1 - SHARP))
+    axes = _axes(gaussians)
+    narrow = _narrowed(axes, along, thin)
+    quaternions, log_scales = factored(_narrowed(narrow, _within(narrow, gaussians.live[:, AXIS]), flat))
     return Gaussians(
-        gaussians.means + arm * (explained * first)[:, None],
-        0.5 * np.log(variances),
+        gaussians.means + np.einsum("kij,kj->ki", axes, along) * (explained * first)[:, None],
+        log_scales,
         quaternions,
-        _logits(opacities(tau * _volumes(gaussians), variances, pixel)),
+        _logits(opacities(tau * _volumes(gaussians), np.exp(2 * log_scales), pixel)),
         sums[:, :TAU] / whole[:, None],
     )
 
@@ -231,10 +229,10 @@ def without_tails(sums: np.ndarray) -> np.ndarray:
 
 
 def opacities(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
-    """Return the peak alpha (n,) like `peak_opacity`, but vanishing with the ``mass`` (n,)."""
+    """Return the peak alpha (n,) like `peak_opacity`, but vanishing with the ``mass`` (n,), and nearer that face on."""
     areas = projected_areas(variances, pixel)
     depths = mass[:, None] / areas
-    return mean_opacity(depths + np.minimum(depths, MIN_ALPHA), areas)
+    return mean_opacity(depths + np.minimum(depths, MIN_ALPHA), areas**FACE_ON)
 
 
 def _volumes(gaussians: Gaussians) -> np.ndarray:
@@ -248,10 +246,28 @@ def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient directions in units of each Gaussian's own axes, (K, 3) unit vectors, and r (K,)."""
     assert gaussians.live is not None
     gradient = gaussians.live[:, GRADIENT].astype(np.float64)
-    axes = rotations(gaussians.quaternions.astype(np.float64))
-    along = np.einsum("kij,ki->kj", axes, gradient) * np.exp(gaussians.log_scales.astype(np.float64))
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
-    return along, np.minimum(np.linalg.norm(gradient, axis=1), 1)
+    return _within(_axes(gaussians), gradient), np.minimum(np.linalg.norm(gradient, axis=1), 1)
+
+
+def _axes(gaussians: Gaussians) -> np.ndarray:
+    """Return the axes of a standard deviation (K, 3, 3), columns."""
+    turned = rotations(gaussians.quaternions.astype(np.float64))
+    found: np.ndarray = turned * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    return found
+
+
+def _within(axes: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return directions (K, 3) in units of the axes (K, 3, 3), unit vectors; zeros for zeros."""
+    own = np.einsum("kij,ki->kj", axes, directions)
+    found: np.ndarray = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30)
+    return found
+
+
+def _narrowed(axes: np.ndarray, own: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return axes (K, 3, 3) that are ``times`` (K,) as long along the directions ``own`` (K, 3), see `_within`."""
+    arm = np.einsum("kij,kj->ki", axes, own)
+    found: np.ndarray = axes + (arm * (times - 1)[:, None])[:, :, None] * own[:, None, :]
+    return found
 
 
 def _logits(opacity: np.ndarray) -> np.ndarray:

@@ -78,8 +78,8 @@ class LiveFacts:
         """Return the facts for a volume, its statistics and function; ``several`` is the file's number of layers."""
         counts = tuple(int(n) for n in numbers.histogram)
         lo, hi = numbers.lo, numbers.hi
-        function = function_text(tf, lo, hi, several)
-        return cls(lo, hi, volume.dims, counts, unit_of_values(volume, tf), function, quantity=volume.quantity)
+        unit, function = unit_of_values(volume.values_in, tf), function_text(tf, lo, hi, several)
+        return cls(lo, hi, volume.dims, counts, unit, function, quantity=volume.quantity)
 
     def statistics(self) -> Statistics:
         """Return the statistics that place functions on the data."""

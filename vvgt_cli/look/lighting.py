@@ -110,6 +110,14 @@ class LightOptions:
     shadows: bool = False
     occlusion: float | None = None
 
+    @classmethod
+    def of(cls, lighting: Lighting | None) -> LightOptions:
+        """Return the options that ask for a light without shadows and occlusion; None: for none."""
+        if lighting is None:
+            return cls((NONE,))
+        lights = (HEADLIGHT,) * lighting.headlight + tuple(",".join(map(repr, d)) for d in lighting.directions)
+        return cls(lights, **{name: getattr(lighting, name) for name in COEFFICIENTS})
+
     def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
         """Return a scene's light, None if unlit; ``preset`` is the function file's. Raise UsageError if invalid."""
         given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}

@@ -86,9 +86,9 @@ def resolve(
     return tf.rescaled(lo, hi)
 
 
-def unit_of_values(volume: Volume, tf: TransferFunction | None) -> str:
-    """Return the unit of a volume's values: the file's, else HU under a function that is over those; "" if unknown."""
-    return volume.values_in or ("HU" if tf is not None and tf.otherwise is not None else "")
+def unit_of_values(stated: str, tf: object) -> str:
+    """Return the unit of values: the file's, else HU under a function that is over those; "" if unknown."""
+    return stated or ("HU" if isinstance(tf, TransferFunction) and tf.otherwise is not None else "")
 
 
 def _in_hounsfield(statistics: Statistics) -> bool:

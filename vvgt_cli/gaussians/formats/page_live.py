@@ -22,15 +22,17 @@ from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import MATTE, MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
 from vvgt_cli.look.resolve import resolve
+from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume.types import triple
 
 HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
 SAMPLED, FEW = 96, 12  # nodes for colours that are not interpolated linearly in RGB: of the file's function, of presets
+ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
@@ -261,7 +263,9 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
 
 
 def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the named functions for values in Hounsfield units, or of the kind of the file's own named function.
+    """Return the named functions for values in Hounsfield units, or of the kind that the file's is named after.
+
+    The file's own function is not among them, unless it was changed and has kept the name.
 
     Args:
         facts: of the layer.
@@ -269,18 +273,41 @@ def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]
     """
     named, found = names(), []
     kind = "ct" if facts.unit == "HU" else own["name"].split("-")[0] if own["name"] in named else ""
-    for name in [name for name in named if name.split("-")[0] == kind and name != own["name"]]:
+    for name in [name for name in named if name.split("-")[0] == kind]:
         tf = named_function(name)
         if tf.otherwise is not None and facts.unit != "HU":  # a guess
             continue
         tf = resolve(tf, facts.statistics(), hounsfield=True)
         assert tf.opacity_unit_share is not None
         times = own["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
-        nodes = [node | {"y": round(1 - (1 - node["y"]) ** times, 6)} for node in _nodes(tf, FEW)]
+        tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
         light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
-        if tf.support(facts.lo, facts.hi):
-            found.append({"name": name, "shows": named[name], "nodes": nodes, "light": light})
+        if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):
+            found.append({"name": name, "shows": named[name], "nodes": _nodes(tf, FEW), "light": light})
     return found
+
+
+def _is_own(tf: TransferFunction, facts: LiveFacts) -> bool:
+    """Return whether a function of the same unit distance shows what the file's own does, to `ALIKE`."""
+    if not facts.function:
+        return False
+    x, own = np.linspace(facts.lo, facts.hi, 257), facts.tf("the file")
+    there, other = tf.opacity(x)[:, None], own.opacity(x)[:, None]
+    off = np.hstack([there - other, there * tf.color(x) - other * own.color(x)])
+    return bool(np.abs(off).max() < ALIKE)
+
+
+def _per_longer(nodes: PiecewiseOpacity, times: float) -> PiecewiseOpacity:
+    """Return opacity per a unit distance so many times as long, with nodes until its extinction is right to 1 %."""
+    x, y = nodes.x, nodes.y
+    while True:
+        y_between = (y[1:] + y[:-1]) / 2
+        longer, between = (-np.expm1(times * np.log1p(-part)) for part in (y, y_between))
+        found, wanted = extinction((longer[1:] + longer[:-1]) / 2, 1.0), extinction(between, 1.0)
+        far = np.flatnonzero((np.abs(found - wanted) > 0.004 * wanted) & (x[1:] > x[:-1]))  # twice that beside 0
+        if not far.size:
+            return PiecewiseOpacity(x, longer)
+        x, y = np.insert(x, far + 1, (x[far] + x[far + 1]) / 2), np.insert(y, far + 1, y_between[far])
 
 
 def _nodes(tf: TransferFunction, sampled: int) -> list[dict[str, Any]]:
@@ -299,4 +326,4 @@ def _limit(tf: TransferFunction, x: float, side: float) -> dict[str, Any]:
     """Return the function's one-sided limit at x, evaluated at the adjacent floating-point number."""
     beside = np.array([np.nextafter(x, side)])
     y, rgb = float(tf.opacity(beside)[0]), tf.color(beside)[0]
-    return {"x": x, "y": round(y, 6), "rgb": [round(c, 4) for c in rgb.tolist()]}
+    return {"x": x, "y": float(f"{y:.8g}"), "rgb": [round(c, 4) for c in rgb.tolist()]}

@@ -131,8 +131,8 @@ def _values(
     codes = np.rint((np.nan_to_num(values, nan=lo - missing * step) - lo) / step) + missing
     window = [(a + b) / 2, (b - a) or step]
     facts = {
-        "lo": lo, "step": step, "missing": missing, "unit": unit_of_values(volume, tf), "quantity": volume.quantity,
-        "level": window[0], "window": window[1],
+        "lo": lo, "step": step, "missing": missing, "level": window[0], "window": window[1],
+        "unit": unit_of_values(volume.values_in, tf), "quantity": volume.quantity,
     }  # fmt: skip
     return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16)
 

@@ -1,7 +1,7 @@
 // The function of one layer of a live page over the histogram of its values: nodes to be dragged.
 import { hex, rgbOf } from './color.mjs';
 import { functionAt } from './live_table.mjs';
-import { element } from './svg.mjs';
+import { element, stops } from './svg.mjs';
 
 const WIDE = 276, HIGH = 92, NEAR = matchMedia('(pointer: coarse)').matches ? 22 : 16, TWICE = 350;  // px; milliseconds between the taps that add a node
 const MANY = 14, CLOSE = 0.03;  // nodes that are all offered, and how far fewer of them may be from the function
@@ -83,7 +83,7 @@ export function editor(apply, layer, key, history) {
     const curve = Array.from({ length: WIDE - 11 }, (_, k) => `${k + 6},${height(functionAt(exact ?? nodes, value(k + 6)).y).toFixed(2)}`).join('L');
     find('.line').setAttribute('d', `M${curve}`);
     find('.area').setAttribute('d', `M6,${HIGH - 4}L${curve}L${WIDE - 6},${HIGH - 4}Z`);
-    find('linearGradient').replaceChildren(...nodes.map(({ x, rgb }) => element('stop', { offset: (x - lo) / span, 'stop-color': hex(rgb) })));
+    find('linearGradient').replaceChildren(...stops(nodes, layer.values));
     const group = find('g');
     while (group.childElementCount > nodes.length) group.lastChild.remove();
     while (group.childElementCount < nodes.length) {

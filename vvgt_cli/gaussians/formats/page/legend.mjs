@@ -3,7 +3,7 @@ import { hex } from './color.mjs';
 import { shown } from './facts.mjs';
 import { functionAt } from './live_table.mjs';
 import { round } from './scale.mjs';
-import { element, label } from './svg.mjs';
+import { element, label, stops } from './svg.mjs';
 
 const HIGH = 130, WIDE = 18;
 const ROW = 18, LETTER = 7, MOST = 12;  // px of a label, of a letter of its name, labels at most
@@ -18,7 +18,7 @@ export function ticks(lo, hi, many = 4) {
 export function drawLegend(group, { nodes, live, right, bottom }) {
   const [lo, hi] = live.values, span = hi - lo || 1, top = bottom - HIGH, height = (v) => bottom - (HIGH * (v - lo)) / span;
   const gradient = element('linearGradient', { id: 'where-legend', gradientUnits: 'userSpaceOnUse', x1: 0, y1: bottom, x2: 0, y2: top });
-  for (const { x, rgb } of nodes) gradient.append(element('stop', { offset: Math.min(Math.max((x - lo) / span, 0), 1), 'stop-color': hex(rgb) }));
+  gradient.append(...stops(nodes, live.values));
   const edge = Array.from({ length: HIGH + 1 }, (_, k) => {
     const y = functionAt(nodes, lo + (span * k) / HIGH).y;
     return `${(right - 2 - (WIDE - 2) * Math.cbrt(Math.min(Math.max(y, 0), 1))).toFixed(1)},${bottom - k}`;

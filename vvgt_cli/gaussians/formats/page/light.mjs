@@ -41,7 +41,7 @@ export function light(look, { app }, begin, history) {
     }
     draw();
     look.light(now);
-    history.changed();
+    history.changed(false);
   }
 
   function aim(x, y) {

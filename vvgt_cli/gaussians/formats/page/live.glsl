@@ -36,10 +36,10 @@ float vvgtAlpha(float y) {  // whose dilogarithm is y, to 3e-4
   return min(y * (1.0006751 + y * (-0.2572020 + y * (0.0395146 + y * (-0.0420802 + y * (0.0288972 - y * 0.0082833))))), 0.99);
 }
 
-float vvgtPeak(float mass, vec3 variance) {  // the mean over views along the axes, by the areas that these see
-  vec3 v = variance + vvgtOpaque.y, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area;
+float vvgtPeak(float mass, vec3 variance) {  // the mean over views along the axes, by the areas that these see to the power of FACE_ON
+  vec3 v = variance + vvgtOpaque.y, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area, weight = area * sqrt(area);
   y += min(y, vec3(1.0 / 255.0));
-  return dot(vec3(vvgtAlpha(y.x), vvgtAlpha(y.y), vvgtAlpha(y.z)), area) / (area.x + area.y + area.z);
+  return dot(vec3(vvgtAlpha(y.x), vvgtAlpha(y.y), vvgtAlpha(y.z)), weight) / (weight.x + weight.y + weight.z);
 }
 
 float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's factor
@@ -112,9 +112,12 @@ void modifySplatCenter(inout vec3 center) {
   vec3 arm = axes * along;
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
+  vec3 normals = mat3(matrix_model) * ((vec3(loadVvgtAxis().xyz) - 128.0) / 127.0), across = normals * axes;
+  across /= max(length(across), 1e-30);
+  axes += outerProduct(axes * across * (sqrt(1.0 - (1.0 - fog) * (1.0 - facing) * (1.0 - vvgtOpaque.x)) - 1.0), across);
   vec3 place = center, joint = axes * along;
   float stays = vvgtCutAll(center, axes), mass = tau * edge * edge * edge * stays;
-  vec3 color = vvgtLit(sums.rgb / whole, mat3(matrix_model) * ((vec3(loadVvgtAxis().xyz) - 128.0) / 127.0), place);
+  vec3 color = vvgtLit(sums.rgb / whole, normals, place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);
@@ -124,9 +127,6 @@ void modifySplatCenter(inout vec3 center) {
   mat3 unit = mat3(axes[0] / vvgtScale.x, axes[1] / vvgtScale.y, axes[2] / vvgtScale.z);
   if (determinant(unit) < 0.0) unit[2] = -unit[2];
   vvgtRotation = vvgtQuaternion(unit);
-  float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
-  vec3 squares = vvgtScale * vvgtScale * (1.0 - (1.0 - fog) * (1.0 - vvgtOpaque.x) * (1.0 - facing) * vec3(lessThanEqual(vvgtScale, vec3(shortest))));
-  vvgtScale = sqrt(squares);
   if (mip) {  // the value, and how it changes along the Gaussian's own axes
     float spread = r * vvgtSpread.x * pow(float(a.y) / 255.0, vvgtSpread.y);
     vvgtColor = vec4(2.0 + 8.0 * spread * (joint * unit) / vvgtScale, stays > 0.0 ? float(at) / 255.0 : 0.0);
@@ -134,10 +134,9 @@ void modifySplatCenter(inout vec3 center) {
   }
   if (vvgtKind == 2.0) {  // the logarithm of its mass
     vvgtColor = vec4(log2(max(whole * edge * edge * edge * stays, 1e-15)) / 12.0 + 4.0, 0.0, 0.0, stays > 0.0 ? 1.0 : 0.0);
-    vvgtScale = sqrt(squares);
     return;
   }
-  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, vvgtScale * vvgtScale));
 }
 void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {
   rotation = vvgtRotation;

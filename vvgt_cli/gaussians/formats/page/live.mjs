@@ -71,8 +71,8 @@ export async function liveLook({ app }, live) {
     app.renderNextFrame = true;
     if (!--again) shown();
   });
-  function tabulate(k) {
-    table.lock().set(texelsOf(kind === 2 ? sumsOf(look.nodes[k], exposed(look.nodes[k], layers[k])) : look.sums[k], live.table), k * means * 2 * spreads * 4);
+  function tabulate(k, nodes = look.nodes[k], sums = look.sums[k]) {
+    table.lock().set(texelsOf(kind === 2 ? sumsOf(nodes, exposed(nodes, layers[k])) : sums, live.table), k * means * 2 * spreads * 4);
     table.unlock();
     set('vvgtTable', table);
   }
@@ -84,6 +84,8 @@ export async function liveLook({ app }, live) {
       look.sums[k] = sumsOf(nodes, layers[k]);
       tabulate(k);
     },
+    // how it would look under other nodes; places are still read under its own
+    sketch: (nodes, k) => tabulate(k, nodes, sumsOf(nodes, layers[k])),
     // one of `KINDS`, of one layer of values
     draw(number) {
       kind = number;

@@ -5,20 +5,26 @@ const ROW = 9;  // plane of a row's low byte, before that of its high byte (form
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// what a Gaussian carries: value and spread, log of the length, direction in which values rise (viewer's axes) and its length r
+// what a Gaussian carries: value and spread, log of the length, direction in which values rise and its length r, axis of the normals (viewer's axes)
 function carried({ bytes, count, live }, { values: [lo, hi] }, i) {
   const byte = (plane) => bytes[plane * count + i], [first, last] = live.log_lengths;
-  const g = [3, 4, 5].map((plane, k) => ((byte(plane) - 128) / 127) * (k < 2 ? -1 : 1));
+  const [g, axis] = [3, 6].map((first) => [0, 1, 2].map((k) => ((byte(first + k) - 128) / 127) * (k < 2 ? -1 : 1)));
   return {
-    row: byte(0), column: (byte(1) * (live.table[1] - 1)) / 255, value: lo + ((hi - lo) * byte(0)) / 255, gradient: g, r: Math.min(Math.hypot(...g), 1),
+    row: byte(0), column: (byte(1) * (live.table[1] - 1)) / 255, value: lo + ((hi - lo) * byte(0)) / 255, gradient: g, axis, r: Math.min(Math.hypot(...g), 1),
     spread: (hi - lo) * live.widest * (byte(1) / 255) ** live.bend, length: Math.exp(first + ((last - first) * byte(2)) / 255),
   };
 }
 
-// the unit direction of the gradient in the Gaussian's own standard deviations
-const along = (gradient, arms) => {
-  const a = arms.map((arm) => dot(gradient, arm)), length = Math.max(Math.hypot(...a), 1e-30);
+// the unit direction of a direction in the Gaussian's own standard deviations, and arms that are so many times as long along one of these
+const along = (direction, arms) => {
+  const a = arms.map((arm) => dot(direction, arm)), length = Math.max(Math.hypot(...a), 1e-30);
   return a.map((x) => x / length);
+};
+
+const across = (arms, own) => [0, 1, 2].map((c) => arms[0][c] * own[0] + arms[1][c] * own[1] + arms[2][c] * own[2]);
+const narrowed = (arms, own, times) => {
+  const arm = across(arms, own);
+  return arms.map((one, k) => one.map((x, c) => x + arm[c] * (times - 1) * own[k]));
 };
 
 // what is said of each layer, with what all have in common
@@ -36,7 +42,7 @@ const alpha = (y) => {
 };
 
 // {center, arms, opacity} of what has an extinction tau, as live.glsl has it; arms are made orthogonal
-function seen({ live }, center, arms, tau, length, facing) {
+function seen({ live }, center, arms, tau, length) {
   const axes = arms.map((arm) => [...arm]);
   for (let sweep = 0; sweep < 6; sweep++) {
     for (const [i, j] of [[0, 1], [0, 2], [1, 2]]) {
@@ -47,19 +53,17 @@ function seen({ live }, center, arms, tau, length, facing) {
       axes[j] = b.map((x, k) => cs * (x + t * a[k]));
     }
   }
-  const squares = axes.map((axis) => dot(axis, axis)), shortest = squares.indexOf(Math.min(...squares)), fog = Math.exp(-tau * length);
-  const factors = squares.map((_, k) => (k === shortest ? 1 - (1 - fog) * (1 - live.sharp) * (1 - facing) : 1));
-  const wide = squares.map((v, k) => v * factors[k] + live.dilation), areas = [0, 1, 2].map((k) => 2 * Math.PI * Math.sqrt(wide[(k + 1) % 3] * wide[(k + 2) % 3]));
-  const total = areas.reduce((sum, area) => sum + area), mass = tau * length ** 3;
-  const opacity = areas.reduce((sum, area) => sum + area * alpha(mass / area + Math.min(mass / area, 1 / 255)), 0) / total;
-  return { center, arms: axes.map((axis, k) => axis.map((x) => x * Math.sqrt(factors[k]))), opacity };
+  const wide = axes.map((axis) => dot(axis, axis) + live.dilation), areas = [0, 1, 2].map((k) => 2 * Math.PI * Math.sqrt(wide[(k + 1) % 3] * wide[(k + 2) % 3]));
+  const weights = areas.map((area) => area ** 1.5), total = weights.reduce((sum, weight) => sum + weight), mass = tau * length ** 3;
+  const opacity = areas.reduce((sum, area, k) => sum + weights[k] * alpha(mass / area + Math.min(mass / area, 1 / 255)), 0) / total;
+  return { center, arms: axes, opacity };
 }
 
 // How the page shows Gaussian i, null where it does not
 export function looksOf(look) {
   const { live, layers } = look, spreads = live.table[1];
   return (i, { center, arms }) => {
-    const number = rowOf(look, i), k = layerOf(look, number), layer = layers[k], { row, column, length, gradient, r } = carried(look, layer, i);
+    const number = rowOf(look, i), k = layerOf(look, number), layer = layers[k], { row, column, length, gradient, axis, r } = carried(look, layer, i);
     let tau, first = 0, variance = 1;
     if (layer.labels.length) {
       const { opacity } = look.rows[number];
@@ -75,10 +79,10 @@ export function looksOf(look) {
     if (tau < 1e-12) return null;
     const unit = along(gradient, arms), facing = r * r, opaque = 1 - Math.exp(-tau * length);
     const thin = Math.sqrt(Math.max(1 - facing * (1 - variance), live.thinnest ** 2) * (1 - opaque * facing * (1 - live.sharp)));
-    const arm = [0, 1, 2].map((c) => arms[0][c] * unit[0] + arms[1][c] * unit[1] + arms[2][c] * unit[2]);
+    const arm = across(arms, unit), narrow = narrowed(arms, unit, thin), flat = Math.sqrt(1 - opaque * (1 - facing) * (1 - live.sharp));
     const moved = center.map((x, c) => x + arm[c] * r * first);
     if (beyond(look, moved)) return null;
-    return seen(look, moved, arms.map((one, k) => one.map((x, c) => x + arm[c] * (thin - 1) * unit[k])), tau, length, facing);
+    return seen(look, moved, narrowed(narrow, along(axis, narrow), flat), tau, length);
   };
 }
 

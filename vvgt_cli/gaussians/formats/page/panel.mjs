@@ -67,7 +67,7 @@ export function panel(look, viewer, live) {
   // small pictures of presets {nodes, light} of a layer, as shot.mjs draws them, while going()
   function sketch(k, looks, done, going) {
     const put = (nodes, light) => {
-      look.apply(nodes, k);
+      look.sketch(nodes, k);
       look.light(light);
       return look.ready();
     };
@@ -129,7 +129,7 @@ export function panel(look, viewer, live) {
   return {
     root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
     drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
-    alone: () => sketching || drawn > 0 || cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()),
+    alone: () => sketching || drawn > 0 || cut.planes().length > 0, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };
 }

@@ -1,4 +1,4 @@
-// The better form of what a live page shows: the server converts the volume under the function of the page, or the file holds the
+// The better form of what a live page shows: the server converts the volume under the function and light of the page, or the file holds the
 // conversion under its own; it is swapped in. Files to save.
 import { Asset, Entity } from 'playcanvas';
 
@@ -84,7 +84,7 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut, another light, MIP or X-ray, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file;
+// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut, MIP or X-ray, which the live form alone has; lit(): another light than the file's, or null}; server: {converts, name}, none of a page in a file;
 // converted: {file, contents, said} of the conversion under the file's own function, in a page in a file. Resolves once that is shown.
 export async function served(panel, viewer, server, converted) {
   const { root, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
@@ -104,7 +104,7 @@ export async function served(panel, viewer, server, converted) {
   };
 
   const begun = JSON.stringify(shown());
-  const improved = () => number !== null && !panel.alone() && (!converted || JSON.stringify(shown()) === begun);
+  const improved = () => number !== null && !panel.alone() && (!converted || (!panel.lit() && JSON.stringify(shown()) === begun));
   function put() {
     better.put(improved());
     const [what, ...rest] = (improved() ? told : 'preview').split(/(?=, |: )/);
@@ -122,7 +122,7 @@ export async function served(panel, viewer, server, converted) {
     const mine = change;
     busy = true;
     try {
-      const answer = await send('function', shown().function ?? shown());
+      const answer = await send('function', { ...(shown().function ?? shown()), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       const job = (await answer.json()).number;
       while (mine === change) {
@@ -170,7 +170,7 @@ export async function served(panel, viewer, server, converted) {
       return download(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: 'application/json' }), rows ? 'labels.json' : 'tf.json');
     }
     try {
-      const answer = await send('save', improved() ? { file, number, ...shown() } : { file, ...shown(), light: panel.lit() });
+      const answer = await send('save', { file, number: improved() ? number : null, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       const link = file === 'html' && panel.begins?.(), at = (found) => `${found}"link": ${JSON.stringify(link).replaceAll('<', '\\u003c')}, `;
       download(link ? new Blob([(await answer.text()).replace('id="scene">{', at)], { type: 'text/html' }) : await answer.blob(), `${name}.${file}`);

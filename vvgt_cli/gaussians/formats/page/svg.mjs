@@ -1,4 +1,7 @@
 // Elements of the drawing over the picture. All looks are attributes: the drawing is also made part of a saved picture.
+import { hex } from './color.mjs';
+import { functionAt } from './live_table.mjs';
+
 const SVG = 'http://www.w3.org/2000/svg';
 
 export function element(name, attributes = {}, text) {
@@ -6,6 +9,12 @@ export function element(name, attributes = {}, text) {
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   if (text !== undefined) made.textContent = text;
   return made;
+}
+
+// stops of a gradient over the values [lo, hi], of the nodes of a function
+export function stops(nodes, [lo, hi]) {
+  const end = (x) => ({ x, ...functionAt(nodes, x) }), all = [end(lo), ...nodes.filter(({ x }) => x >= lo && x <= hi), end(hi)];
+  return all.map(({ x, rgb }) => element('stop', { offset: (x - lo) / (hi - lo || 1), 'stop-color': hex(rgb) }));
 }
 
 // text that is legible over anything
