@@ -84,7 +84,10 @@ class Cloud:
         return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
     def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
-        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's)."""
+        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's).
+
+        Raise DataError for several layers or labels, DataError or UsageError for an invalid light.
+        """
         facts = self._alone("a function")
         table, facts = self._function(facts, tf)
         distance = tf.opacity_unit_distance

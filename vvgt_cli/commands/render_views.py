@@ -387,9 +387,10 @@ def fields_of(
     renderer: str,
     stack: ExitStack,
 ) -> list[Blocked] | None:
-    """Return a field in blocks by folder of each function, None if the volume is read whole; ``stack`` closes them.
+    """Return a field in blocks for each function (by folder), None if the volume is read whole; ``stack`` closes them.
 
-    ``options`` None: automatic. Raise UsageError for a ``renderer`` that needs the volume in memory.
+    A view is ``size`` px high; ``options`` None: automatic. Raise UsageError for a ``renderer`` that needs the volume
+    in memory.
     """
     options = options or automatic(source, run.console)
     if options is None:

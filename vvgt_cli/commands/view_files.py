@@ -128,7 +128,8 @@ class Layout:
 def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none if nothing is visible.
 
-    Large volumes are subsampled along each axis: the points lie much farther apart than voxels.
+    Views are ``size`` px high. Large volumes are subsampled along each axis: the points lie much farther apart than
+    voxels.
     """
     from vvgt_cli.closed_form.closed_form import closed_form
 

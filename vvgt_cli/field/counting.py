@@ -125,7 +125,7 @@ class BlockAccess:
     def __init__(
         self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
-        """Prepare for counting; a ``histogram`` may be needed even for types that are not counted value by value."""
+        """Prepare for counting; ``histogram`` asks for one even for types that are not counted value by value."""
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}

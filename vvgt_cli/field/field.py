@@ -75,7 +75,10 @@ class Field(Protocol):
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """Return mean value, spread, normals' axis and gradient under Gaussians of the box frame, (K, 8) float32."""
+        """Return mean value, spread, normals' axis and gradient under Gaussians of the box frame, (K, 8) float32.
+
+        Raise UsageError for an optics grid.
+        """
 
     def with_look(self, source: Source) -> Field:
         """Return the field of the same volume with another look; statistics of a single layer are computed here."""

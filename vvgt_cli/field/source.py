@@ -57,7 +57,7 @@ class SourceRequest:
 
     @property
     def path(self) -> str:
-        """Path of the volume's file; UsageError if the volume is already in memory."""
+        """Path of the volume's file; raises UsageError if the volume is already in memory."""
         if not isinstance(self.volume, str):
             raise UsageError(f"{content_of(self.volume).volumes[0].name}: a volume in memory; expected a path here")
         return self.volume

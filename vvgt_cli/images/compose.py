@@ -13,7 +13,10 @@ BLACK = (0.0, 0.0, 0.0)
 
 
 def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BLACK) -> np.ndarray:
-    """Composite premultiplied RGBA (..., 4) over a colour, grey or image (..., 3); return float32, not clipped."""
+    """Composite premultiplied RGBA (..., 4) over a colour, grey or image (..., 3); return float32, not clipped.
+
+    Raise DataError for other shapes.
+    """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.shape[-1:] != (4,):
         raise DataError(f"image of shape {rgba.shape}; expected four channels, premultiplied RGBA")

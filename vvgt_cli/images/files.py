@@ -58,7 +58,10 @@ def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[li
 
 
 def read_view(path: str | PathLike[str]) -> np.ndarray:
-    """Read the image at ``path`` (any suffix), EXR or else PNG: (h, w, 4) float32 premultiplied, or raise DataError."""
+    """Read the image at ``path`` (with or without .exr or .png), EXR or else PNG: (h, w, 4) float32 premultiplied.
+
+    Raise DataError if there is none, or it cannot be read.
+    """
     stem = Path(path)
     if stem.suffix in SUFFIXES:
         stem = stem.with_suffix("")

@@ -32,8 +32,8 @@ WORST = 0.1  # share of the blocks that count as the worst
 def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return ``-10 log10(mean squared error)`` in dB of images in [0, 1] (clipped), at most `CAP`.
 
-    Pixels in ``mask`` (h, w) count, by default all. Raise DataError where shapes differ, none counts or one is not
-    finite.
+    Images are (h, w) or (h, w, c); pixels in ``mask`` (h, w) count, by default all. Raise DataError where shapes
+    differ, none counts or one is not finite.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape:
@@ -163,7 +163,7 @@ def score_view(reference: np.ndarray, ours: np.ndarray, *, perceptual: bool = Tr
 
 
 def score_views(reference: Iterable[np.ndarray], ours: Iterable[np.ndarray], *, perceptual: bool = True) -> Scores:
-    """Score views (n, h, w, 4), or iterables that are read one view at a time; see `score_view`."""
+    """Score views (n, h, w, 4), or iterables that are read one at a time, by `score_view`; raise DataError for none."""
     views = []
     for a, b in zip_longest(reference, ours):
         if a is None or b is None:
@@ -205,7 +205,10 @@ class Texture:
 
 
 def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
-    """Measure the texture of (reference, ours), (h, w, 4) each, in blocks where references are opaque and smooth."""
+    """Measure the texture of (reference, ours), (h, w, 4) each, in blocks where references are opaque and smooth.
+
+    Raise DataError for other shapes.
+    """
     found = [np.empty((2, 0))]
     for reference, ours in pairs:
         if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 4:

@@ -226,7 +226,10 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Content:
-    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`."""
+    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`.
+
+    Errors are those of `volume_of`.
+    """
     if isinstance(volume, str | os.PathLike):
         return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
@@ -291,7 +294,10 @@ def with_look(source: SourceRequest, look: Look) -> SourceRequest:
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
-    """Return a caller's label table: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file."""
+    """Return a caller's label table: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file.
+
+    Raise DataError for a mapping that is not a table.
+    """
     if isinstance(labels, Mapping):
         return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels

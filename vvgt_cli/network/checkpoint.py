@@ -91,7 +91,7 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
-    """Load weights; raise DataError if a name or shape is missing, unknown or other, or a number is not finite."""
+    """Load weights; raise DataError for names or shapes other than the module's, or values that are not finite."""
     own = module.state_dict()
     missing, unknown = sorted(set(own) - set(state)), sorted(set(state) - set(own))
     if missing or unknown:

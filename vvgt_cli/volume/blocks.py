@@ -251,7 +251,7 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
 
 
 def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """Yield ``n`` words of ``text`` from ``start`` on, in windows, with the position behind each.
+    """Yield ``n`` white-space separated words of ``text`` from ``start`` on, by windows: (words, position behind them).
 
     Raise DataError if there are fewer.
     """

@@ -159,7 +159,7 @@ def contiguous(field: np.ndarray) -> np.ndarray:
 
 
 def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Return the Euclidean norms (nz, ny, nx) float32 of data values ``slope * stored + intercept``, slice by slice."""
+    """Return norms (nz, ny, nx) float32 of values (nz, ny, nx, c), ``slope * stored + intercept``, slice by slice."""
     out = np.empty(values.shape[:3], np.float32)
     for z, plane in enumerate(values):
         total = np.zeros(plane.shape[:2])

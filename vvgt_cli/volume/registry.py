@@ -125,7 +125,7 @@ def contents(source: str, options: ReadOptions) -> dict[str, Any]:
 
 
 def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List shapes of a source's resolutions, slowest axis and finest first, for some formats; as `read_volume`."""
+    """List shapes of a source's resolutions, slowest axis and finest first, or nothing; raise as `read_volume`."""
     if source.partition(":")[0] in STEPPED:
         from vvgt_cli.volume.arrays.remote import level_shapes as remote
 

@@ -373,7 +373,7 @@ def scored_views(size: int) -> list[Picture]:
 
 
 def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
-    """Score Gaussians (box frame), drawn by a rule, against the volume's stored views; DataError for damaged blocks."""
+    """Score Gaussians (box frame), drawn by a rule, on the stored views; raise DataError if a block is damaged."""
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render
 

@@ -72,7 +72,7 @@ def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], na
 
 
 def same_place(found: np.ndarray, comments: tuple[str, ...], name: str) -> None:
-    """Raise DataError unless ``found`` (4, 4), data to scene, is where vvgt puts a file, or half a turn from it."""
+    """Raise DataError unless ``found`` (4, 4), data to scene, is where vvgt puts a file, or the half turn alone."""
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
     if not any(np.allclose(found, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(

@@ -178,7 +178,7 @@ def _text(title: str, scene: Mapping[str, Any], elements: str) -> str:
 
 
 def policy(text: str, source: str = "") -> str:
-    """Return the content security policy of a page, with hashes of scripts and style; ``source`` of other files."""
+    """Return a page's content security policy, by hashes; ``source``, as "'self'", is where it loads files from."""
     scripts = [found.encode("utf-8") for found in _SCRIPTS.findall(text)]
     if 'id="program"' in text:
         scripts.append(gzip.decompress(asset(PROGRAM)))

@@ -232,7 +232,10 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
 
 
 def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
-    """Parse the JSON of a light that a page of these options sends (as `_light` writes), or raise an error."""
+    """Parse the JSON of a light that a page of these options sends (as `_light` writes).
+
+    Raise DataError or UsageError if it is not valid.
+    """
     numbers = ("ambient", "diffuse", "specular", "power")
     if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
         raise DataError("the page's light: expected an object of kind none, headlight or direction")

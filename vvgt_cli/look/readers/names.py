@@ -38,7 +38,7 @@ def names() -> dict[str, str]:
 
 
 def named_function(name: str) -> TransferFunction:
-    """Return one of our functions, per a share of the box's longest edge; raise KeyError for an unknown name."""
+    """Return one of our functions, with opacity per a share of the box's edge; raise KeyError for an unknown name."""
     return minimal.read(_entries()[name]["function"], name)
 
 

@@ -264,7 +264,8 @@ class Frames:
 def load_frames(frames: Frames, options: ReadOptions, source: str) -> tuple[np.ndarray, tuple[float, float]]:
     """Load the volume (nz, ny, nx) that the options choose, memory-mapped where it is plain, and slope and intercept.
 
-    Where the fourth axis is the only one beyond space, ``component`` is taken for it too.
+    Where the fourth axis is the only one beyond space, ``component`` is taken for it too. Errors are those of
+    `Reader.read`.
     """
     spatial, offset = (*frames.dims, 1, 1)[:3], frames.offset
     times, rest = _times(frames, options, source)

@@ -327,7 +327,10 @@ def _load_files(
 
 
 def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
-    """Write data values as float32 into an attached raw file, return its bytes; errors are those of `atomic_write`."""
+    """Write data values as float32 into an attached raw file, and return its size in bytes.
+
+    Errors are those of `atomic_write`.
+    """
     values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
     vectors = " ".join(
         f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()

@@ -63,7 +63,10 @@ class Picture:
 
 
 def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file."""
+    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
+
+    Errors are those of `Reader.read`.
+    """
     if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
     channel = _channel(picture, options.component, source)

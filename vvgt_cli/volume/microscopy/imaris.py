@@ -43,7 +43,10 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
 
 
 def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[str], Any]) -> Volume:
-    """Read a channel of a time step of an open file at ``options.level``; ``checked`` returns a path's dataset."""
+    """Read a channel of a time step of an open file at ``options.level``.
+
+    ``checked`` returns a path's dataset, and raises where its values must not be read.
+    """
     if options.array is not None:
         raise UsageError(f"{path}: an Imaris file, which has one image; leave out --array {options.array}")
     levels, level = _count(file, "ResolutionLevel"), options.level or 0

@@ -285,7 +285,10 @@ class BrickArray:
 
 
 def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return first brick and number of bricks, (3,) each, of voxels ``lo`` to ``hi`` (3,), both included."""
+    """Return first brick and number of bricks, (3,) each, of voxels ``lo`` to ``hi`` (3,), both included.
+
+    Raise DataError if the grid is too large.
+    """
     size = [int(b) - int(a) + 1 for a, b in zip(lo, hi, strict=True)]
     if math.prod(size) > MAX_VOXELS:
         raise DataError(

@@ -114,7 +114,7 @@ def read_raw(path: Path, options: ReadOptions) -> Volume:
 
 
 def read_stdin(options: ReadOptions, stream: IO[bytes] | None = None) -> Volume:
-    """Read raw values from standard input (or ``stream``); needs dims and dtype."""
+    """Read raw values from standard input (or ``stream``); needs dims and dtype. Errors are those of `Reader.read`."""
     if options.array is not None:
         raise UsageError(f"standard input: raw values have no named arrays; leave out --array {options.array}")
     dims, dtype = layout("standard input", options)

@@ -387,8 +387,9 @@ def _color(text: str | None) -> tuple[float, float, float] | None:
 def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:
     """Return what ImageJ's description says, as ImageJ reads it (ij.io.TiffDecoder and FileOpener, 1.54).
 
-    ImageJ counts the ``resolution`` (tags 282 and 283, or None) in the description's unit (micrometres per centimetre,
-    by ``tag`` 296, excepted), takes 72 dots per inch for no size, and leaves out a distance between slices that is 1.
+    ImageJ counts the ``resolution`` (pixels per unit along x and y, or None) in the description's unit (micrometres per
+    centimetre, by ``tag`` 296, excepted), takes 72 dots per inch for no size, and leaves out a distance between slices
+    that is 1.
     """
     if "scales" in stated:  # SCIFIO's lists, in parallel
         scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))

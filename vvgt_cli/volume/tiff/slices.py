@@ -49,7 +49,10 @@ def _of_one_format(files: list[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def read_slices(files: list[Path], options: ReadOptions, source: str, name: str) -> Volume:
-    """Read slices, slice z with rows from the top as y; spacing is the first file's, else that of a scanner's log."""
+    """Read slices, slice z with rows from the top as y; spacing is the first file's, else that of a scanner's log.
+
+    Errors are those of `Reader.read`.
+    """
     files, others = _of_one_format(files) if len(files) > 1 else (files, [])
     if len(files) > MOST:
         raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")

@@ -41,7 +41,7 @@ SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 KEYS = ("dims", "spacing", "array", "component", "time")
-MOST_ROWS = 50  # of blocks or steps that `contents_of` lists
+MOST_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
 
 

@@ -84,7 +84,10 @@ def check_legacy_grid(path: Path) -> None:
 
 
 def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled."""
+    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled.
+
+    Errors are those of `Reader.read`.
+    """
     if not mesh.IsA("vtkDataSet"):
         raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
     if mesh.IsA("vtkPolyData"):

@@ -101,7 +101,10 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
 def sampled_volume(
     values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
 ) -> Volume:
-    """Make the volume of samples, and warn of their number if ``dims`` is None; raise DataError if none is inside."""
+    """Make the volume of samples, and warn of their number if ``dims`` is None; raise DataError if none is inside.
+
+    Values are (nz, ny, nx), NaN where not ``inside``; ``dtype`` is theirs before sampling.
+    """
     if not inside.any():
         raise DataError(f"{source}: no sample of {_text(grid.dims)} lies in a cell of the mesh; try other --dims")
     if dims is None:

@@ -198,7 +198,8 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
 def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
     """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
-    With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden.
+    With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden. Errors are
+    those of `Reader.read`.
     """
     packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
     if packed is not None:
