@@ -74,41 +74,6 @@ def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
     assert list(tmp_path.glob("*.json")) == []
 
 
-def test_a_series_of_volumes_is_a_movie_over_time(tmp_path, vvgt):
-    """A picture a frame, all in the range of all; with an orbit the view turns meanwhile."""
-    ball = np.linalg.norm(np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 12)], indexing="ij")), axis=0)
-    for k in range(3):
-        np.save(tmp_path / f"run_{k}.npy", ((k + 1) * np.exp(-4 * ball**2)).astype(np.float32))
-    look = ("--tf", "viridis", "--size", 24)
-    assert vvgt("render", tmp_path / "run_*.npy", *look, "-o", tmp_path / "time.gif").code == 0
-    pictures, times, _ = gif(tmp_path / "time.gif")
-    assert (pictures.shape, set(times)) == ((3, 24, 24, 3), {200})
-    brightness = pictures.mean(axis=(1, 2, 3))
-    assert brightness[0] < 0.6 * brightness[1] < 0.6 * brightness[2]
-    assert vvgt("render", tmp_path / "run_2.npy", *look, "-o", tmp_path / "last.png").code == 0
-    with Image.open(tmp_path / "last.png") as last:
-        shown = np.asarray(last.convert("RGBA"), np.float32) / 255
-    assert psnr(shown[..., :3] * shown[..., 3:], pictures[2]) > 28
-    result = vvgt("render", tmp_path / "run_*.npy", *look, "--rule", "mip", "--orbit", 7, "-o", tmp_path / "mip.gif")
-    assert (result.code, "7 views" in result.err) == (0, True)
-    greatest = gif(tmp_path / "mip.gif")[0].max(axis=(1, 2, 3))
-    np.testing.assert_allclose(greatest, np.array([1, 1, 1, 2, 2, 3, 3]) / 3, atol=0.06)
-
-
-def test_a_glob_of_gaussians_is_a_movie_over_time(ply, tmp_path, vvgt):
-    gaussians, _ = ply
-    for k in range(2):
-        write_ply(tmp_path / f"f_{k}.ply", replace(gaussians, means=gaussians.means * (1 - 0.5 * k)), PlyOptions())
-    result = vvgt("render", tmp_path / "f_?.ply", "--size", 64, "-o", tmp_path / "time.gif")
-    assert result.code == 0, result.err
-    pictures = gif(tmp_path / "time.gif")[0]
-    for k, picture in enumerate(pictures):
-        shrunk = replace(gaussians, means=gaussians.means * (1 - 0.5 * k))
-        assert psnr(render(shrunk, orbit_views(1, size=64)[0])[..., :3], picture) > 28
-    assert len(pictures) == 2
-    assert vvgt("render", tmp_path / "none_*.ply", "--size", 64, "-o", tmp_path / "no.gif").code == 2
-
-
 def test_an_mp4_of_an_orbit_over_white(ply, tmp_path, vvgt):
     pytest.importorskip("imageio_ffmpeg")
     result = vvgt("render", ply[1], "--orbit", 10, "--size", 63, "--background", 1, 1, 1, "-o", tmp_path / "turn.mp4")

@@ -53,8 +53,7 @@ def command(
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
     Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif
-    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit; a quoted glob, or a
-    file of several time steps, becomes a movie over time, at 5 without --camera and --orbit. The up axis is the one
+    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. The up axis is the one
     recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels: FOLDER#1
     is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown under any
     function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name. Of a volume of values,
@@ -65,7 +64,6 @@ def command(
       vvgt render head.nrrd --tf ct-bone --size 800 -o head.png
       vvgt render frog.ply --orbit 36 --size 800 -o turn
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
-      vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
     from vvgt_cli.commands.recolor import function_of

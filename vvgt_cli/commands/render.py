@@ -22,7 +22,6 @@ from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import AUTO
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.rays import HALO
 from vvgt_cli.field.reader import Box, Scalars
@@ -55,8 +54,7 @@ class RenderRequest:
 
     Attributes:
         given: file of Gaussians, "-" for standard input, of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`); or a volume with its look. Of a movie also a glob of files of
-            Gaussians or a series of volumes.
+            (`vvgt_cli.gaussians.formats.levels`); or a volume with its look.
         output: directory for the images, one picture (`PICTURE`), or a movie by its ending
             (`SUFFIXES`).
         camera: view-set file, or None.
@@ -69,7 +67,6 @@ class RenderRequest:
         overwrite: replace images that exist.
         function: look to show live Gaussians under; None: the look of the file.
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
-        frames: number of Gaussians or volumes, one after the other.
     """
 
     given: str | SourceRequest
@@ -83,7 +80,6 @@ class RenderRequest:
     overwrite: bool = False
     function: FunctionRequest | None = None
     blocks: BlockOptions | None = None
-    frames: int = 1
 
     @property
     def single(self) -> bool:
@@ -96,18 +92,17 @@ class RenderRequest:
         return Path(self.output).suffix.lower() in SUFFIXES
 
     def cameras(self, size: int | None = None, up: str = "none") -> list[Camera]:
-        """Return the views, of several frames at least one each; ``size`` and ``up`` (axis) are an orbit's defaults.
+        """Return the views; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults.
 
         Raises:
             UsageError: no views are given, or several for one picture.
         """
-        still = self.camera is None and (self.single or self.frames > 1)
-        if (self.camera is None) == (self.orbit is None) and not still:
+        if (self.camera is None) == (self.orbit is None) and not (self.single and self.camera is None):
             raise UsageError("give the views with either --camera FILE or --orbit N, or one picture, as -o out.png")
         if self.camera is not None:
             cameras = read_cameras(self.camera, self.size)
         else:
-            cameras = orbit_views(self.orbit or 1, size=self.size or size or SIZE) * (1 if self.orbit else self.frames)
+            cameras = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
         if self.single and len(cameras) > 1:
             raise UsageError(f"-o {self.output}: one picture of {len(cameras)} views; expected a directory")
         if self.camera is not None:
@@ -137,6 +132,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     """
     console = console or Console()
     run = Run(console, ConversionReport("render"))
+    cameras = request.cameras()
     if request.rule in NAMES and request.background is not None:
         raise UsageError(f"--background: pictures of --rule {request.rule} are opaque; omit it")
     if request.movie and request.exr:
@@ -145,72 +141,20 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         inputs = [request.given] if isinstance(request.given, str) else request.given.paths()
         floats = [Output("--exr", str(Path(request.output).with_suffix(".exr")))] if request.exr else []
         check_outputs([Output("-o", request.output), *floats], inputs, request.overwrite)
-    frames = _frames(run, request) if request.movie else [request.given]
-    request = replace(request, frames=len(frames))
-    cameras = request.cameras()
-    if not (request.movie or request.single):
+    else:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
     if request.movie:
         movie_ready(request.output)
     with ExitStack() as stack:
-        draw, cameras, by = _frame(run, request, frames[0], cameras, stack)
-        if len(frames) > 1:
-            draw = _over_time(request, frames, draw, cameras)
+        if isinstance(request.given, str):
+            draw, cameras, by = _gaussians(run, request, request.given)
+        else:
+            draw, by = _volume(run, request, request.given, cameras, stack)
         with run.stage("render") as stage:
             note = (_movie if request.movie else _pictures)(request, console, draw, cameras)
             stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {by} in {note}"
     return len(cameras)
-
-
-def _frames(run: Run, request: RenderRequest) -> list[str | SourceRequest]:
-    """Return the Gaussians or volumes of a movie, in their order; volumes of a series are seen in a common range.
-
-    Raises:
-        DataError, UsageError: see `vvgt_cli.conversion.frames.survey` and `vvgt_cli.commands.view.expanded`.
-    """
-    from vvgt_cli.commands.view import expanded, is_series
-    from vvgt_cli.conversion.frames import list_steps, survey
-
-    given = request.given
-    if isinstance(given, str):
-        return list(expanded([given]))
-    if not is_series(given):
-        return [given]
-    steps = list_steps(given)
-    with run.stage("frames") as stage:
-        found = survey(steps, given.labels, given.tf, run.console)
-        stage.note = f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}"
-    labels = AUTO if given.labels is None and found.labels is not None else given.labels
-    same = replace(given, statistics=found.whole, labels=labels)
-    return [replace(same, volume=step.volume, read=step.read) for step in steps]
-
-
-def _frame(
-    run: Run, request: RenderRequest, given: str | SourceRequest, cameras: list[Camera], stack: ExitStack
-) -> tuple[Draw, list[Camera], str]:
-    """Return the renderer of a frame, the views, and the name of what draws."""
-    if isinstance(given, str):
-        return _gaussians(run, request, given)
-    draw, by = _volume(run, request, given, cameras, stack)
-    return draw, cameras, by
-
-
-def _over_time(request: RenderRequest, frames: list[str | SourceRequest], first: Draw, cameras: list[Camera]) -> Draw:
-    """Return the function that draws the views in their order, as many of each frame; ``first`` draws the first."""
-    quiet = Run(Console(quiet=True), ConversionReport("render"))
-
-    def turns() -> Iterator[Draw]:
-        now, draw = 0, first
-        with ExitStack() as stack:
-            for number in range(len(cameras)):
-                if (turn := number * len(frames) // len(cameras)) != now:
-                    stack.close()
-                    now, draw = turn, _frame(quiet, request, frames[turn], cameras, stack)[0]
-                yield draw
-
-    each = turns()
-    return lambda camera: next(each)(camera)
 
 
 def _gaussians(run: Run, request: RenderRequest, name: str) -> tuple[Draw, list[Camera], str]:
@@ -328,9 +272,8 @@ def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[C
             if bar:
                 bar(done, len(cameras))
 
-    rate = RATE if request.camera or request.orbit else SLOWLY
-    size = write_movie(request.output, pictures(), request.overwrite, rate)
-    return f"{request.output}: {len(cameras) / rate:.1f} s, {size / 1e6:.2f} MB"
+    size = write_movie(request.output, pictures(), request.overwrite)
+    return f"{request.output}: {len(cameras) / RATE:.1f} s, {size / 1e6:.2f} MB"
 
 
 def as_xray(source: Source) -> Source:
@@ -338,7 +281,7 @@ def as_xray(source: Source) -> Source:
     source.require_scalar_field()
     layer = source.layers[0]
     assert isinstance(layer.tf, TransferFunction)
-    distance = exposed_distance(layer.tf, source.overall, 2 / source.volume.unit_frame().scale)
+    distance = exposed_distance(layer.tf, source.statistics, 2 / source.volume.unit_frame().scale)
     return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
 
 
@@ -360,7 +303,7 @@ def mip_of(field: Blocked | Source) -> Draw:
     from vvgt_cli.dvr.scene import kernel_values
 
     values, slope, intercept = kernel_values(source.volume)
-    whole = Box(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
+    whole = Box(values, None, _of_range(source.statistics, slope, intercept), np.zeros(3, np.int64))
     part = whole, whole.begin, np.array(source.volume.dims)
     return lambda camera: grey(_greatest(source, [part], camera))
 
@@ -369,7 +312,7 @@ def _blocks(field: Blocked) -> Iterator[Part]:
     """Yield the blocks of a volume."""
     reader, volume = field.reader, field.source.volume
     assert isinstance(reader, Scalars)
-    optics = _of_range(field.source.overall, reader.rule.slope, reader.rule.intercept)
+    optics = _of_range(field.source.statistics, reader.rule.slope, reader.rule.intercept)
     blocks = Boxes(volume.dims, (field.edge, field.edge, field.edge))
     for number in range(len(blocks)):
         lo, hi = blocks.at(number)
@@ -405,7 +348,6 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
 
 SUFFIXES = (".gif", ".mp4")
 RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
-SLOWLY = 5  # frames per second, as pages play a series
 _QUALITY = "18"  # of x264: visually almost lossless
 _MOST = 1 << 16  # colours that a palette is computed from
 _COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
@@ -417,14 +359,13 @@ def movie_ready(path: str | Path) -> None:
         _ffmpeg(str(path))
 
 
-def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False, rate: int = RATE) -> int:
+def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False) -> int:
     """Write pictures as a looping movie, and return its size in bytes.
 
     Args:
         path: a file that ends in one of `SUFFIXES`.
         pictures: (h, w, 3) float32 RGB in [0, 1] (clipped), at least one, all of the same size.
         overwrite: replace an existing file.
-        rate: pictures per second.
 
     Raises:
         DataError: the library fails or is not installed, or the file cannot be written.
@@ -432,11 +373,11 @@ def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: boo
     """
     frames = (np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8) for picture in pictures)
     with atomic_write(path, overwrite) as temporary:
-        (_gif if Path(path).suffix.lower() == ".gif" else _mp4)(temporary, frames, rate)
+        (_gif if Path(path).suffix.lower() == ".gif" else _mp4)(temporary, frames)
         return temporary.stat().st_size
 
 
-def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
+def _gif(path: Path, frames: Iterator[np.ndarray]) -> None:
     """Write a GIF that loops forever, with one palette for all pictures, so that static parts do not flicker."""
     from PIL import Image
 
@@ -446,7 +387,7 @@ def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
     colors = colors[:: max(len(colors) // _MOST, 1)]
     palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // rate, loop=0, optimize=False)
+    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // RATE, loop=0, optimize=False)
 
 
 def _ffmpeg(source: str) -> Any:
@@ -459,7 +400,7 @@ def _ffmpeg(source: str) -> Any:
     return imageio_ffmpeg
 
 
-def _mp4(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
+def _mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
     """Write H.264 that all players support: 4:2:0, with the last row or column repeated to get even sizes."""
     library, writer = _ffmpeg(str(path)), None
     try:
@@ -468,7 +409,7 @@ def _mp4(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
             even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if writer is None:
                 writer = library.write_frames(
-                    str(path), (even.shape[1], even.shape[0]), fps=rate, codec="libx264", macro_block_size=2,
+                    str(path), (even.shape[1], even.shape[0]), fps=RATE, codec="libx264", macro_block_size=2,
                     output_params=["-crf", _QUALITY, "-movflags", "+faststart"], ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)

@@ -92,7 +92,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
     """
     run = Run(console or Console(), ConversionReport("view"))
     clouds = named_files(request.files)
-    if len(clouds) == 1 and is_series(source := replace(request.source, volume=clouds[0][1])):
+    if len(clouds) == 1 and _is_series(source := replace(request.source, volume=clouds[0][1])):
         _show_series(run, request, source, announce)
         return
     if request.output is None:
@@ -109,7 +109,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         report_agreement(run, request.output, gaussians, options)
 
 
-def is_series(source: SourceRequest) -> bool:
+def _is_series(source: SourceRequest) -> bool:
     """Return whether a volume is several frames: a glob of files, or a file of several time steps."""
     from vvgt_cli.conversion.frames import is_glob_of_volumes, list_steps
 
