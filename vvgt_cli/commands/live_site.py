@@ -373,7 +373,7 @@ class PageController:
         self.better = made.ply
         self.resources[f"{number}.ply"] = _resource(made.files["ply"], BYTES)
         self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
-        self.console.message("converted for the page's function")
+        self.console.message("converted for the page's function and light")
 
     def _failed(self, number: int, error: VvgtError) -> None:
         if self.state["state"] in ("first", "working"):

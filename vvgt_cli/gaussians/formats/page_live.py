@@ -20,7 +20,7 @@ from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upri
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
-from vvgt_cli.gaussians.live import law_nodes
+from vvgt_cli.gaussians.live import OPAQUE, law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import MATTE, MOST, Lighting
@@ -302,7 +302,7 @@ def _is_own(tf: TransferFunction, facts: LiveFacts) -> bool:
 
 def _per_longer(nodes: PiecewiseOpacity, times: float) -> PiecewiseOpacity:
     """Return opacity per a unit distance so many times as long, with nodes until its extinction is right to 1 %."""
-    x, y = nodes.x, nodes.y
+    x, y = nodes.x, np.minimum(nodes.y, OPAQUE)
     while True:
         y_between = (y[1:] + y[:-1]) / 2
         longer, between = (-np.expm1(times * np.log1p(-part)) for part in (y, y_between))

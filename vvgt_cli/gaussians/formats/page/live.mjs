@@ -21,7 +21,7 @@ export async function unpacked(id, alone, size) {
   throw new Damaged('its values are incomplete');
 }
 
-// {live, layers, bytes, count, sums, rows, planes, apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, layers, bytes, count, sums, rows, planes, apply(nodes, k), sketch(nodes, k), labels(list, k), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
   const { planes } = live, layers = layersOf(live), carried = new WeakMap();  // bytes of the resources that have them

@@ -15,13 +15,14 @@ function carried({ bytes, count, live }, { values: [lo, hi] }, i) {
   };
 }
 
-// the unit direction of a direction in the Gaussian's own standard deviations, and arms that are so many times as long along one of these
+// the unit direction of a direction in the Gaussian's own standard deviations
 const along = (direction, arms) => {
   const a = arms.map((arm) => dot(direction, arm)), length = Math.max(Math.hypot(...a), 1e-30);
   return a.map((x) => x / length);
 };
 
 const across = (arms, own) => [0, 1, 2].map((c) => arms[0][c] * own[0] + arms[1][c] * own[1] + arms[2][c] * own[2]);
+// arms that are so many times as long along one of these directions
 const narrowed = (arms, own, times) => {
   const arm = across(arms, own);
   return arms.map((one, k) => one.map((x, c) => x + arm[c] * (times - 1) * own[k]));

@@ -138,7 +138,7 @@ export async function served(panel, viewer, server, converted) {
             put();
           }
           if (state.scored) return;
-        } else say(`converting under this function: ${state.said}`);
+        } else say(`converting under this look: ${state.said}`);
         await pause(ASK);
       }
       if (mine === change && busy) end();
