@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import hypothesis
@@ -113,15 +113,26 @@ class Result:
         return lines[0]
 
 
-@pytest.fixture
-def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[Callable[..., Result]]:
-    """Run a command line in this process; output is captured at the file descriptors, so VTK's is seen too."""
+class CommandLine:
+    """Run command lines in this process; output is captured at the file descriptors, so VTK's is seen too."""
 
-    def call(*args: object) -> Result:
-        capfdbinary.readouterr()
+    def __init__(self, captured: pytest.CaptureFixture[bytes]) -> None:
+        self.captured = captured
+
+    def __call__(self, *args: object) -> Result:
+        self.captured.readouterr()
         code = run([str(arg) for arg in args])
-        out, err = capfdbinary.readouterr()
+        out, err = self.captured.readouterr()
         return Result(code, out, err.decode())
 
-    yield call
+    def ok(self, *args: object) -> Result:
+        """Run a command line that must succeed."""
+        result = self(*args)
+        assert result.code == 0, result.err
+        return result
+
+
+@pytest.fixture
+def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[CommandLine]:
+    yield CommandLine(capfdbinary)
     set_memory(None)  # `--memory` is of the whole process

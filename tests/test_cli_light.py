@@ -37,16 +37,14 @@ def tf(folder, name="dark"):
 
 
 def psnr(vvgt, ply, *more):
-    result = vvgt("evaluate", ply, "--volume", SOURCE, "--no-conditions", "--step", "0.5", "--json", *more)
-    assert result.code == 0, result.err
+    result = vvgt.ok("evaluate", ply, "--volume", SOURCE, "--no-conditions", "--step", "0.5", "--json", *more)
     return json.loads(result.out)["scores"]["psnr"]
 
 
 def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
     out = folder / "head.ply"
     report = folder / "head.json"
-    made = vvgt("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--report", report, "-o", out)
-    assert made.code == 0, made.err
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--report", report, "-o", out)
     gaussians, header = read_ply(out)
     assert header.light == Lighting()
     assert gaussians.degree == header.sh_degree == 2
@@ -65,17 +63,16 @@ def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
 
 def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):
     out = folder / "fixed.ply"
-    made = vvgt(
+    vvgt.ok(
         "convert", SOURCE, *tf(folder), *SMALL, "--light", "1,0,2", "--shadows", "--specular", "0",
         "--ambient-occlusion", "-o", out,
     )  # fmt: skip
-    assert made.code == 0, made.err
     gaussians, header = read_ply(out)
     assert (gaussians.harmonics, header.sh_degree) == (None, 0)
     assert header.light.shadows
     assert header.light.occlusion == 0.1
     dark = folder / "dark.ply"
-    assert vvgt("convert", SOURCE, *tf(folder), *SMALL, "-o", dark).code == 0
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "-o", dark)
     assert read_ply(dark)[1].light is None
     assert gaussians.colors.mean() < 0.8 * read_ply(dark)[0].colors.mean()
     assert not np.any(_rows(dark, "dark")[1]["nz"])
@@ -83,8 +80,7 @@ def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt)
 
 def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
     out = folder / "flat.ply"
-    made = vvgt("init", SOURCE, *tf(folder, "lit"), "--max-gaussians", "300", "--sh-degree", "0", "-o", out)
-    assert made.code == 0, made.err
+    made = vvgt.ok("init", SOURCE, *tf(folder, "lit"), "--max-gaussians", "300", "--sh-degree", "0", "-o", out)
     assert "--sh-degree 0: headlight and highlights change with the view" in made.err
     gaussians, header = read_ply(out)
     assert (gaussians.degree, header.light) == (0, Lighting(diffuse=0.9))
@@ -108,11 +104,10 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
 def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
     shown = {}
     for name, more in (("preset", ()), ("none", ("--light", "none")), ("left", ("--light", "left"))):
-        done = vvgt(
+        vvgt.ok(
             "render-views", SOURCE, *tf(folder, "lit"), "--views", "1", "--test-views", "0", "--size", "32", "--format",
             "exr", "--no-points", *more, "-o", folder / name,
         )  # fmt: skip
-        assert done.code == 0, done.err
         shown[name] = next((folder / name).rglob("*.exr")).read_bytes()
     assert len(set(shown.values())) == 3
 
@@ -176,23 +171,21 @@ def test_files_are_lit_by_default_in_memory_in_blocks_and_live(vvgt, tmp_path) -
         "flat": ("--live", "--light", "none"),
     }
     for name, more in ways.items():
-        done = vvgt("convert", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.ply")
-        assert done.code == 0, done.err
+        done = vvgt.ok("convert", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.ply")
         assert ("--light none omits it" in done.err) == (name != "flat")
         headers[name] = read_ply(tmp_path / f"{name}.ply")[1].light
     assert headers == dict.fromkeys(("a", "b", "live"), LabelTable.lighting) | {"flat": None}
     again = {"as": (), "new": ("--labels", "auto")}
     for name, more in again.items():  # a new table brings its light, the file's own look does not
         where = tmp_path / f"{name}.ply"
-        assert vvgt("recolor", tmp_path / "flat.ply", *more, "--opacity-unit-distance", 2, "-o", where).code == 0
+        vvgt.ok("recolor", tmp_path / "flat.ply", *more, "--opacity-unit-distance", 2, "-o", where)
         assert read_ply(where)[1].light == (LabelTable.lighting if more else None)
 
 
 def test_a_network_leaves_harmonics_as_they_are(folder, vvgt):
     call = ("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--steps", "8")
-    assert vvgt(*call, "-o", folder / "plain.ply").code == 0
-    result = vvgt(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
-    assert result.code == 0, result.err
+    vvgt.ok(*call, "-o", folder / "plain.ply")
+    vvgt.ok(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
     stages = {stage["name"]: stage for stage in json.loads((folder / "m.json").read_text())["stages"]}
     assert stages["network"]["psnr"] > 15
     assert read_ply(folder / "m.ply")[0].degree == 2

@@ -60,18 +60,16 @@ def test_the_command_line_takes_both_forms(vvgt) -> None:
     options = ("--volume", "v.raw", "--dims", "4,5,6", "--dtype", "uint8", "--overwrite")
     pictures = []
     for limits in (["20,90"], ["20", "90"]):
-        assert vvgt("tf", "show", "viridis", "-o", "a.png", *options, "--tf-range", *limits).code == 0
+        vvgt.ok("tf", "show", "viridis", "-o", "a.png", *options, "--tf-range", *limits)
         pictures.append(Path("a.png").read_bytes())
     assert pictures[0] == pictures[1]
 
 
 def test_a_name_with_line_breaks_stays_on_a_line(vvgt) -> None:
     np.save("a\nb\x85c.npy", blob((12, 12, 12)).data)
-    out = vvgt("info", "a\nb\x85c.npy")
-    assert out.code == 0
+    out = vvgt.ok("info", "a\nb\x85c.npy")
     assert "name           a b c" in out.out.decode().split("\n")
-    done = vvgt("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--size", 32)
-    assert done.code == 0
+    done = vvgt.ok("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--size", 32)
     lines = done.err.splitlines()
     assert sum(line.startswith("read ") and "a b c: 12 x 12 x 12" in line for line in lines) == 1
     assert sum(line.startswith("write ") and "d e.ply: " in line for line in lines) == 1
@@ -85,7 +83,7 @@ def test_raw_values_read_in_another_order_than_they_lie_in_are_told(vvgt, recwar
         data = np.fromfile("v.raw", np.float32).reshape(order[::-1])
         assert guess_dims(data) == (None if order == dims else dims)
         recwarn.clear()
-        assert vvgt("info", "v.raw", "--dims", *order, "--dtype", "float32").code == 0
+        vvgt.ok("info", "v.raw", "--dims", *order, "--dtype", "float32")
         assert ["did you mean --dims 40 28 20?" in str(w.message) for w in recwarn] == [True] * (order != dims)
 
 

@@ -91,7 +91,7 @@ def test_what_is_worse_is_not_written(folder, vvgt, tmp_path, monkeypatch):
     shutil.copy("mixed/transforms_test.json", "mixed/transforms_check.json")
     for image in Path("mixed/train").glob("*.exr"):
         write_exr(image, np.zeros((32, 32, 4), np.float32), overwrite=True)
-    assert vvgt("optimize", folder / "in.ply", "--views", folder / "views", "--steps", 40, "-o", "good.ply").code == 0
+    vvgt.ok("optimize", folder / "in.ply", "--views", folder / "views", "--steps", 40, "-o", "good.ply")
     args = ("good.ply", "--views", "mixed", "--steps", 400, "-o", "out.ply", "--report", "r.json")
     result = vvgt("optimize", *args)
     assert (result.code, "ended early" in result.err) == (0, True), result.err
@@ -172,7 +172,7 @@ def test_ctrl_c_writes_what_there_is(folder, tmp_path):
 def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, tmp_path, vvgt):
     world = PlyOptions(frame="world", up="x", scale=0.5, centre=(3.0, -2.0, 9.0))
     write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], world)
-    assert vvgt("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q").code == 0
+    vvgt.ok("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q")
     far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
     assert (same[1].made_for, same[1].rule) == (
         read_cameras(folder / "views" / "transforms_train.json")[0].width,
@@ -185,8 +185,7 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
 
 def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
     small = ("--size", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
-    result = vvgt("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
-    assert result.code == 0, result.err
+    vvgt.ok("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
     report = json.loads((tmp_path / "r.json").read_text())
     stages = {stage["name"]: stage for stage in report["stages"]}
     assert "back-projection" not in stages

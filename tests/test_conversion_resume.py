@@ -20,7 +20,7 @@ def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
     """The working folder, with what a run that is not ended writes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(views, "ray_settings", by_start)
-    assert vvgt(*LINE, "-o", "whole.ply").code == 0
+    vvgt.ok(*LINE, "-o", "whole.ply")
     return tmp_path
 
 
@@ -77,12 +77,12 @@ def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vv
 @pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
 def test_stages_that_cut_the_pyramid_again_have_it(more, folder, vvgt, monkeypatch):
     line = (*LINE, *more, "--overwrite", "-o")
-    assert vvgt(*line, "whole.ply").code == 0
+    vvgt.ok(*line, "whole.ply")
     with monkeypatch.context() as patch:
         ended(patch, "scores.score_test_views", 0)
         assert vvgt(*line, "a.ply", "--checkpoint", "kept").code == 130
     (folder / "kept" / "fitted.npz").unlink()
-    assert vvgt(*line, "a.ply", "--checkpoint", "kept").code == 0
+    vvgt.ok(*line, "a.ply", "--checkpoint", "kept")
     assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()
 
 

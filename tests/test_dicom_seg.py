@@ -147,7 +147,7 @@ def test_by_command(vvgt, tmp_path: Path) -> None:
     assert (colors[:, 0] - colors[:, 2] > 0.9).any()
     assert (colors[:, 2] - colors[:, 0] > 0.9).any()
     split = ("--split-labels", "-o", tmp_path / "s_{}.ply")
-    assert vvgt("convert", tmp_path / "s.dcm", *SMALL, *split).code == 0
+    vvgt.ok("convert", tmp_path / "s.dcm", *SMALL, *split)
     assert sorted(p.name for p in tmp_path.glob("s_*.ply")) == ["s_1-liver.ply", "s_2-spleen.ply"]
     facts = vvgt("info", tmp_path / "s.dcm").out.decode()
     assert "label_map" in facts

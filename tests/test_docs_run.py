@@ -106,8 +106,7 @@ def run_blocks(page: str, vvgt) -> list[str]:
         for line in block.splitlines():
             words = shlex.split(line)
             assert words[0] == "vvgt", f"{page}: {line}: expected a vvgt command"
-            result = vvgt(*small(words[1:]))
-            assert result.code == 0, f"{line}\n{result.err}"
+            vvgt.ok(*small(words[1:]))
             done.append(line)
     return done
 

@@ -184,8 +184,7 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     notes = []
     for blocks in ("32", "128"):
-        run = vvgt("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
-        assert run.code == 0
+        run = vvgt.ok("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
         notes.append(re.search(r"PSNR ([\d.]+) dB .* 3 views of 150 px, through all voxels", run.err))
         scores = json.loads(run.out)["scores"]
         assert f"{scores['psnr']:.2f}" == notes[-1][1]
@@ -203,10 +202,9 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
 def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, monkeypatch):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
-    assert vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64").code == 0
+    vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.A_GAUSSIAN", 1 << 40)
-    run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
-    assert run.code == 0
+    run = vvgt.ok("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
     assert "skipped: test views" in run.err
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 

@@ -40,9 +40,9 @@ def test_the_second_of_two_runs_to_one_name_fails_at_once(tmp_path, vvgt, monkey
     assert (result.code, result.error) == (
         2, "vvgt: error: a.ply: another run is at work on it; wait until that has ended, or give another name",
     )  # fmt: skip
-    assert vvgt(*INIT, "-o", "b.ply").code == 0
+    vvgt.ok(*INIT, "-o", "b.ply")
     holder.communicate("\n")
-    assert vvgt(*INIT, "-o", "a.ply").code == 0
+    vvgt.ok(*INIT, "-o", "a.ply")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
 
 
@@ -68,7 +68,7 @@ def test_two_equal_series_in_one_folder(tmp_path, vvgt, monkeypatch):
     result = vvgt(*line)
     assert (result.code, "manifest.json: another run is at work on it" in result.error) == (2, True)
     holder.communicate("\n")
-    assert vvgt(*line).code == 0
+    vvgt.ok(*line)
 
 
 def test_where_there_are_no_locks_everyone_may_write(tmp_path, monkeypatch):

@@ -227,25 +227,22 @@ def test_a_usd_stage_is_turned_upright():
 
 def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
-    result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
-    assert result.code == 0, result.err
+    result = vvgt.ok("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     found = re.search(r"PSNR ([\d.]+) dB, a \.ply would have ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
     after, before, cost = map(float, found.groups())
     assert cost == pytest.approx(before - after, abs=0.011)
     assert 0 < before < 60
     told = json.loads((tmp_path / "r.json").read_text())
     assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
-    scored = vvgt("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis", "--json",
-                  "--no-conditions", "--step", 0.5)  # fmt: skip
-    assert scored.code == 0, scored.err
+    scored = vvgt.ok("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis",
+                     "--json", "--no-conditions", "--step", 0.5)  # fmt: skip
     assert json.loads(scored.out)["size"] == 64
 
 
 def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
-        result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
-        assert result.code == 0, result.err
+        result = vvgt.ok("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
         found = re.search(r"([\d.]+|inf) dB from the Gaussians before writing, 3 views of 64 px", result.err)
         assert (found is None) == (least is None)
         assert least is None or float(found[1]) > least, result.err
@@ -253,7 +250,7 @@ def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
     for name in ("a.ply", "b.spz", "b.html"):
         folder = tmp_path / f"{name}-views"
-        assert vvgt("render", tmp_path / name, "--orbit", 1, "--size", 64, "-o", folder).code == 0
+        vvgt.ok("render", tmp_path / name, "--orbit", 1, "--size", 64, "-o", folder)
     pictures = [read_png(tmp_path / f"{name}-views" / "orbit_000.png") for name in ("a.ply", "b.spz", "b.html")]
     assert psnr(pictures[0], pictures[1]) > 30
     assert psnr(pictures[0], pictures[2]) > 35

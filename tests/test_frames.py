@@ -52,8 +52,7 @@ def clouds(cloud: Gaussians) -> np.ndarray:
 
 
 def init(vvgt, source: object, output: str, *options: object) -> tuple[Gaussians, PlyHeader]:
-    result = vvgt("init", source, "--tf", "tf.json", *SMALL, "-o", output, *options)
-    assert result.code == 0, result.err
+    vvgt.ok("init", source, "--tf", "tf.json", *SMALL, "-o", output, *options)
     return read_ply(output)
 
 
@@ -174,7 +173,7 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     Path("front.json").write_text(transforms_json([FRONT]))
     for frame in ("unit", "world"):
         _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame)
-        assert vvgt("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q").code == 0
+        vvgt.ok("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q")
         assert_reads_right(read_png(f"{frame}/front.png")[..., 3], frame)
         assert header.up == ("z" if frame == "unit" else "none")
     # as SuperSplat shows it: PLY (x, y, z) at (-x, -y, z), +y up; the eye before it, at the patient's front
@@ -183,7 +182,7 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     assert_reads_right(render(shown, eye)[..., 3], "viewer")
     # the reference renderer, and the points that trainers start from
     options = ("--tf", "tf.json", "--cameras", "front.json", "--format", "both", "-o", "views", "-q")
-    assert vvgt("render-views", "f.nii", *options).code == 0
+    vvgt.ok("render-views", "f.nii", *options)
     assert_reads_right(read_png("views/train/front.png")[..., 3], "reference")
     points = read_points(Path("views/points3d.ply"))
     assert_reads_right(splatted(points), "points", 0.5)
@@ -249,7 +248,7 @@ def test_an_orbit_circles_the_way_up(vvgt, up: str) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("b"), anatomy.balls(affine), affine)
     init(vvgt, "b.nii", "b.ply", "--up", up)
-    assert vvgt("render", "b.ply", "--orbit", 5, "--size", 32, "-o", "turn", "-q").code == 0
+    vvgt.ok("render", "b.ply", "--orbit", 5, "--size", 32, "-o", "turn", "-q")
     towards = np.array({"inferior": (0, 0, -1), "left": (-1, 0, 0), "y": (0, 1, 0)}.get(up, (0, 0, 1)), float)
     for camera in read_cameras("turn/transforms.json"):
         assert camera.position @ towards == pytest.approx(3 * np.sin(np.radians(20)), abs=1e-6)
@@ -265,11 +264,10 @@ def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
 
 
 def evaluated(vvgt, ply: str, volume: str, *options: str) -> dict:
-    result = vvgt(
+    result = vvgt.ok(
         "evaluate", ply, "--volume", volume, "--tf", "tf.json", "--size", 48, "--no-conditions", "--step", 0.5,
         "--json", *options,
     )  # fmt: skip
-    assert result.code == 0, result.err
     return json.loads(result.out)["scores"] | {"said": result.err}
 
 
@@ -304,10 +302,9 @@ def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:
     affine = anatomy.place(anatomy.OBLIQUE * (1, -1, 1))
     anatomy.nifti(Path("v"), anatomy.letter(affine) + anatomy.balls(affine), affine)
     views = ("--views", 8, "--test-views", 2, "--size", 48, "-o", "views", "-q")
-    assert vvgt("render-views", "v.nii", "--tf", "tf.json", *views).code == 0
+    vvgt.ok("render-views", "v.nii", "--tf", "tf.json", *views)
     init(vvgt, "v.nii", "in.ply")
-    result = vvgt("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
-    assert result.code == 0, result.err
+    vvgt.ok("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
     report = json.loads(Path("r.json").read_text())
     assert report["scores"]["psnr"] > 24
     before, after = (read_ply(name)[1] for name in ("in.ply", "out.ply"))
@@ -332,8 +329,7 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
         anatomy.nifti(Path(name), both[index[..., 2], index[..., 1], index[..., 0]], affine)
         options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png")
         options += ("-o", f"{name}.ply")
-        result = vvgt("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
-        assert result.code == 0, result.err
+        vvgt.ok("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
         pictures.append(read_png(f"{name}.png"))
     reference = slice(0, 64)
     np.testing.assert_allclose(pictures[0][:, reference], pictures[1][:, reference], atol=0.02)

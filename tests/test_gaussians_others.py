@@ -129,7 +129,7 @@ def test_splat(vvgt: Callable, tmp_path: Path) -> None:
     opacity = [1 / (1 + np.exp(-g.opacity_logits.astype(float))) for g in (found, expected)]
     np.testing.assert_allclose(*opacity, atol=1 / 255)
     assert json.loads(vvgt("info", path, "--json").out)["format"] == ".splat"
-    assert vvgt("render", path, "-o", tmp_path / "r", "--size", 32, "--orbit", 1).code == 0
+    vvgt.ok("render", path, "-o", tmp_path / "r", "--size", 32, "--orbit", 1)
     flat = GOOD.copy()
     flat[3, 7] = -np.inf
     path.write_bytes(splat(flat))

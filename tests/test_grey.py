@@ -192,24 +192,21 @@ def test_a_live_file_is_near_the_volume_in_memory_and_in_blocks(rule: str, least
 
 
 def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> None:
-    assert vvgt("recolor", live, "--tf", "viridis", "-o", tmp_path / "fixed.ply").code == 0
+    vvgt.ok("recolor", live, "--tf", "viridis", "-o", tmp_path / "fixed.ply")
     labels = tmp_path / "labels.ply"
     np.save(tmp_path / "map.npy", np.arange(512).reshape(8, 8, 8).astype(np.uint8) // 128)
-    assert (
-        vvgt(
-            "convert",
-            tmp_path / "map.npy",
-            "--labels",
-            "auto",
-            "--live",
-            "--max-gaussians",
-            200,
-            "--size",
-            64,
-            "-o",
-            labels,
-        ).code
-        == 0
+    vvgt.ok(
+        "convert",
+        tmp_path / "map.npy",
+        "--labels",
+        "auto",
+        "--live",
+        "--max-gaussians",
+        200,
+        "--size",
+        64,
+        "-o",
+        labels,
     )
     out = tmp_path / "a.png"
     for rule in ("mip", "xray"):
@@ -225,7 +222,7 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
     done = vvgt("render", "example:blob:12", "--rule", "spark", "--size", 32, "-o", out)
     assert (done.code, "mip or xray" in done.error) == (2, True)
     assert not out.exists()
-    assert vvgt("render", live, "--rule", "mip", "--orbit", 3, "--size", 32, "-o", tmp_path / "a.gif").code == 0
+    vvgt.ok("render", live, "--rule", "mip", "--orbit", 3, "--size", 32, "-o", tmp_path / "a.gif")
 
 
 def test_a_live_result_draws_them() -> None:

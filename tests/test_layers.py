@@ -79,16 +79,12 @@ def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None
     )
     np.testing.assert_allclose(part.affine @ [0, 0, 0, 1], whole.affine @ [0, 6, 0, 1])
     out = tmp_path / "a.ply"
-    done = vvgt(
-        "init", tmp_path / "v.nii", "--tf", "gray", "--crop", ":,6:18,:", *SMALL[:4], "--frame", "world", "-o", out
-    )
-    assert done.code == 0, done.err
+    vvgt.ok("init", tmp_path / "v.nii", "--tf", "gray", "--crop", ":,6:18,:", *SMALL[:4], "--frame", "world", "-o", out)
     _, header = read_ply(str(out))
     np.testing.assert_allclose(np.reshape(header.affine, (3, 4)), part.affine[:3], atol=1e-6)
     for options in (("--tf", "gray"), ("--labels", "auto")):
         mask = ("--mask", tmp_path / "m.nii", "--overwrite")
-        done = vvgt("init", tmp_path / "v.nii", *options, *mask, *SMALL[:4], "-o", out)
-        assert done.code == 0, done.err
+        vvgt.ok("init", tmp_path / "v.nii", *options, *mask, *SMALL[:4], "-o", out)
         means, frame = library.read_ply(out)[0].means, whole.unit_frame()
         world = means / frame.scale + frame.centre
         index = np.round((np.linalg.inv(whole.affine) @ np.c_[world, np.ones(len(world))].T).T[:, :3]).astype(int)
@@ -219,7 +215,7 @@ def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvg
         assert (done.code, "a.nrrd has colours; expected scalars: give a --mask" in done.error) == (2, True)
     with pytest.raises(UsageError, match="has colours"):
         library.convert(str(tmp_path / "a.nrrd"), keep_largest=10)
-    assert vvgt(*given, "--keep-largest", 10, "--component", 0).code == 0
+    vvgt.ok(*given, "--keep-largest", 10, "--component", 0)
     for more in (("--overwrite",), ("--overwrite", "--blocks", 16)):
         with pytest.warns(UserWarning, match="--keep-largest 10: hides"):
             done = vvgt(*given, "--keep-largest", 10, "--component", "all", *more)
@@ -229,16 +225,14 @@ def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvg
 def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
     assert '"colors": "RGB"' in vvgt("info", tmp_path / "a.nrrd", "--json").out.decode()
-    done = vvgt("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply")
     assert "opacity by luminance" in done.err
     made, _ = read_ply(str(tmp_path / "a.ply"))
     order = np.argsort(made.means[:, 0])
     assert np.polyfit(made.means[order, 0], made.colors[order, 0], 1)[0] > 0.3  # red grows along x
     np.save(tmp_path / "f.npy", colors().astype(np.float32))
     assert "component" in vvgt("init", tmp_path / "f.npy", "-o", tmp_path / "b.ply").error
-    one = vvgt("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
-    assert one.code == 0, one.err
+    vvgt.ok("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
     asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
     assert "one component; expected several: omit --component color" in asked.error
     table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
@@ -253,9 +247,8 @@ def test_names_of_labels_are_kept_beside_other_layers(vvgt, tmp_path: Path) -> N
     (tmp_path / "t.json").write_text(json.dumps(table))
     given = (tmp_path / "v.nii", "--tf", "gray", "--layer", f"{tmp_path / 'l.nii'},labels={tmp_path / 't.json'}")
     for options, out in (((), "a.ply"), (("--live",), "b.ply")):
-        done = vvgt("init" if not options else "convert", *given, *SMALL[:4], *options, "-o", tmp_path / out)
-        assert done.code == 0, done.err
-    assert vvgt("recolor", tmp_path / "b.ply", "-o", tmp_path / "c.ply").code == 0
+        vvgt.ok("init" if not options else "convert", *given, *SMALL[:4], *options, "-o", tmp_path / out)
+    vvgt.ok("recolor", tmp_path / "b.ply", "-o", tmp_path / "c.ply")
     for out in ("a.ply", "c.ply"):
         legend = json.loads(library.read_ply(tmp_path / out)[1].legend)
         assert [name for name, _ in legend["labels"]] == names
@@ -304,10 +297,9 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     unsure = vvgt("init", tmp_path / "a.ome.tif", "--tf", "hot", "-o", tmp_path / "a.ply")
     assert unsure.code == 2  # one, or all
     assert "--channel 0 to 1, a name, all" in unsure.error
-    done = vvgt("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
     layer = f"{tmp_path / 'a.ome.tif'},channel=cyan,tf=gray"
-    done = vvgt(
+    done = vvgt.ok(
         "init",
         tmp_path / "a.ome.tif",
         "--channel",
@@ -320,7 +312,6 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
         "-o",
         tmp_path / "b.ply",
     )
-    assert done.code == 0, done.err
     assert "gray" in done.err
 
 
@@ -414,8 +405,7 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
     layer = f"{tmp_path / 'organ_seg.nii.gz'},labels={tmp_path / 't.json'}"
     asked = ("--tf", "gray:0.5,1:0.05", "--layer", layer)
     out, report = tmp_path / "a.ply", tmp_path / "a.json"
-    done = vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, "-o", out, "--report", report)
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, "-o", out, "--report", report)
     assert "32 x 32 x 32" in done.err
     made, _ = read_ply(str(out))
     red = made.colors[:, 0] - made.colors[:, 1] > 0.5
@@ -429,7 +419,7 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
         json.loads(report.read_text())["scores"]["psnr"], abs=1
     )
     kept = ("--checkpoint", tmp_path / "kept", "--overwrite")
-    assert vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, *kept, "-o", tmp_path / "b.ply").code == 0
+    vvgt.ok("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, *kept, "-o", tmp_path / "b.ply")
     assert out.read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
@@ -463,8 +453,7 @@ def test_several_functions_over_colours_channels_and_layers(vvgt, tmp_path: Path
         ("scan.npy", layer),
     ):
         functions = ("--tf", "gray:0.2,0.8:0.3", "--tf", "viridis:0.1,0.5:0.9", "--overwrite")
-        done = vvgt("convert", tmp_path / volume, *options, *functions, *SMALL, "-o", tmp_path / "o_{}.ply")
-        assert done.code == 0, done.err
+        vvgt.ok("convert", tmp_path / volume, *options, *functions, *SMALL, "-o", tmp_path / "o_{}.ply")
         made = [read_ply(str(path)) for path in sorted(tmp_path.glob("o_*.ply"))]
         assert len(made) == 2
         assert not np.array_equal(made[0][0].opacity_logits, made[1][0].opacity_logits)

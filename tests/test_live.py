@@ -288,7 +288,7 @@ def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_recolor_shows_other_functions_without_the_volume(vvgt, live_file, tmp_path) -> None:
-    assert vvgt("recolor", live_file, "--tf", "viridis", "-o", tmp_path / "v.ply").code == 0
+    vvgt.ok("recolor", live_file, "--tf", "viridis", "-o", tmp_path / "v.ply")
     ordinary, header = read_ply(tmp_path / "v.ply")
     assert header.live is None
     assert ordinary.live is None
@@ -318,22 +318,19 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
     assert under["function"].startswith("viridis")
     assert under["hidden"] + under["gaussians"] == plain["gaussians"]
     for name, more in (("a", ()), ("b", ("--tf", "viridis"))):
-        assert vvgt("render", live_file, *more, "--orbit", 1, "--size", 32, "-o", tmp_path / name).code == 0
+        vvgt.ok("render", live_file, *more, "--orbit", 1, "--size", 32, "-o", tmp_path / name)
     pictures = [next((tmp_path / name).glob("*.png")).read_bytes() for name in "ab"]
     assert pictures[0] != pictures[1]
-    assert (
-        vvgt("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c").code == 0
-    )
+    vvgt.ok("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c")
     assert next((tmp_path / "c").glob("*.png")).read_bytes() not in pictures  # of its own function
     with pytest.warns(UserWarning, match="cannot store values for other functions"):
-        assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
+        vvgt.ok("view", live_file, "-o", tmp_path / "one.spz")
 
 
 def test_a_live_page_is_not_read_back(vvgt, tmp_path) -> None:
     """It computes look and light anew: its columns alone are another picture."""
     for name, told in (("a.html", False), ("a.spz", True)):
-        done = vvgt("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
-        assert done.code == 0
+        done = vvgt.ok("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
         assert ("read back" in done.err) == told
 
 
@@ -363,12 +360,12 @@ def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
     for k in range(2):
         np.save(tmp_path / f"f{k}.npy", np.random.default_rng(k).random((6, 7, 8)).astype(np.float32))
     source = ("convert", tmp_path / "f?.npy", "--tf", "viridis", "-o", tmp_path / "o_{}.ply", "--max-gaussians", 90)
-    assert vvgt(*source, "--size", 48, "--live").code == 0
+    vvgt.ok(*source, "--size", 48, "--live")
     for k in range(2):
         gaussians, header = read_ply(tmp_path / f"o_{k}.ply")
         assert header.live is not None
         assert gaussians.live is not None
-        assert vvgt("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply").code == 0
+        vvgt.ok("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply")
     assert json.loads((tmp_path / "o_index.json").read_text())["files"][1]["file"] == "o_1.ply"
     done = vvgt(*source, "--size", 48)
     assert (done.code, "live" in done.error) == (2, True), done.error
@@ -401,7 +398,7 @@ def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
     for number, blocks in enumerate(((), ("--blocks", 16))):
         out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
         source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
-        assert vvgt("convert", *source, "-o", out, "--report", report).code == 0
+        vvgt.ok("convert", *source, "-o", out, "--report", report)
         scores.append(json.loads(report.read_text())["scores"]["psnr"])
         facts.append(read_ply(out)[1].live)
     assert scores[0] == pytest.approx(scores[1], abs=0.02)

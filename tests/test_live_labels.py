@@ -210,7 +210,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     (tmp_path / "t.json").write_text(json.dumps(table))
     whole = read_ply(label_file)[0]
     look = ("--labels", tmp_path / "t.json", "--light", "none")
-    assert vvgt("recolor", label_file, *look, "-o", tmp_path / "a.ply").code == 0
+    vvgt.ok("recolor", label_file, *look, "-o", tmp_path / "a.ply")
     found, header = read_ply(tmp_path / "a.ply")
     assert header.live is None
     assert len(found) == (whole.live[:, LABEL_ROW] == 0).sum()  # type: ignore[index]
@@ -234,7 +234,7 @@ def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tm
     volume, first = label_file.parent / "map_label.npy", tmp_path / "first.ply"
     for more in ((), ("--blocks", 16)):
         source = (volume, "--labels", tmp_path / "t.json", "--live", *more, "-o", first, "--overwrite")
-        assert vvgt("convert", *source, *SMALL).code == 0
+        vvgt.ok("convert", *source, *SMALL)
         gaussians, header = read_ply(first)
         assert header.live is not None
         assert [label.opacity for label in header.live.labels] == [1, 0]
@@ -242,7 +242,7 @@ def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tm
         counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(int))
         assert 0.05 < counts[1] / counts.sum() < 0.5
         assert gaussians.opacity_logits[gaussians.live[:, LABEL_ROW] == 1].max() < -10
-        assert vvgt("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite").code == 0
+        vvgt.ok("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite")
         assert len(read_ply(tmp_path / "a.ply")[0]) == len(gaussians)
 
 
@@ -269,10 +269,7 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
 
 def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
     volume, found = label_file.parent / "map_label.npy", []
-    assert (
-        vvgt("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL).code
-        == 0
-    )
+    vvgt.ok("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL)
     for file in (label_file, tmp_path / "b.ply"):
         gaussians = read_ply(file)[0]
         assert gaussians.live is not None

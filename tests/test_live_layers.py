@@ -160,10 +160,10 @@ def test_layers_lie_where_they_are_in_the_world(pair: Path) -> None:
 
 def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     live = pair / "live.ply"
-    assert vvgt("recolor", live, "-o", tmp_path / "own.ply").code == 0
+    vvgt.ok("recolor", live, "-o", tmp_path / "own.ply")
     nothing = {"points": [{"x": 0.9, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.01}]}
     (tmp_path / "n.json").write_text(json.dumps(nothing))
-    assert vvgt("recolor", live, "--layer", f"left,tf={tmp_path / 'n.json'}", "-o", tmp_path / "r.ply").code == 0
+    vvgt.ok("recolor", live, "--layer", f"left,tf={tmp_path / 'n.json'}", "-o", tmp_path / "r.ply")
     own, less = read_ply(tmp_path / "own.ply")[0], read_ply(tmp_path / "r.ply")[0]
     assert 0.3 * len(own) < len(less) < 0.9 * len(own)
     again = vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")})
@@ -171,8 +171,8 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
     (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
     hidden, dark = f"2,labels={tmp_path / 'none.json'}", f"tf={tmp_path / 'dark.json'}"
-    assert vvgt("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply").code == 0
-    assert vvgt("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply").code == 0
+    vvgt.ok("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply")
+    vvgt.ok("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply")
     without = [len(read_ply(tmp_path / f"{name}.ply")[0]) for name in "hd"]
     seen = [int((read_ply(live)[0].live[:, LAYER_ID] == number).sum()) for number in (2, 0)]  # type: ignore[index]
     for left, gone in zip(without, seen, strict=True):
@@ -193,7 +193,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     assert [row["name"] for row in told] == ["left", "right", "top_label"]
     under = json.loads(vvgt("info", live, "--json", "--layer", "1,tf=viridis").out)
     assert "viridis" in under["function"]
-    assert vvgt("render", live, "--layer", "2,labels=auto", "--orbit", 1, "--size", 32, "-o", tmp_path / "p").code == 0
+    vvgt.ok("render", live, "--layer", "2,labels=auto", "--orbit", 1, "--size", 32, "-o", tmp_path / "p")
 
 
 def test_layers_are_near_their_volume(vvgt, pair) -> None:
@@ -201,8 +201,7 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     source += ("--layer", f"{pair / 'right.nii'},tf={pair / 'tf.json'}")
     source += ("--layer", f"{pair / 'top_label.nii'},labels={pair / 't.json'}")
     for name in ("live.ply", "blocked.ply"):
-        done = vvgt("evaluate", pair / name, *source, "--json", "--no-conditions")
-        assert done.code == 0, done.err
+        done = vvgt.ok("evaluate", pair / name, *source, "--json", "--no-conditions")
         assert json.loads(done.out)["scores"]["psnr"] > 21
     done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
     assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
@@ -216,16 +215,15 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
     source = (pair / "left.nii", "--tf", pair / "tf.json", "--layer", f"{pair / 'right.nii'},{dark}")
     one = (*source, "--layer", f"{pair / 'top_label.nii'},{hidden}")
     looks = ("--layer", f"1,{dark}", "--layer", f"2,{hidden}")
-    assert vvgt("recolor", pair / "live.ply", *looks, "-o", tmp_path / "r.ply").code == 0
+    vvgt.ok("recolor", pair / "live.ply", *looks, "-o", tmp_path / "r.ply")
     for blocks in ((), ("--blocks", "16")):
         scores = []
         for file in (pair / "live.ply", tmp_path / "r.ply"):
-            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
-            assert done.code == 0, done.err
+            done = vvgt.ok("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
             scores.append(json.loads(done.out)["scores"]["psnr"])
         assert scores[0] == pytest.approx(scores[1], abs=0.01)
         assert scores[0] > 22
-        assert vvgt("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite").code == 0
+        vvgt.ok("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite")
         number = read_ply(tmp_path / "l.ply")[0].live[:, LAYER_ID]  # type: ignore[index]
         assert (np.bincount(number.astype(int)) > 40).all()
     every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
@@ -234,7 +232,7 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
 
 
 def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
-    assert vvgt("view", pair / "live.ply", "-o", tmp_path / "a.html").code == 0
+    vvgt.ok("view", pair / "live.ply", "-o", tmp_path / "a.html")
     found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)
     assert found is not None
     layers = json.loads(found[1])["live"]["layers"]

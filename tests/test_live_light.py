@@ -102,7 +102,7 @@ def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_pa
     assert (header.light, header.sh_degree) == (Lighting(), 2)
     found = {}
     for name, more in {"as": (), "none": ("--light", "none"), "x": ("--light", "x", "--specular", 0)}.items():
-        assert vvgt("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply").code == 0
+        vvgt.ok("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply")
         found[name] = read_ply(tmp_path / f"{name}.ply")
     assert found["as"][1].light == header.light
     assert found["none"][1].light is None
@@ -117,8 +117,8 @@ def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_pa
         shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
         scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--size", 48).out)["scores"]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
-    assert vvgt("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a").code == 0
-    assert vvgt("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b").code == 0
+    vvgt.ok("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a")
+    vvgt.ok("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b")
     assert next((tmp_path / "a").glob("*.png")).read_bytes() != next((tmp_path / "b").glob("*.png")).read_bytes()
 
 

@@ -43,8 +43,8 @@ def scene_of(page: bytes) -> dict:
 def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) -> None:
     """And so do the files of the frames; each frame's bytes are those of its file."""
     source = ("convert", frames / "f?.npy", "--tf", "viridis", "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
-    assert vvgt(*source, "-o", tmp_path / "f_{}.ply").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
+    vvgt.ok(*source, "-o", tmp_path / "f_{}.ply")
     content = (tmp_path / "p.html").read_bytes()
     scene = scene_of(content)
     live = scene["live"]
@@ -100,7 +100,7 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
         data[:, :, 5:] = numbers[1]
         np.save(tmp_path / f"map_label_{k}.npy", data)
     source = ("convert", tmp_path / "map_label_?.npy", "--labels", "auto", "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
     content = (tmp_path / "p.html").read_bytes()
     live = scene_of(content)["live"]
     assert [label["number"] for label in live["layers"][0]["labels"]] == [1, 7, 9]
@@ -119,8 +119,8 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
     np.save(tmp_path / "map.npy", map_)
     layer = ("--layer", f"{tmp_path / 'map.npy'},labels=auto")
     source = ("convert", frames / "f?.npy", "--tf", "viridis", *layer, "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
-    assert vvgt(*source, "-o", tmp_path / "f_{}.ply").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
+    vvgt.ok(*source, "-o", tmp_path / "f_{}.ply")
     content = (tmp_path / "p.html").read_bytes()
     live = scene_of(content)["live"]
     assert [(one["row"], [label["number"] for label in one["labels"]]) for one in live["layers"]] == [

@@ -47,7 +47,7 @@ def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, 
     assert function.opacity_unit_share == 1 / 256
     assert max(function.opacity_nodes.y) <= 0.5
     assert (function.otherwise is not None) == name.startswith("ct-")
-    assert vvgt("tf", "convert", name, tmp_path / "own.json").code == 0
+    vvgt.ok("tf", "convert", name, tmp_path / "own.json")
     again = read_transfer_function(str(tmp_path / "own.json"))
     for one, other in ((function, again), (function.otherwise, again.otherwise)):
         if one is not None:
@@ -289,8 +289,7 @@ def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt: Callable, 
     for name, blocks in (("whole", ()), ("wide", ("--blocks", 32)), ("fine", ("--blocks", 16))):
         given = () if tf is None else ("--tf", tf)
         files.append(tmp_path / f"{name}.ply")
-        done = vvgt("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
-        assert done.code == 0, done.err
+        vvgt.ok("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
     whole, wide, fine = (path.read_bytes() for path in files)
     assert wide == fine
     facts = [json.loads(vvgt("info", path, "--json").out) for path in files]

@@ -144,11 +144,11 @@ def test_hidden_labels_are_named(vvgt: Callable, tmp_path: Path) -> None:
     small = ("--max-gaussians", 60, "--size", 64, "--overwrite", "-o", tmp_path / "o.ply")
     table = saved(tmp_path, "t.ctbl", ROWS.format(a=255, b=0, c=0))
     with pytest.warns(UserWarning, match=r"labels: t.ctbl hides 2 of its labels \(opacity 0\): 2 \(bone\), 3 \(fat\)"):
-        assert vvgt("init", tmp_path / "labels.npy", "--labels", table, *small).code == 0
+        vvgt.ok("init", tmp_path / "labels.npy", "--labels", table, *small)
     solid = saved(tmp_path, "s.txt", ROWS.format(a=255, b=255, c=255))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*hides")
-        assert vvgt("init", tmp_path / "labels.npy", "--labels", solid, *small).code == 0
+        vvgt.ok("init", tmp_path / "labels.npy", "--labels", solid, *small)
     none = saved(tmp_path, "n.ctbl", ROWS.format(a=0, b=0, c=0))
     with pytest.warns(UserWarning, match="hides 3 of its labels"):
         assert "try --labels auto" in vvgt("init", tmp_path / "labels.npy", "--labels", none, *small).error

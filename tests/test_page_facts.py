@@ -241,8 +241,7 @@ def test_a_legend_of_labels_names_those_that_are_shown() -> None:
 
 def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     def listed(name: str) -> dict[str, Any]:
-        done = vvgt("info", tmp_path / name, "--sharing", "--json")
-        assert done.code == 0, done.err
+        done = vvgt.ok("info", tmp_path / name, "--sharing", "--json")
         return json.loads(done.out)
 
     values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
@@ -252,7 +251,7 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     quick = ("--steps", 0)
     kinds = {"a.ply": quick, "live.ply": ("--live",), "n.ply": ("--no-comments", *quick), "a.html": ("--live",)}
     for name, more in kinds.items():
-        assert vvgt("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name).code == 0
+        vvgt.ok("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name)
         assert "Doe" not in json.dumps(listed(name))
     plain, live, bare, page = map(listed, ("a.ply", "live.ply", "n.ply", "a.html"))
     assert {"title", "function", "names", "command", "checksum", "place", "picture"} <= set(plain)
@@ -271,7 +270,7 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
         )
     np.save(tmp_path / "v.npy", values)
     camera = ("--camera", "9,0,0,0,0,0,30")
-    assert vvgt("convert", tmp_path / "v.npy", *given, *quick, *camera, "-o", tmp_path / "w.ply").code == 0
+    vvgt.ok("convert", tmp_path / "v.npy", *given, *quick, *camera, "-o", tmp_path / "w.ply")
     assert listed("w.ply")["camera"] == "eye and target in the world"
     assert "camera" not in plain
     assert plain["place"].endswith("in the scanner")

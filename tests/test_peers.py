@@ -39,8 +39,7 @@ def start(tmp_path_factory):
 
 def test_a_peer_is_run_timed_and_scored_beside_ours(vvgt, start, tmp_path) -> None:
     command = f"{sys.executable} {start / 'make.py'} {start / 'start.ply'} {{views}} {{out}}"
-    result = vvgt("report", "example:blob:10", *SMALL, "--peer", f"Other one={command}", "-o", tmp_path / "out")
-    assert result.code == 0, result.err
+    vvgt.ok("report", "example:blob:10", *SMALL, "--peer", f"Other one={command}", "-o", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "report.json").read_text())
     peer, closed = found["runs"][0], found["runs"][4]
     assert (peer["name"], peer["kind"], closed["name"]) == ("Other one", "peer", "closed form, K = 60")

@@ -182,7 +182,7 @@ def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.previous_frame.VIEWS", 12)
     for k, radius in enumerate((0.2, 0.208, 0.2, 0.2, 0.208)):
         np.save(beat / f"v_{k}.npy", body(radius))
-    assert vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply").code == 0
+    vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     index = json.loads((beat / "f_index.json").read_text())["files"]
     assert [row.get("moved", 0) > 20 for row in index] == [False, True, True, False, True]
     assert index[2]["psnr"] > index[0]["psnr"] - 0.1
@@ -221,8 +221,7 @@ def test_frames_share_what_stands_still_whatever_their_comments_say():
 @pytest.mark.parametrize("more", [(), ("--light", "headlight"), ("--blocks", "16")], ids=" ".join)
 def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
     run = ("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more)
-    done = vvgt(*run, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok(*run, "-o", beat / "f_{}.ply")
     files = [rows(beat / f"f_{k}.ply") for k in range(4)]
     index = json.loads((beat / "f_index.json").read_text())["files"]
     assert "moved" not in index[0]
@@ -234,10 +233,10 @@ def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
         assert still.sum() > 50
     assert index[3]["moved"] == 0
     assert 0 < max(row["moved"] for row in index[1:]) < 0.7 * len(files[0])
-    assert vvgt("convert", beat / "v_2.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "a.ply").code == 0
+    vvgt.ok("convert", beat / "v_2.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "a.ply")
     alone = json.loads((beat / "f_index.json").read_text())
     assert alone["files"][2]["psnr"] > alone["files"][0]["psnr"] - 0.6
-    assert vvgt(*run, "-o", beat / "f.html").code == 0
+    vvgt.ok(*run, "-o", beat / "f.html")
     check_page(beat)
 
 
@@ -281,18 +280,16 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
 
 def test_no_more_steps_than_were_asked_for(vvgt, beat):
     run = ("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW[:-1], "3", "-o", beat / "f_{}.ply")
-    done = vvgt(*run, "--report", beat / "f_{}.json")
-    assert done.code == 0, done.err
+    done = vvgt.ok(*run, "--report", beat / "f_{}.json")
     assert "differences " in done.err
     assert json.loads((beat / "f_1.json").read_text())["refinement"]["steps"] <= 3
 
 
 def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
-    done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     assert "skipped: starting from the previous frame" in done.err
-    assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
+    vvgt.ok("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply")
     assert uncertified(beat / "a.ply") == uncertified(beat / "f_1.ply")
 
 
@@ -306,6 +303,5 @@ def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
     for file in ("v_2.npy", "v_3.npy"):
         (beat / file).unlink()
     how = HOW[:4] if more == ("--live",) else HOW
-    done = vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
     assert ("differences " in done.err) == (more[0] == "--shard")

@@ -163,8 +163,7 @@ def test_load_views_prefers_exr_and_falls_back_to_png(copied, expected):
 
 
 def test_half_rounds_to_half(vvgt, tmp_path, expected):
-    result = vvgt(*BASE, "--test-views", 0, "--half", "--format", "exr", "-o", tmp_path / "h")
-    assert result.code == 0
+    vvgt.ok(*BASE, "--test-views", 0, "--half", "--format", "exr", "-o", tmp_path / "h")
     camera, image = expected["train"][1]
     read, _ = read_exr(tmp_path / "h" / "train" / f"{camera.name}.exr")
     np.testing.assert_array_equal(read, image.astype(np.float16).astype(np.float32))
@@ -176,11 +175,10 @@ def test_half_rounds_to_half(vvgt, tmp_path, expected):
 def test_several_functions_get_a_folder_each(vvgt, tmp_path):
     tf = tmp_path / "a.b.json"
     tf.write_text('{"points": [{"x": 0, "opacity": 0}, {"x": 1, "opacity": 1, "rgb": [1, 0, 0]}]}')
-    result = vvgt(
+    vvgt.ok(
         "render-views", VOLUME, "--tf", tf, "--tf", "magma", "--views", 1, "--test-views", 0, "--size", 16,
         "--format", "exr", "-o", tmp_path / "v",
     )  # fmt: skip
-    assert result.code == 0
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.b", "magma"]
     red, other = (load_views(tmp_path / "v" / name)[1][0] for name in ("a.b", "magma"))
     assert (red[..., 1:3] == 0).all()
@@ -204,11 +202,10 @@ def test_cameras_of_a_file_with_their_split(vvgt, tmp_path, made):
         frame["file_path"] = frame["file_path"].replace("_0", ".0")
     document["test_filenames"] = [frame["file_path"] for frame in document["frames"][3:]]
     (tmp_path / "t.json").write_text(json.dumps(document))
-    result = vvgt(
+    vvgt.ok(
         "render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "--size", 16, "--format", "exr",
         "-o", tmp_path / "v",
     )  # fmt: skip
-    assert result.code == 0
     cameras, images = load_views(tmp_path / "v")
     assert [camera.name for camera in cameras] == ["train_000", "train_001", "train_002"]  # a dot would be a suffix
     assert images.shape == (3, 16, 16, 4)
@@ -223,7 +220,7 @@ def test_cameras_of_several_sizes_share_a_contact_sheet(vvgt, tmp_path):
     ]
     (tmp_path / "t.json").write_text(transforms_json(views))
     call = ("render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "-o", tmp_path / "v")
-    assert vvgt(*call).code == 0
+    vvgt.ok(*call)
     document = json.loads((tmp_path / "v" / "transforms.json").read_text())
     assert [(frame["w"], frame["h"]) for frame in document["frames"]] == [(40, 16), (16, 400)]
     assert "camera_angle_x" in json.loads((tmp_path / "v" / "transforms_train.json").read_text())["frames"][1]

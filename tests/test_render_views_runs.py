@@ -31,8 +31,7 @@ def stamps(folder):
 
 def test_the_same_command_renders_nothing_again(vvgt, copied):
     before = stamps(copied)
-    result = vvgt(*BASE, "-o", copied)
-    assert result.code == 0
+    result = vvgt.ok(*BASE, "-o", copied)
     assert "5 views, 0 to render here" in result.err
     assert stamps(copied) == before
 
@@ -127,10 +126,9 @@ def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, messag
 
 def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
     (copied / "notes.txt").write_text("mine")
-    result = vvgt(
+    vvgt.ok(
         "render-views", VOLUME, "--tf", TF, "--views", 2, "--test-views", 0, "--size", 20, "-o", copied, "--overwrite"
     )
-    assert result.code == 0
     assert sorted(path.name for path in (copied / "train").iterdir()) == [
         f"train_00{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")
     ]
@@ -170,8 +168,7 @@ def test_shards_together_are_the_whole(vvgt, tmp_path, made):
     call = (*BASE, "-o", folder)
     rendered = []
     for i in (3, 1, 2):
-        result = vvgt(*call, "--shard", f"{i}/3")
-        assert result.code == 0
+        vvgt.ok(*call, "--shard", f"{i}/3")
         rendered.append(len(list(folder.rglob("*.exr"))))
         assert (folder / "contact.png").exists() == (i == 2)  # whoever finds every view
         assert (folder / "transforms.json").exists() == (i != 3)  # the first part describes the set
@@ -226,7 +223,7 @@ def test_complete_needs_the_recorded_bytes(tmp_path):
 
 def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made):
     folder = tmp_path / "views"
-    assert vvgt(*BASE, "--no-points", "-o", folder).code == 0
+    vvgt.ok(*BASE, "--no-points", "-o", folder)
     names = {path.relative_to(made) for path in made.rglob("*.*") if path.is_file()}
     found = {path.relative_to(folder) for path in folder.rglob("*.*") if path.is_file()}
     assert {path.name for path in names - found} == {"points3d.ply"}

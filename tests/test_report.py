@@ -107,8 +107,7 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
 def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
-    result = vvgt("report", *args, "-o", tmp_path / "out")
-    assert result.code == 0, result.err
+    result = vvgt.ok("report", *args, "-o", tmp_path / "out")
     assert "in blocks of 16" in result.err
     blocks = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "--blocks 16" in blocks["command_line"]
@@ -164,10 +163,9 @@ def test_nothing_is_overwritten_unasked(scene_report, vvgt):
 
 def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
     folder, _ = scene_report
-    assert vvgt("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
-                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json").code == 0  # fmt: skip
-    result = vvgt("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
-    assert result.code == 0, result.err
+    vvgt.ok("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
+                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")  # fmt: skip
+    result = vvgt.ok("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
     assert {p.name for p in (tmp_path / "both").iterdir()} == {"report.csv", "report.html", *FILES}
     text = (tmp_path / "both" / "report.html").read_text("utf-8")
     Reader(text)
@@ -312,9 +310,8 @@ def test_several_reports_have_different_names(tmp_path, vvgt):
     for name, content in (("a", document()), ("b", other)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "report.json").write_text(json.dumps(content))
-    result = vvgt("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
+    vvgt.ok("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
                   tmp_path / "a" / "report.json", "-o", tmp_path / "c")  # fmt: skip
-    assert result.code == 0, result.err
     text = (tmp_path / "c" / "report.html").read_text("utf-8")
     Reader(text)
     for name in ("a (1)", "b", "a (3)"):

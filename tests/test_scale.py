@@ -47,11 +47,11 @@ def same_gaussians(one, other):
 
 def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, raw, tmp_path):
     memory = tmp_path / "memory.ply"
-    assert vvgt("init", raw, "-o", memory, *FIT).code == 0
+    vvgt.ok("init", raw, "-o", memory, *FIT)
     files = []
     for size in ("16", "32", "128", "auto"):
         path = tmp_path / f"{size}.ply"
-        assert vvgt("init", raw, "-o", path, *FIT, "--blocks", size).code == 0
+        vvgt.ok("init", raw, "-o", path, *FIT, "--blocks", size)
         files.append(path.read_bytes())
     assert len(set(files)) == 1
     assert same_gaussians(memory, path)
@@ -62,8 +62,8 @@ def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, 
 def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     fit = ("--max-gaussians", budget, "--size", "100", "-q")
-    assert vvgt("init", raw, "-o", one, *fit).code == 0
-    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
+    vvgt.ok("init", raw, "-o", one, *fit)
+    vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")
     assert same_gaussians(one, other)
 
 
@@ -71,8 +71,8 @@ def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, 
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     fit = ("--max-gaussians", "100000", "--size", "100", "-q")
-    assert vvgt("init", raw, "-o", one, *fit).code == 0
-    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
+    vvgt.ok("init", raw, "-o", one, *fit)
+    vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")
     both = []
     for path in (one, other):
         found = read_ply(path)[0]
@@ -98,9 +98,9 @@ def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
                   '{"x": 0.4, "rgb": [1, 1, 0], "opacity": 1}]}')  # fmt: skip
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     options = ("--tf", tf, "--max-gaussians", "3000", "--size", "200", "-q")
-    assert vvgt("init", path, "-o", one, *options).code == 0
+    vvgt.ok("init", path, "-o", one, *options)
     for size in ("16", "32"):
-        assert vvgt("init", path, "-o", other, *options, "--blocks", size, "--overwrite").code == 0
+        vvgt.ok("init", path, "-o", other, *options, "--blocks", size, "--overwrite")
         assert same_gaussians(one, other)
 
 
@@ -157,8 +157,8 @@ def store(kind, path, values, chunks=(16, 20, 24)):
 def test_chunked_files_are_read_in_blocks(vvgt, tmp_path, kind):
     source = store(kind, tmp_path, bodies().astype(np.float32))
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    assert vvgt("init", source, "-o", one, *FIT).code == 0
-    assert vvgt("init", source, "-o", other, *FIT, "--blocks", "32").code == 0
+    vvgt.ok("init", source, "-o", one, *FIT)
+    vvgt.ok("init", source, "-o", other, *FIT, "--blocks", "32")
     assert same_gaussians(one, other)
 
 
@@ -198,11 +198,10 @@ def test_a_missing_chunk_is_fill_value_and_a_damaged_one_a_line_with_its_index(v
     assert run.code == 1
     assert "chunk (1, 0, 1) (z, y, x) is damaged" in run.err
     chunks[5].unlink()
-    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
-    assert run.code == 0
+    vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
     values[32:, :32, 32:] = 0
     np.save(tmp_path / "v.npy", values)
-    assert vvgt("init", tmp_path / "v.npy", "-o", tmp_path / "b.ply", *FIT).code == 0
+    vvgt.ok("init", tmp_path / "v.npy", "-o", tmp_path / "b.ply", *FIT)
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
 
 
@@ -221,8 +220,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     for size, level, grid in ((300, None, "64 x 64 x 64"), (30, None, "32 x 32 x 32"), (30, "full", "64 x 64 x 64"),
                               (30, "2", "16 x 16 x 16")):  # fmt: skip
         chosen = ["--level", level] if level else ["--blocks", "auto"]
-        run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
-        assert run.code == 0
+        run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
         assert f": {grid} uint8" in run.err
     run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
     assert run.code == 2
@@ -234,22 +232,17 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     source = store("hdf5", tmp_path, bodies().astype(np.float32))
-    plain = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert plain.code == 0
+    plain = vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
     assert "blocks" not in plain.err
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 200 << 20)
-    less = vvgt("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
-    assert less.code == 0
+    less = vvgt.ok("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
     assert "processed in blocks" in less.err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
-    views = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
-    assert views.code == 0, views.err
-    whole = vvgt("evaluate", tmp_path / "b.ply", "--volume", source)
-    assert whole.code == 0, whole.err
+    vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    whole = vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source)
     assert "processed in blocks" in whole.err
-    fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
-    assert fitted.code == 0
+    fitted = vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
     assert "processed in blocks" in fitted.err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
@@ -270,17 +263,16 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
     import gzip
 
     packed.write_bytes(gzip.compress(raw.read_bytes()))
-    assert vvgt("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto").code == 0  # small: unpacked
+    vvgt.ok("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto")  # small: unpacked
     assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2
 
 
 def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
     named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
     named.write_bytes(raw.read_bytes())
-    run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32")
-    assert run.code == 0
+    run = vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32")
     assert "distinct colours" in run.err
-    assert vvgt("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+    vvgt.ok("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none")
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
     assert not list(tmp_path.glob(".*blocks"))
 

@@ -36,8 +36,7 @@ def test_slices_of_tiff_are_read_in_blocks_page_by_page(vvgt, tmp_path, coding):
         files = []
         for blocks in ((), ("--blocks", "16"), ("--blocks", "64")):
             path = tmp_path / "a.ply"
-            run = vvgt("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
-            assert run.code == 0, run.err
+            vvgt.ok("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
             files.append(sorted_rows(path)[1])
         assert np.array_equal(files[0], files[1])
         assert np.array_equal(files[0], files[2])
@@ -61,8 +60,7 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
-    run = vvgt("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert run.code == 0, run.err
+    run = vvgt.ok("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert "processed in blocks" in run.err
 
 
@@ -73,8 +71,7 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000
-    run = vvgt("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert run.code == 0, run.err
+    run = vvgt.ok("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert "processed in blocks" in run.err
 
 
@@ -155,6 +152,5 @@ def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, mon
         return tree
 
     monkeypatch.setattr(tiled_tree, "build_tree", watched)
-    run = vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
-    assert run.code == 0, run.err
+    vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     assert len(made) > 6

@@ -39,8 +39,7 @@ def nested(n: int = 24, cut: bool = False) -> np.ndarray:
 def converted(vvgt, tmp_path: Path, values: np.ndarray, *options) -> dict[int, Gaussians]:
     np.save(tmp_path / "v.npy", values)
     out = ("--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply", "--overwrite")
-    done = vvgt("convert", tmp_path / "v.npy", "--labels", "auto", *out, *options)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "v.npy", "--labels", "auto", *out, *options)
     index = json.loads((tmp_path / "p_index.json").read_text())
     return {row["label"]: read_ply(str(tmp_path / row["file"]))[0] for row in index["files"]}
 

@@ -107,8 +107,7 @@ def test_eyes_stand_above_the_middle_as_viewers_show_it(up, direction):
 def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
     out, report = tmp_path / "a.ply", tmp_path / "a.json"
     command = ("convert", BLOB, *FEW, "--for", "quest", "--size", 48, "-o", out)
-    found = vvgt(*command, "--report", report)
-    assert found.code == 0, found.err
+    found = vvgt.ok(*command, "--report", report)
     assert "for quest: at most 20 MB, 60 Gaussians, 48 px, drawn as playcanvas" in found.err
     known = json.loads(report.read_text())
     assert {key: known["options"][key] for key in ("target", "max_gaussians", "size", "rule", "max_megabytes")} == {
@@ -127,8 +126,7 @@ def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
                 whole = render_view(scene, camera, RenderSettings()), render(gaussians, camera, "playcanvas")
                 expected.append(psnr(whole[0][..., :3], whole[1][..., :3]))
         assert one["psnr"] == pytest.approx(np.mean(expected), abs=0.3)  # blocks of the same pictures
-    blocks = vvgt(*command, "--overwrite", "--blocks", 16)
-    assert blocks.code == 0, blocks.err
+    vvgt.ok(*command, "--overwrite", "--blocks", 16)
     again = dict(read_ply(out)[1].certificate.conditions)
     assert [again[name] for name in BOTH] == pytest.approx([recorded[name] for name in BOTH], abs=0.5)
 
@@ -145,16 +143,12 @@ def test_every_kind_of_conversion_has_the_score(vvgt, tmp_path):
 
 def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
     out = tmp_path / "a.ply"
-    assert vvgt("convert", BLOB, *FEW, "--size", 48, "-o", out).code == 0
-    found = vvgt("evaluate", out, "--volume", BLOB, "--for", "quest", "--size", 48, "--step", 1, "--json")
-    assert found.code == 0, found.err
+    vvgt.ok("convert", BLOB, *FEW, "--size", 48, "-o", out)
+    found = vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "quest", "--size", 48, "--step", 1, "--json")
     told = json.loads(found.out)
     assert told["rule"] == "playcanvas"
     assert set(BOTH) <= {one["where"] for one in told["conditions"]}
-    assert (
-        vvgt("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions").code
-        == 0
-    )
+    vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions")
     refused = vvgt("evaluate", out, "--volume", BLOB, "--for", "quest", "--no-conditions")
     assert (refused.code, "--no-conditions with --for quest" in refused.error) == (2, True)
 

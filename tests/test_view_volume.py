@@ -422,8 +422,7 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     monkeypatch.setattr(view, "_serve", serve)
     (temporary := tmp_path / "t").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    done = vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis")
-    assert done.code == 0, done.err
+    vvgt.ok("view", tmp_path / "run_*.npy", "--tf", "viridis")
     names, means = shown[0]
     assert len(names) == 3
     assert means == sorted(means)
@@ -437,5 +436,5 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []
     monkeypatch.setattr(convert_batch, "convert_files", lambda request, console: saved.append(request))
-    assert vvgt("view", tmp_path / "run_*.npy", "--tf", "viridis", "-o", tmp_path / "a.html").code == 0
+    vvgt.ok("view", tmp_path / "run_*.npy", "--tf", "viridis", "-o", tmp_path / "a.html")
     assert (saved[0].output, saved[0].source.tf, saved[0].live) == (str(tmp_path / "a.html"), "viridis", False)

@@ -74,8 +74,7 @@ def test_several_orientations_are_told_apart(tmp_path: Path) -> None:
 def test_info_lists_stacks(tmp_path: Path, vvgt) -> None:
     write_series(tmp_path)
     write_scouts(tmp_path, 7)
-    said = vvgt("info", tmp_path)
-    assert said.code == 0
+    said = vvgt.ok("info", tmp_path)
     assert "--series 1/1, name 3 axial slices of 5 x 4, dims 5 4 3" in said.out.decode()
     assert "--series 1/2, name 3 sagittal slices of 5 x 4" in said.out.decode()
 

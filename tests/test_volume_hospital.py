@@ -206,8 +206,7 @@ def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt: Callable, tmp_pat
     said = vvgt("info", source).out.decode()
     assert "step 1, name EchoTime 7.38 ms, option --time 1" in said
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
-    done = vvgt("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
-    assert done.code == 0, done.error
+    vvgt.ok("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
     assert sorted(p.name for p in tmp_path.glob("p_*.ply")) == ["p_00.ply", "p_01.ply"]
 
 

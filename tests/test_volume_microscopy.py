@@ -93,8 +93,7 @@ def test_one_channel_in_blocks_as_in_memory(vvgt, tmp_path: Path, write: Callabl
     write(tmp_path / name, cells(channels=1))
     for blocks, out in (((), "a.ply"), (("--blocks", 16), "b.ply")):
         extra = ("--level", "full") if blocks and name == "a.ims" else ()
-        done = vvgt("init", tmp_path / name, *SMALL[:4], *blocks, *extra, "-o", tmp_path / out)
-        assert done.code == 0, done.err
+        vvgt.ok("init", tmp_path / name, *SMALL[:4], *blocks, *extra, "-o", tmp_path / out)
     assert (tmp_path / "a.ply").stat().st_size > 1000
 
 
@@ -184,8 +183,7 @@ def test_levels_of_imaris(vvgt, tmp_path: Path) -> None:
     np.testing.assert_array_equal(coarse.data, values[0, 0, :, ::2, ::2])
     np.testing.assert_allclose(coarse.extent, read_volume(path).extent)
     np.testing.assert_allclose(coarse.origin, [SPACING[0] / 2, SPACING[1] / 2, 0], atol=1e-9)
-    done = vvgt("init", path, *SMALL[:4], "--level", 1, "-o", tmp_path / "a.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("init", path, *SMALL[:4], "--level", 1, "-o", tmp_path / "a.ply")
     assert "4 x 3 x 5" in done.err
     assert "expected full, or 0 to 1" in vvgt("init", path, "--level", 2, "-o", tmp_path / "b.ply").error
 
@@ -337,8 +335,7 @@ def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
         ("render-views", path, "-o", tmp_path / "views", "--size", 32, "--views", 3, "--test-views", 1),
         ("info", path),
     ):
-        done = vvgt(*command)
-        assert done.code == 0, (command, done.err)
+        vvgt.ok(*command)
     one = vvgt("info", path, "--channel", "GFP", "--json")
     assert json.loads(one.out)["range"] == [0, 3000]
     made = library.convert(path, goal={"max_gaussians": 200, "size": 32, "steps": 0})

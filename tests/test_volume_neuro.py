@@ -82,14 +82,13 @@ def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt: Callable
     labels[2:5, 3:9, 3:9], labels[7:10, 3:9, 3:9] = 17, 53
     nib.save(nib.MGHImage(labels, OBLIQUE), str(tmp_path / "aseg.mgz"))
     (tmp_path / "FreeSurferColorLUT.txt").write_text(FREESURFER)
-    facts = vvgt("info", tmp_path / "aseg.mgz")
-    assert facts.code == 0
+    facts = vvgt.ok("info", tmp_path / "aseg.mgz")
     assert "label_map" in facts.out.decode()
     source = ("init", tmp_path / "aseg.mgz", "--labels", tmp_path / "FreeSurferColorLUT.txt", "--max-gaussians", 300)
     for name, blocks in (("whole", ()), ("blocks", ("--blocks", 32))):
-        assert vvgt(*source, "-o", tmp_path / f"{name}.ply", *blocks).code == 0
+        vvgt.ok(*source, "-o", tmp_path / f"{name}.ply", *blocks)
     assert (tmp_path / "whole.ply").read_bytes().count(b"\n") > 10
-    assert vvgt("info", tmp_path / "blocks.ply").code == 0
+    vvgt.ok("info", tmp_path / "blocks.ply")
 
 
 KINDS = {"analyze": nib.AnalyzeImage, "spm99": nib.Spm99AnalyzeImage, "spm2": nib.Spm2AnalyzeImage}
@@ -124,7 +123,7 @@ def test_analyze_as_nibabel_writes_it(tmp_path: Path, kind: str, order: str) -> 
 def test_analyze_says_so_on_one_line(tmp_path: Path, vvgt: Callable) -> None:
     nib.AnalyzeImage(VALUES.astype("i2"), None).to_filename(tmp_path / "v.img")
     with pytest.warns(UserWarning, match="^v.hdr: Analyze does not say which side is left; .*$") as said:
-        assert vvgt("info", tmp_path / "v.hdr").code == 0
+        vvgt.ok("info", tmp_path / "v.hdr")
     assert len(said) == 1
     (tmp_path / "v.hdr").unlink()
     assert "without its .hdr" in vvgt("info", tmp_path / "v.img").error
@@ -218,8 +217,7 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
 def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> None:
     (tmp_path / "v.seq.nrrd").write_bytes(sequence())
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
-    done = vvgt("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
 
 

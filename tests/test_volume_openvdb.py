@@ -254,11 +254,9 @@ def test_nanovdb_says_how_to_convert(tmp_path: Path) -> None:
 
 def test_a_grid_by_name_on_the_command_line(vvgt, folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "sphere.vdb", tmp_path)
-    result = vvgt("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json")
-    assert result.code == 0, result.err
+    result = vvgt.ok("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json")
     assert b'"float32"' in result.out
-    told = vvgt("info", tmp_path / "sphere.vdb")
-    assert told.code == 0, told.err
+    told = vvgt.ok("info", tmp_path / "sphere.vdb")
     assert b"--grid surface, dims 41 41 41, dtype float32, range -3 3" in told.out
     assert b"--grid fog, dims 35 35 35" in told.out
     assert "fog (float)" in vvgt("init", tmp_path / "sphere.vdb", "-o", tmp_path / "a.ply").error

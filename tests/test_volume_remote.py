@@ -119,9 +119,9 @@ def test_only_the_chunks_that_are_needed_are_asked_for(address: str) -> None:
 def test_converted_in_blocks_it_has_the_bytes_of_the_folder(vvgt, address: str, folder: Path, tmp_path: Path) -> None:
     for name, place in (("a", folder), ("b", address)):
         line = ("init", f"{place}/x.ome.zarr", *FIT, "--blocks", "32", "--workers", "2", "--no-comments")
-        assert vvgt(*line, "-o", tmp_path / f"{name}.ply").code == 0
+        vvgt.ok(*line, "-o", tmp_path / f"{name}.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    assert vvgt("convert", f"{address}/x.ome.zarr", *FIT, "--steps", 0, "-o", tmp_path / "c.ply").code == 0
+    vvgt.ok("convert", f"{address}/x.ome.zarr", *FIT, "--steps", 0, "-o", tmp_path / "c.ply")
     facts = json.loads(vvgt("info", f"{address}/x.ome.zarr", "--json").out)
     assert facts["dims"] == [100, 90, 80]
 
