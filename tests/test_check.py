@@ -74,8 +74,7 @@ def test_failures_end_with_status_1_and_are_named(vvgt, monkeypatch):
 
 def test_a_scene_is_measured_and_checked(vvgt):
     scene = ("check", "example:blob:16", "--tf", "viridis")
-    result = vvgt.ok(*scene, "--json", "--tolerance", "0.01")
-    document = json.loads(result.out)
+    document = json.loads(vvgt.ok(*scene, "--json", "--tolerance", "0.01").out)
     assert document["volume"]["dims"] == [16, 16, 16]
     found = document["stiffness"]
     assert found["needed_step"] in (1.0, 2.0, 4.0)

@@ -100,16 +100,14 @@ def test_the_same_command_gives_the_same_bytes_on_standard_output_too(converted)
 
 
 def test_report_to_standard_output(folder, vvgt):
-    result = vvgt("init", SOURCE, *SMALL, "-o", "a.ply", "--report", "-")
-    report = json.loads(result.out)
+    report = json.loads(vvgt("init", SOURCE, *SMALL, "-o", "a.ply", "--report", "-").out)
     assert (report["command"], report["scores"]) == ("init", None)
     assert report["gaussians"] == len(read_ply("a.ply")[0])
 
 
 @pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
 def test_init_has_three_methods(method, folder, vvgt):
-    result = vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply")
-    assert method in result.err
+    assert method in vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply").err
     assert 0 < len(read_ply("a.ply")[0]) <= 300
 
 
@@ -238,8 +236,7 @@ def test_info_on_every_kind(converted, folder, vvgt):
         str(converted[0] / "a.ply"): "gaussians",
     }
     for file, kind in kinds.items():
-        result = vvgt.ok("info", file)
-        assert result.out.decode().splitlines()[0].split(None, 1) == ["kind", kind]
+        assert vvgt.ok("info", file).out.decode().splitlines()[0].split(None, 1) == ["kind", kind]
         assert json.loads(vvgt("info", file, "--json").out)["kind"] == kind
     vvgt("render", converted[0] / "a.ply", "--orbit", 2, "--size", 16, "-o", "d")
     assert json.loads(vvgt("info", "d/transforms.json", "--json").out)["views"] == 2

@@ -26,8 +26,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_xml_describes_the_command_by_its_own_options(vvgt) -> None:
-    result = vvgt.ok("--xml")
-    found = ElementTree.fromstring(result.out)
+    found = ElementTree.fromstring(vvgt.ok("--xml").out)
     assert found.tag == "executable"
     parameters = [node for group in found.findall("parameters") for node in group if node.find("name") is not None]
     named = {node.findtext("name"): node for node in parameters}

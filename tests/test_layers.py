@@ -225,8 +225,7 @@ def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvg
 def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
     assert '"colors": "RGB"' in vvgt("info", tmp_path / "a.nrrd", "--json").out.decode()
-    done = vvgt.ok("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply")
-    assert "opacity by luminance" in done.err
+    assert "opacity by luminance" in vvgt.ok("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply").err
     made, _ = read_ply(str(tmp_path / "a.ply"))
     order = np.argsort(made.means[:, 0])
     assert np.polyfit(made.means[order, 0], made.colors[order, 0], 1)[0] > 0.3  # red grows along x
@@ -235,8 +234,7 @@ def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     vvgt.ok("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
     asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
     assert "one component; expected several: omit --component color" in asked.error
-    table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
-    assert "several components" in table.error
+    assert "several components" in vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply").error
 
 
 def test_names_of_labels_are_kept_beside_other_layers(vvgt, tmp_path: Path) -> None:

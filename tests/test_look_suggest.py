@@ -80,8 +80,7 @@ def test_colours_are_told_apart(count):
 
 
 def test_files_are_functions_and_the_same_ones_again(vvgt, tmp_path):
-    first = vvgt.ok("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "a")
-    paths = first.out.decode().split()
+    paths = vvgt.ok("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "a").out.decode().split()
     assert paths == [str(tmp_path / "a" / f"band_{k}.json") for k in (1, 2, 3)]
     vvgt("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "b")
     for path in (tmp_path / "a").iterdir():

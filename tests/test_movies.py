@@ -61,8 +61,7 @@ def even_steps(pictures):
 
 def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
     gaussians, path = ply
-    result = vvgt.ok("render", path, "--orbit", 20, "-o", tmp_path / "turn.gif")
-    assert "0.8 s" in result.err
+    assert "0.8 s" in vvgt.ok("render", path, "--orbit", 20, "-o", tmp_path / "turn.gif").err
     pictures, times, loop = gif(tmp_path / "turn.gif")
     assert pictures.shape == (20, 64, 64, 3)
     assert (set(times), loop) == ({40}, 0)

@@ -241,8 +241,7 @@ def test_a_legend_of_labels_names_those_that_are_shown() -> None:
 
 def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     def listed(name: str) -> dict[str, Any]:
-        done = vvgt.ok("info", tmp_path / name, "--sharing", "--json")
-        return json.loads(done.out)
+        return json.loads(vvgt.ok("info", tmp_path / name, "--sharing", "--json").out)
 
     values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
     nibabel.save(nibabel.Nifti1Image(values, np.diag([2, 2, 2, 1])), tmp_path / "Doe_John.nii")

@@ -280,8 +280,7 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
 
 def test_no_more_steps_than_were_asked_for(vvgt, beat):
     run = ("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW[:-1], "3", "-o", beat / "f_{}.ply")
-    done = vvgt.ok(*run, "--report", beat / "f_{}.json")
-    assert "differences " in done.err
+    assert "differences " in vvgt.ok(*run, "--report", beat / "f_{}.json").err
     assert json.loads((beat / "f_1.json").read_text())["refinement"]["steps"] <= 3
 
 

@@ -31,8 +31,7 @@ def stamps(folder):
 
 def test_the_same_command_renders_nothing_again(vvgt, copied):
     before = stamps(copied)
-    result = vvgt.ok(*BASE, "-o", copied)
-    assert "5 views, 0 to render here" in result.err
+    assert "5 views, 0 to render here" in vvgt.ok(*BASE, "-o", copied).err
     assert stamps(copied) == before
 
 

@@ -107,8 +107,7 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
 def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
-    result = vvgt.ok("report", *args, "-o", tmp_path / "out")
-    assert "in blocks of 16" in result.err
+    assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err
     blocks = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "--blocks 16" in blocks["command_line"]
     assert [run["name"] for run in blocks["runs"]] == [run["name"] for run in found["runs"]]

@@ -232,18 +232,14 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     source = store("hdf5", tmp_path, bodies().astype(np.float32))
-    plain = vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert "blocks" not in plain.err
+    assert "blocks" not in vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT[:-1]).err
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 200 << 20)
-    less = vvgt.ok("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
-    assert "processed in blocks" in less.err
+    assert "processed in blocks" in vvgt.ok("init", source, "-o", tmp_path / "b.ply", *FIT[:-1]).err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
     vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
-    whole = vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source)
-    assert "processed in blocks" in whole.err
-    fitted = vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
-    assert "processed in blocks" in fitted.err
+    assert "processed in blocks" in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source).err
+    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
     assert none.code == 2
@@ -270,8 +266,7 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
 def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
     named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
     named.write_bytes(raw.read_bytes())
-    run = vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32")
-    assert "distinct colours" in run.err
+    assert "distinct colours" in vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32").err
     vvgt.ok("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none")
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
     assert not list(tmp_path.glob(".*blocks"))

@@ -60,8 +60,7 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
-    run = vvgt.ok("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert "processed in blocks" in run.err
+    assert "processed in blocks" in vvgt.ok("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1]).err
 
 
 def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
@@ -71,8 +70,7 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000
-    run = vvgt.ok("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert "processed in blocks" in run.err
+    assert "processed in blocks" in vvgt.ok("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1]).err
 
 
 def test_threads_share_a_file_of_pages(tmp_path):

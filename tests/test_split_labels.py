@@ -93,8 +93,7 @@ def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
     values = nested()
     assert list(converted(vvgt, tmp_path, np.where(values == 3, 3, 0))) == [3]
     line = ("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
-    size = vvgt(*line, "--max-size", 1)
-    assert "--max-size with labels: the limit is for one cloud" in size.error
+    assert "--max-size with labels: the limit is for one cloud" in vvgt(*line, "--max-size", 1).error
     time = vvgt(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
     )

@@ -183,8 +183,7 @@ def test_levels_of_imaris(vvgt, tmp_path: Path) -> None:
     np.testing.assert_array_equal(coarse.data, values[0, 0, :, ::2, ::2])
     np.testing.assert_allclose(coarse.extent, read_volume(path).extent)
     np.testing.assert_allclose(coarse.origin, [SPACING[0] / 2, SPACING[1] / 2, 0], atol=1e-9)
-    done = vvgt.ok("init", path, *SMALL[:4], "--level", 1, "-o", tmp_path / "a.ply")
-    assert "4 x 3 x 5" in done.err
+    assert "4 x 3 x 5" in vvgt.ok("init", path, *SMALL[:4], "--level", 1, "-o", tmp_path / "a.ply").err
     assert "expected full, or 0 to 1" in vvgt("init", path, "--level", 2, "-o", tmp_path / "b.ply").error
 
 
@@ -336,8 +335,7 @@ def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
         ("info", path),
     ):
         vvgt.ok(*command)
-    one = vvgt("info", path, "--channel", "GFP", "--json")
-    assert json.loads(one.out)["range"] == [0, 3000]
+    assert json.loads(vvgt("info", path, "--channel", "GFP", "--json").out)["range"] == [0, 3000]
     made = library.convert(path, goal={"max_gaussians": 200, "size": 32, "steps": 0})
     assert np.ptp(made.gaussians.colors, axis=0).max() > 0.5
 

@@ -82,8 +82,7 @@ def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt: Callable
     labels[2:5, 3:9, 3:9], labels[7:10, 3:9, 3:9] = 17, 53
     nib.save(nib.MGHImage(labels, OBLIQUE), str(tmp_path / "aseg.mgz"))
     (tmp_path / "FreeSurferColorLUT.txt").write_text(FREESURFER)
-    facts = vvgt.ok("info", tmp_path / "aseg.mgz")
-    assert "label_map" in facts.out.decode()
+    assert "label_map" in vvgt.ok("info", tmp_path / "aseg.mgz").out.decode()
     source = ("init", tmp_path / "aseg.mgz", "--labels", tmp_path / "FreeSurferColorLUT.txt", "--max-gaussians", 300)
     for name, blocks in (("whole", ()), ("blocks", ("--blocks", 32))):
         vvgt.ok(*source, "-o", tmp_path / f"{name}.ply", *blocks)

@@ -254,8 +254,7 @@ def test_nanovdb_says_how_to_convert(tmp_path: Path) -> None:
 
 def test_a_grid_by_name_on_the_command_line(vvgt, folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "sphere.vdb", tmp_path)
-    result = vvgt.ok("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json")
-    assert b'"float32"' in result.out
+    assert b'"float32"' in vvgt.ok("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json").out
     told = vvgt.ok("info", tmp_path / "sphere.vdb")
     assert b"--grid surface, dims 41 41 41, dtype float32, range -3 3" in told.out
     assert b"--grid fog, dims 35 35 35" in told.out

@@ -248,8 +248,7 @@ def test_info_takes_folders_globs_and_inner_paths(vvgt, tmp_path: Path) -> None:
     write_slices(tmp_path / "stack", VALUES.astype(np.float32))
     np.savez(tmp_path / "v.npz", field=VALUES, other=VALUES)
     for source in ("scan", "stack", "stack/*.tif", "v.npz:/field"):
-        done = vvgt.ok("info", f"{tmp_path}/{source}", "--json")
-        assert json.loads(done.out)["dims"] == [5, 4, 3]
+        assert json.loads(vvgt.ok("info", f"{tmp_path}/{source}", "--json").out)["dims"] == [5, 4, 3]
     (tmp_path / "empty").mkdir()
     assert "a folder; expected a volume file" in vvgt("info", tmp_path / "empty").error
 

@@ -291,8 +291,7 @@ def test_a_page_that_unpacks_to_more_than_itself(tmp_path: Path) -> None:
 
 def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
     source = write_ome(tmp_path / "a.ome.tif")
-    done = vvgt.ok("info", source, "--channel", "GFP", "--time", "2", "--json")
-    facts = json.loads(done.out)
+    facts = json.loads(vvgt.ok("info", source, "--channel", "GFP", "--time", "2", "--json").out)
     assert facts["dims"] == [X, Y, Z]
     assert facts["range"] == [VALUES[2, 1].min(), VALUES[2, 1].max()]
     told = json.loads(vvgt("info", source, "--json").out)
