@@ -259,8 +259,7 @@ def transfer() -> list[Seed]:
     from vvgt_cli.look.readers.names import FILE as NAMED
 
     def read(path: Path) -> None:
-        tf = read_transfer_function(str(path))
-        tf.node_range()
+        read_transfer_function(str(path)).node_range()
 
     preset = {
         "ColorSpace": "Diverging", "Name": "Preset", "NanColor": [1, 1, 0],

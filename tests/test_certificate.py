@@ -286,8 +286,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4
     assert header.certificate.texture == pytest.approx((found.ours, found.reference), abs=1e-3)
-    told = json.loads((tmp_path / "r.json").read_text())["texture"]
-    assert told["blocks"] == found.blocks
+    assert json.loads((tmp_path / "r.json").read_text())["texture"]["blocks"] == found.blocks
     assert f"texture {header.certificate.texture[0]:g}" in vvgt("info", tmp_path / "out.ply").out.decode()
     vvgt.ok("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
     assert read_ply(tmp_path / "blocks.ply")[1].certificate.texture[1] == pytest.approx(found.reference, abs=0.01)

@@ -40,8 +40,7 @@ def made(tmp_path_factory):
     assert run([str(arg) for arg in start]) == 0
     gaussians, _ = read_ply(folder / "init.ply")
     world = PlyOptions(frame="world", up="z", scale=0.5, centre=(3.0, 4.0, 5.0), unit_distance=0.7)
-    dark = replace(gaussians, colors=gaussians.colors - DARK)
-    write_ply(folder / "in.ply", dark, world)
+    write_ply(folder / "in.ply", replace(gaussians, colors=gaussians.colors - DARK), world)
     write_model(folder / "brighter", BRIGHTER)
     write_model(folder / "darker", DARKER)
     return folder

@@ -55,10 +55,8 @@ def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
     assert psnr(vvgt, out, *tf(folder), "--light", "none") < own - 3
     rows = _rows(out, "head")[1]
     normals = np.stack([rows[n] for n in ("nx", "ny", "nz")], axis=1)
-    lengths = np.linalg.norm(normals, axis=1)
-    assert (np.abs(lengths - 1) < 1e-5).mean() > 0.9
-    info = json.loads(vvgt("info", out, "--json").out)
-    assert info["light"] == Lighting().text()
+    assert (np.abs(np.linalg.norm(normals, axis=1) - 1) < 1e-5).mean() > 0.9
+    assert json.loads(vvgt("info", out, "--json").out)["light"] == Lighting().text()
 
 
 def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):

@@ -86,8 +86,7 @@ def test_raw_values_read_in_another_order_than_they_lie_in_are_told(vvgt, recwar
 
 
 def test_of_noise_cubes_and_tiny_volumes_no_order_is_told() -> None:
-    rng = np.random.default_rng(0)
-    assert guess_dims(rng.random((20, 30, 40))) is None
+    assert guess_dims(np.random.default_rng(0).random((20, 30, 40))) is None
     assert guess_dims(blob((24, 24, 24)).data) is None
     assert guess_dims(np.arange(24.0).reshape(2, 3, 4)) is None
     assert guess_dims(np.full((20, 30, 40), np.nan)) is None

@@ -78,8 +78,7 @@ def test_methods_to_compare_with(call, method):
 
 
 def test_a_file_of_another_program_gets_no_comments(folder, call, vvgt, tmp_path):
-    gaussians = read_ply(folder / "in.ply")[0]
-    write_ply(tmp_path / "plain.ply", gaussians, PlyOptions(comments=False))
+    write_ply(tmp_path / "plain.ply", read_ply(folder / "in.ply")[0], PlyOptions(comments=False))
     result = vvgt("optimize", "plain.ply", "--views", folder / "views", "--steps", 0, "-o", "-", "-q")
     assert result.out == (tmp_path / "plain.ply").read_bytes()
 

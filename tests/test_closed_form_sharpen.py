@@ -129,8 +129,7 @@ def test_what_is_hidden_takes_the_colour_of_what_hides_it():
     behind, front = cloud(400, 9), cloud(400, 10)
     both = replace(behind.take(np.arange(400)), colors=np.tile(np.float32(YELLOW), (400, 1)))
     both = concatenate([both, replace(front, colors=np.tile(np.float32(BLUE), (400, 1)))])
-    seen = np.concatenate([np.full(400, 0.01), np.ones(400)])
-    found = sharpened(both, seen, BOX).colors
+    found = sharpened(both, np.concatenate([np.full(400, 0.01), np.ones(400)]), BOX).colors
     assert np.abs(found[:400] - BLUE).mean() < 0.1 * np.abs(np.subtract(YELLOW, BLUE)).mean()
     alike = sharpened(both, np.ones(800), BOX).colors
     assert np.abs(alike[:400] - YELLOW).mean() < 0.3 * np.abs(np.subtract(YELLOW, BLUE)).mean()

@@ -69,8 +69,7 @@ def drawn(size, enough):
 
 
 def done(tmp_path, fit=SMALL, **options):
-    request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options)
-    return convert(request, Console(quiet=True))
+    return convert(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True))
 
 
 def chosen(report):
@@ -187,8 +186,7 @@ def test_no_steps_leave_back_projection():
 
 def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
     fit = FitOptions(200, 48, steps=0)
-    request = ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit)
-    initialise_only(request, Console(quiet=True))
+    initialise_only(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit), Console(quiet=True))
     alone = read_ply(tmp_path / "init.ply")[0]
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "back-projection")
     assert stage.kept

@@ -144,8 +144,7 @@ def test_the_order_of_convergence_in_the_step_is_two():
     errors = [
         np.sqrt(np.mean((render_view(scene, camera(), RenderSettings(step=s, samples=1)) - exact) ** 2)) for s in steps
     ]
-    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert abs(order - 2) < 0.2
+    assert abs(np.polyfit(np.log(steps), np.log(errors), 1)[0] - 2) < 0.2
 
 
 def test_opacity_one_is_capped_so_that_it_has_a_limit():
@@ -272,8 +271,7 @@ def test_pixels_get_as_many_rays_as_they_differ_from_their_neighbours():
     adaptive = render_view(scene, c, RenderSettings(step=0.25))
     padded = np.pad(single, ((1, 1), (1, 1), (0, 0)), mode="edge")
     around = [padded[i : i + 48, j : j + 48] for i in range(3) for j in range(3)]
-    differ = np.max([np.abs(single - other).max(axis=-1) for other in around], axis=0)
-    mask = differ > 0.08
+    mask = np.max([np.abs(single - other).max(axis=-1) for other in around], axis=0) > 0.08
     assert 0.01 < mask.mean() < 0.5
     kept = (adaptive == single).all(axis=-1)
     assert kept[~mask].all()

@@ -170,8 +170,7 @@ def test_pieces_follow_from_the_volume_and_come_front_to_back():
     assert sorted(order) == list(range(len(pieces)))
     ranks = np.empty(len(pieces))
     ranks[order] = np.arange(len(pieces))
-    direction = np.array([-0.9, 0.1, 0.5])
-    points = eye + np.arange(0, 120, 0.5)[:, None] * direction
+    points = eye + np.arange(0, 120, 0.5)[:, None] * np.array([-0.9, 0.1, 0.5])
     inside = points[((points >= -0.5) & (points < np.array(pieces.dims) - 0.5)).all(axis=1)]
     index = np.floor((inside + 0.5) / 16).astype(int)
     met = [ranks[(k * pieces.shape[1] + j) * pieces.shape[0] + i] for i, j, k in index]

@@ -130,8 +130,7 @@ def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_
 
 
 def test_an_old_openusd_is_reported(monkeypatch):
-    usd = pytest.importorskip("pxr.Usd")
-    monkeypatch.setattr(usd, "GetVersion", lambda: (0, 25, 11))
+    monkeypatch.setattr(pytest.importorskip("pxr.Usd"), "GetVersion", lambda: (0, 25, 11))
     with pytest.raises(
         DataError, match=r"OpenUSD 25\.11 does not support ParticleField3DGaussianSplat.*usd-core>=26\.3"
     ):
@@ -211,8 +210,7 @@ def test_a_usd_stage_is_turned_upright():
     from pxr import Sdf, UsdGeom
 
     layer = Sdf.Layer.CreateAnonymous(".usdc")
-    path = Path(layer.realPath or "/nonexistent")
-    assert not path.exists()
+    assert not Path(layer.realPath or "/nonexistent").exists()
     content = encoded(format_of("a.usdc"), cloud(20), PlyOptions(), "a.usdc")
     import tempfile
 
@@ -232,8 +230,7 @@ def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     after, before, cost = map(float, found.groups())
     assert cost == pytest.approx(before - after, abs=0.011)
     assert 0 < before < 60
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
+    assert json.loads((tmp_path / "r.json").read_text())["bytes"] == (tmp_path / "a.spz").stat().st_size
     scored = vvgt.ok("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis",
                      "--json", "--no-conditions", "--step", 0.5)  # fmt: skip
     assert json.loads(scored.out)["size"] == 64

@@ -184,8 +184,7 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     options = ("--tf", "tf.json", "--cameras", "front.json", "--format", "both", "-o", "views", "-q")
     vvgt.ok("render-views", "f.nii", *options)
     assert_reads_right(read_png("views/train/front.png")[..., 3], "reference")
-    points = read_points(Path("views/points3d.ply"))
-    assert_reads_right(splatted(points), "points", 0.5)
+    assert_reads_right(splatted(read_points(Path("views/points3d.ply"))), "points", 0.5)
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -305,8 +304,7 @@ def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:
     vvgt.ok("render-views", "v.nii", "--tf", "tf.json", *views)
     init(vvgt, "v.nii", "in.ply")
     vvgt.ok("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
-    report = json.loads(Path("r.json").read_text())
-    assert report["scores"]["psnr"] > 24
+    assert json.loads(Path("r.json").read_text())["scores"]["psnr"] > 24
     before, after = (read_ply(name)[1] for name in ("in.ply", "out.ply"))
     assert (after.affine, after.space, after.up, after.centre) == (before.affine, "RAS", "z", before.centre)
     assert evaluated(vvgt, "out.ply", "v.nii")["psnr"] > evaluated(vvgt, "in.ply", "v.nii")["psnr"]

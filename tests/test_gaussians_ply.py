@@ -31,8 +31,7 @@ def random_gaussians(count=50, seed=0):
 
 def written(gaussians, **options):
     stream = io.BytesIO()
-    size = write_ply(stream, gaussians, PlyOptions(**options))
-    assert size == len(stream.getvalue())
+    assert write_ply(stream, gaussians, PlyOptions(**options)) == len(stream.getvalue())
     return stream.getvalue()
 
 
@@ -94,8 +93,7 @@ def test_colors_are_exact_where_display_colors_mostly_are_and_off_by_half_an_ulp
 
 
 def test_layout_is_the_one_that_loaders_count_on():
-    content = written(random_gaussians(7))
-    header, data = content.split(b"end_header\n", 1)
+    header, data = written(random_gaussians(7)).split(b"end_header\n", 1)
     lines = header.decode().splitlines()
     assert lines[:4] == ["ply", "format binary_little_endian 1.0", "element vertex 7", "property float x"]
     order = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"

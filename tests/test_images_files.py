@@ -106,8 +106,7 @@ def test_png_rgb_round_trip_is_exact_in_8_bits(tmp_path):
 
 
 def test_png_stores_straight_alpha(tmp_path):
-    rng = np.random.default_rng(3)
-    straight = rng.integers(0, 256, (8, 9, 4))
+    straight = np.random.default_rng(3).integers(0, 256, (8, 9, 4))
     straight[0, 0] = (255, 0, 0, 1)  # would be lost if alpha were applied in 8 bits on the way
     premultiplied = straight / 255
     premultiplied[..., :3] *= premultiplied[..., 3:]
@@ -121,8 +120,7 @@ def test_png_stores_straight_alpha(tmp_path):
 
 def _decode(path):
     """The stored bytes of an 8-bit RGBA PNG, by an independent decoder."""
-    pillow = pytest.importorskip("PIL.Image")
-    image = pillow.open(path)
+    image = pytest.importorskip("PIL.Image").open(path)
     assert image.mode == "RGBA"
     return np.asarray(image).astype(int)
 

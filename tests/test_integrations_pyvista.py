@@ -42,8 +42,7 @@ def test_function_light_and_camera_are_the_plotters(tmp_path: Path) -> None:
     assert result.ply.up == "z"
     assert result.ply.light is not None
     assert (result.ply.light.headlight, result.ply.light.ambient, result.ply.light.specular_power) == (True, 0.3, 20)
-    distance = shown.volume.prop.GetScalarOpacityUnitDistance()
-    assert result.ply.unit_distance == pytest.approx(distance)
+    assert result.ply.unit_distance == pytest.approx(shown.volume.prop.GetScalarOpacityUnitDistance())
     page = (tmp_path / "a.html").read_text()
     assert json.loads(page.partition('id="scene">')[2].partition("</script>")[0])["outermost"] == []
 

@@ -80,8 +80,7 @@ def test_logarithmic_axes():
     prop, piecewise, color = made([(0.01, 0.1, 0.5, 0), (10, 0.9, 0.5, 0)], [(0.01, 0, 0, 0), (10, 1, 1, 1)])
     piecewise.SetUseLogScale(True)
     color.SetScaleToLog10()
-    x = np.geomspace(0.012, 9.7, 50)
-    agrees(prop, piecewise, color, x, within=1e-4)
+    agrees(prop, piecewise, color, np.geomspace(0.012, 9.7, 50), within=1e-4)
 
 
 def test_the_rest_of_a_property_is_taken_or_named():

@@ -126,12 +126,10 @@ def test_recognised_by_type_name_and_number() -> None:
 
 def test_labels_are_data_values_and_whole() -> None:
     assert labels_in(Volume(balls(), slope=2.0, intercept=1.0)) == [1, 3, 7]
-    holes = np.where(balls() == 3, np.nan, balls())
-    assert labels_in(Volume(holes)) == [0, 1]
+    assert labels_in(Volume(np.where(balls() == 3, np.nan, balls()))) == [0, 1]
     with pytest.raises(DataError, match=r"such as 0\.5; expected a label map"):
         labels_in(Volume(balls() / 2))
-    many = np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)
-    assert len(labels_in(Volume(many))) == 65_536
+    assert len(labels_in(Volume(np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)))) == 65_536
 
 
 # ---- the command line

@@ -66,8 +66,7 @@ def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
     path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", HOW, **read)
     assert saved(path, tmp_path / "c.ply") == written
     header = written[: written.index(b"end_header")].decode()
-    world = saved_world(converted, tmp_path / "w.ply")
-    assert "frame world" in world
+    assert "frame world" in saved_world(converted, tmp_path / "w.ply")
     assert "frame unit" in header
 
 
@@ -98,8 +97,7 @@ def test_masked_values_are_nan(field):
     read = np.asarray(vvgt.read_volume(masked).data)
     assert np.array_equal(np.isnan(read), masked.mask)
     assert np.array_equal(read[~masked.mask], masked.compressed())
-    whole = np.ma.masked_array(np.ones((4, 4, 4), np.uint8))
-    assert vvgt.read_volume(whole).data.dtype == np.uint8
+    assert vvgt.read_volume(np.ma.masked_array(np.ones((4, 4, 4), np.uint8))).data.dtype == np.uint8
 
 
 def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):
@@ -150,8 +148,7 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     cameras, volume = vvgt.render_views(field, TF, vvgt.default_views("test", size=48)[4:5], spacing=SPACING)
     assert np.sqrt(np.mean((volume[0] - image) ** 2)) < 0.05
     np.testing.assert_array_equal(converted.render(cameras[0]), image)
-    sheet = converted.preview(32)
-    assert sheet.shape == (3 * 32, 3 * 32, 3)
+    assert converted.preview(32).shape == (3 * 32, 3 * 32, 3)
     assert converted._repr_png_().startswith(b"\x89PNG")
     frame = converted._repr_html_()
     assert re.match(r'<iframe title="volume, [0-9]+ x [0-9]+ x [0-9]+" sandbox="allow-scripts allow-downloads" ', frame)

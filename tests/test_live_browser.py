@@ -84,10 +84,8 @@ def test_a_page_begins_with_the_files_light_and_the_ball_moves_it(lit: Path, tmp
     ball: Actions = [{"click": "#live summary"}, {"drag": "#live .light svg", "by": [-20, -12]}]
     for window in (DESK, PHONE):
         actions = ball if window == DESK else [{"click": "#live .fold"}, *ball]
-        dragged = after(lit, actions, tmp_path, window)
-        assert psnr(head, dragged) < 35
-        undone = after(lit, [*actions, {"key": "Control+z"}], tmp_path, window)
-        assert psnr(head, undone) > 45
+        assert psnr(head, after(lit, actions, tmp_path, window)) < 35
+        assert psnr(head, after(lit, [*actions, {"key": "Control+z"}], tmp_path, window)) > 45
 
 
 def test_labels_are_switched_off_shown_alone_and_searched(labels: Path, tmp_path: Path) -> None:

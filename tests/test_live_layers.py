@@ -166,8 +166,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     vvgt.ok("recolor", live, "--layer", f"left,tf={tmp_path / 'n.json'}", "-o", tmp_path / "r.ply")
     own, less = read_ply(tmp_path / "own.ply")[0], read_ply(tmp_path / "r.ply")[0]
     assert 0.3 * len(own) < len(less) < 0.9 * len(own)
-    again = vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")})
-    assert len(again.gaussians) == len(less)
+    assert len(vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")}).gaussians) == len(less)
     (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
     (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
     hidden, dark = f"2,labels={tmp_path / 'none.json'}", f"tf={tmp_path / 'dark.json'}"

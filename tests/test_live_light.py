@@ -47,8 +47,7 @@ def exact(color: np.ndarray, n: np.ndarray, d: np.ndarray, light: Lighting) -> n
 @pytest.mark.parametrize("light", [HEAD, SIDE, replace(HEAD, specular=0.0), replace(SIDE, specular=0.0)])
 def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lighting) -> None:
     """Of a share of the matter that faces along the axis; the rest faces all directions."""
-    rng = np.random.default_rng(2)
-    axis, share = rng.normal(size=(5, 3)), np.array([1.0, 0.8, 0.5, 0.2, 0.01])
+    axis, share = np.random.default_rng(2).normal(size=(5, 3)), np.array([1.0, 0.8, 0.5, 0.2, 0.01])
     axis *= (share / np.linalg.norm(axis, axis=1))[:, None]
     shaded, everywhere = relight(grey(axis), axis, light), sphere(2000)
     assert shaded.degree == (2 if light.depends_on_view else 0)

@@ -124,8 +124,7 @@ def test_densities_are_contoured_when_no_function_is_given(tmp_path: Path, sign:
     shown = from_histogram(numbers, density=volume.density)
     assert shown.name == f"automatic ({name})"
     high, low = values.max(), values.min()
-    noise = np.array([0.1])
-    assert shown.opacity(noise) == 0
+    assert shown.opacity(np.array([0.1])) == 0
     assert shown.opacity(np.array([high])) > 0.2
     assert (shown.opacity(np.array([low])) > 0.2) == (sign < 0)
     assert fitting(numbers, volume) == name

@@ -89,8 +89,7 @@ def test_unit_nodes_on_data_that_reach_a_little_beyond_are_data_values(values):
 
 
 def test_unit_nodes_on_unit_data_are_data_values(recwarn):
-    inside = statistics([0.2, 0.9])
-    assert resolve(function(x=(0, 0.5, 1)), inside).node_range() == (0, 1)
+    assert resolve(function(x=(0, 0.5, 1)), statistics([0.2, 0.9])).node_range() == (0, 1)
     assert resolve(function(x=(0, 0.5, 1)), DATA, "0,1").node_range() == (0, 1)
     assert not recwarn.list
 
@@ -107,13 +106,11 @@ def test_fractions_follow_the_data_or_the_range():
     assert resolve(tf, DATA).domain == "data"
     assert resolve(tf, DATA, "rescale").opacity_nodes.x.tolist() == [0, 200]
     assert resolve(tf, DATA, "0,8").opacity_nodes.x.tolist() == [2, 6]
-    constant = statistics(np.full(10, 7.0))
-    assert resolve(tf, constant).opacity(np.array([7.0])).tolist() == [1]
+    assert resolve(tf, statistics(np.full(10, 7.0))).opacity(np.array([7.0])).tolist() == [1]
 
 
 def test_percentiles_follow_the_histogram():
-    rng = np.random.default_rng(0)
-    values = rng.exponential(10, 100_000)
+    values = np.random.default_rng(0).exponential(10, 100_000)
     tf = function(x=(0, 0.5, 0.9), y=(0, 0.1, 1), domain="percentile")
     resolved = resolve(tf, statistics(values))
     expected = np.quantile(values, [0, 0.5, 0.9])
@@ -243,8 +240,7 @@ def test_automatic_function_hides_the_background_and_shows_the_rest(name, values
     assert tf.opacity(np.array([numbers.hi]))[0] == pytest.approx(0.5)
     depth = 256 * -np.log1p(-tf.opacity(values)).mean()  # along the longest edge, on average
     assert 1 < depth < 4.5
-    again = from_histogram(statistics(values))
-    assert again.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
+    assert from_histogram(statistics(values)).opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
 
 
 def test_automatic_function_shows_both_sides_of_an_ambient_value():
@@ -268,8 +264,7 @@ def test_automatic_function_of_hounsfield_units_shows_tissue_by_them():
         assert 0 < fat < organ < 0.006 < 0.29 < bone
     crop = statistics(ct_values(air=0))
     assert from_histogram(crop).name == "automatic (histogram)"
-    told = from_histogram(crop, hounsfield=True)
-    assert told.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
+    assert from_histogram(crop, hounsfield=True).opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
     dark = statistics(np.linspace(-2000, -900, 1000))
     assert from_histogram(dark, hounsfield=True).name == "automatic (histogram)"
 
@@ -290,8 +285,7 @@ def test_automatic_function_shows_the_whole_of_a_crop_without_air():
 
 
 def test_automatic_function_of_labels_shows_no_others_between_them():
-    labels = np.repeat([0.0, 1, 2, 3, 4], [90_000, 6000, 50, 3000, 950])
-    tf = from_histogram(statistics(labels))
+    tf = from_histogram(statistics(np.repeat([0.0, 1, 2, 3, 4], [90_000, 6000, 50, 3000, 950])))
     at = tf.opacity(np.arange(5.0))
     assert at[0] == 0
     assert at[[2, 4]] == pytest.approx(0.5, rel=0.02)  # rare ones are thick; within half a bin

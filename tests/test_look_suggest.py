@@ -16,8 +16,7 @@ from vvgt_cli.volume import Volume, statistics
 
 
 def of(values, count=10, voxels=64.0):
-    values = np.asarray(values)
-    numbers = statistics(Volume(values.reshape(-1, 1, 1)))
+    numbers = statistics(Volume(np.asarray(values).reshape(-1, 1, 1)))
     return numbers, suggest(numbers, count, voxels, 0.5)
 
 

@@ -28,8 +28,7 @@ def noisy(image, sigma, seed=1):
 def test_separable_filter_is_the_two_dimensional_correlation(shape):
     rng = np.random.default_rng(0)
     image, kx, ky = rng.random(shape), rng.random(5), rng.random(8)
-    windows = np.lib.stride_tricks.sliding_window_view(image, (8, 5))
-    expected = np.einsum("hwij,i,j->hw", windows, ky, kx)
+    expected = np.einsum("hwij,i,j->hw", np.lib.stride_tricks.sliding_window_view(image, (8, 5)), ky, kx)
     np.testing.assert_allclose(separable(image, kx, ky), expected, rtol=1e-12)
 
 
@@ -51,8 +50,7 @@ def test_psnr_of_known_errors():
 
 def test_ssim_is_the_formula_in_float64():
     a, b = picture(), noisy(picture(), 0.05)
-    x = np.arange(-5, 6)
-    g = np.exp(-(x**2) / 4.5)
+    g = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
     weight = np.outer(g, g) / g.sum() ** 2
     values = []
     for c in range(3):

@@ -76,8 +76,7 @@ def test_identical_views_and_json():
     assert (scores.psnr, scores.psnr_white, scores.psnr_foreground) == (CAP, CAP, CAP)
     assert scores.ssim == pytest.approx(1, abs=1e-6)
     assert scores.flip == 0
-    record = json.loads(json.dumps(asdict(scores), allow_nan=False))
-    assert record["per_view"][1]["psnr"] == CAP
+    assert json.loads(json.dumps(asdict(scores), allow_nan=False))["per_view"][1]["psnr"] == CAP
 
 
 def test_perceptual_scores_are_none_when_not_requested_or_impossible():
@@ -99,8 +98,7 @@ def test_views_are_read_one_at_a_time():
             held.append(len(held))
             yield view
 
-    lazily = score_views((v for v in reference), render())
-    assert lazily == score_views(reference, reference)
+    assert score_views((v for v in reference), render()) == score_views(reference, reference)
     assert len(held) == 4
 
 

@@ -83,8 +83,7 @@ def test_inputs_of_other_shapes_are_an_error_of_one_line(folder):
 
 
 def _edit_card(folder: Path, **changes):
-    card = json.loads((folder / CARD).read_text())
-    (folder / CARD).write_text(json.dumps({**card, **changes}))
+    (folder / CARD).write_text(json.dumps({**json.loads((folder / CARD).read_text()), **changes}))
 
 
 def _truncate(folder):

@@ -79,8 +79,7 @@ def test_what_no_view_shows_has_neither_slope_nor_error():
 def test_halved_views_show_what_whole_ones_do():
     gaussians, _, _ = scene(count=50)
     cameras = default_views("train", 2, size=64)
-    views = np.stack([render(gaussians, camera) for camera in cameras])
-    few, small, rule = halved(cameras, views)
+    few, small, rule = halved(cameras, np.stack([render(gaussians, camera) for camera in cameras]))
     assert small.shape == (2, 32, 32, 4)
     assert rule.dilation == DILATION / 4
     for camera, view in zip(few, small, strict=True):

@@ -45,8 +45,7 @@ def test_hilbert_visits_every_cell_once_and_never_jumps(bits):
     cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     codes = hilbert(cells, bits)
     assert sorted(codes) == list(range(side**3))
-    path = cells[np.argsort(codes)]
-    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+    assert (np.abs(np.diff(cells[np.argsort(codes)], axis=0)).sum(axis=1) == 1).all()
 
 
 def test_transposed_curves_swap_two_axes():
@@ -146,8 +145,7 @@ def test_poses_hold_translation_rotation_and_field_of_view():
     assert np.allclose(rotation, camera.rotation, atol=1e-6)
     assert w >= 0
     assert np.allclose(pose[7:], np.radians(40))
-    half_turn = np.diag([-1.0, 1.0, -1.0])
-    assert np.allclose(np.abs(quaternion(half_turn)), [0, 0, 1, 0], atol=1e-12)
+    assert np.allclose(np.abs(quaternion(np.diag([-1.0, 1.0, -1.0]))), [0, 0, 1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("old", "new"), [(10, 10), (32, 14), (7, 28), (400, 224)])
@@ -157,8 +155,7 @@ def test_resizing_keeps_constants_and_ramps(old, new):
     ramp = weights @ ((np.arange(old) + 0.5) / old).astype(np.float32)
     inner = slice(1 + new // old, -1 - new // old)  # the edge is clamped
     assert np.allclose(ramp[inner], ((np.arange(new) + 0.5) / new)[inner], atol=0.02)
-    image = np.ones((old, old + 3, 4), np.float32)
-    assert np.allclose(resize(image, new), 1, atol=1e-5)
+    assert np.allclose(resize(np.ones((old, old + 3, 4), np.float32), new), 1, atol=1e-5)
 
 
 def test_far_apart_views_are_chosen_whatever_their_order():
@@ -167,8 +164,7 @@ def test_far_apart_views_are_chosen_whatever_their_order():
     assert len(set(chosen)) == 6
     assert farthest_cameras(cameras, 30) == list(range(24))
     order = np.random.default_rng(0).permutation(24)
-    mixed = farthest_cameras([cameras[i] for i in order], 6)
-    assert sorted(order[mixed]) == chosen
+    assert sorted(order[farthest_cameras([cameras[i] for i in order], 6)]) == chosen
     eyes = np.array([camera.position for camera in cameras])[chosen]
     gaps = np.linalg.norm(eyes[:, None] - eyes[None], axis=2) + 10 * np.eye(6)
     assert gaps.min() > 2  # on a sphere of radius 3
@@ -190,8 +186,7 @@ def test_scene_arrays_hold_what_the_switches_ask_for():
     assert (prepared.gradients[:, 10:13] >= 0).all()
     assert prepared.gradients[:, 10:13].max() > 0.9
     assert np.abs(prepared.gradients[:, :13]).max() <= 1 + 1e-6
-    restored = prepared.restore(prepared.rows)
-    assert np.array_equal(restored.means, gaussians.means)
+    assert np.array_equal(prepared.restore(prepared.rows).means, gaussians.means)
 
 
 ONE_PLACE = replace(random_cloud(500), means=np.zeros((500, 3)))

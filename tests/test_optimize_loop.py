@@ -253,8 +253,7 @@ def test_steps_leave_the_input_alone(scene):
 
 def test_factors_and_back_keep_the_covariance():
     g = truth(200)
-    back = OwnAxes(g, CAMERAS).gaussians()
-    np.testing.assert_allclose(covariances(back), covariances(g), atol=1e-6)
+    np.testing.assert_allclose(covariances(OwnAxes(g, CAMERAS).gaussians()), covariances(g), atol=1e-6)
     flat = Gaussians(
         g.means, np.where([True, True, False], g.log_scales, -11), g.quaternions, g.opacity_logits, g.colors
     )
@@ -263,8 +262,7 @@ def test_factors_and_back_keep_the_covariance():
 
 def test_no_gaussians_stay_none(scene):
     _, images, check = scene
-    none = truth(0)
-    assert len(optimize(none, CAMERAS, images, OptimizeOptions(steps=2), check)[0]) == 0
+    assert len(optimize(truth(0), CAMERAS, images, OptimizeOptions(steps=2), check)[0]) == 0
 
 
 def test_wrong_views_and_options_are_refused(scene):

@@ -39,8 +39,7 @@ def one() -> Gaussians:
 
 def test_a_page_states_the_extent_of_visible_gaussians() -> None:
     """Of all of its clouds, in the viewer's axes; not what is too faint to be seen."""
-    rng = np.random.default_rng(3)
-    means = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
+    means = np.random.default_rng(3).uniform(-1, 1, (500, 3)).astype(np.float32)
     some = replace(splats_of(one(), PlyOptions()), means=means, logits=np.full(500, -2.0, np.float32))
     far = replace(some, means=means[:2] + 5, logits=np.array([3.0, -6.0], np.float32))
     places = np.array(outermost([some, far]))
@@ -56,8 +55,7 @@ def test_a_page_states_the_extent_of_visible_gaussians() -> None:
 
 
 def test_a_round_body_fits_from_every_side() -> None:
-    rng = np.random.default_rng(4)
-    means = rng.normal(size=(4000, 3))
+    means = np.random.default_rng(4).normal(size=(4000, 3))
     ball = (means / np.linalg.norm(means, axis=1)[:, None]).astype(np.float32)
     points = np.array(
         outermost([replace(splats_of(one(), PlyOptions()), means=ball, logits=np.zeros(4000, np.float32))])
@@ -198,10 +196,8 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     stream = io.BytesIO()
     write_ply(stream, one(), PlyOptions(legend=text))
     stream.seek(0)
-    header = read_ply(stream)[1]
-    assert header.legend == text
-    facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
-    found = facts["legend"]
+    assert read_ply(stream)[1].legend == text
+    found = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]["legend"]
     assert (found["values"], found["unit"], found["quantity"]) == ([0, 60], "HU", "density")
     assert [(n["x"], n["y"]) for n in found["nodes"]] == [(0, 0), (10, 0), (30, 0.5), (30, 1), (60, 1)]
     np.testing.assert_allclose(found["nodes"][-1]["rgb"], (0, 0.5, 0.5), atol=3e-3)

@@ -160,8 +160,7 @@ def test_descent_moves_what_is_free():
     images = np.stack([render(replace(g, colors=1 - g.colors), camera) for camera in cameras])
     free = np.arange(60) % 3 == 0
     found, _ = optimize(g, cameras, images, OptimizeOptions(steps=6), free=free)
-    moved = (found.colors != g.colors).any(axis=1)
-    np.testing.assert_array_equal(moved, free)
+    np.testing.assert_array_equal((found.colors != g.colors).any(axis=1), free)
     np.testing.assert_allclose(covariances(found)[~free], covariances(g)[~free], rtol=1e-4, atol=1e-9)
 
 
@@ -190,8 +189,7 @@ def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
 
 
 def test_patches():
-    rng = np.random.default_rng(2)
-    base = rng.integers(0, 256, 5000, np.uint8)
+    base = np.random.default_rng(2).integers(0, 256, 5000, np.uint8)
     other = base.copy()
     for at in (0, 700, 710, 3000, 4990):
         other[at : at + 10] += 1

@@ -80,8 +80,7 @@ def test_another_function_is_as_near_as_by_itself(session, earlier, changes, les
     assert names(later)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
     assert later.report.refinement["steps"] == 24
     assert later.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
-    again = session.convert(tf, GOAL, after=earlier)
-    assert np.array_equal(again.gaussians.means, later.gaussians.means)
+    assert np.array_equal(session.convert(tf, GOAL, after=earlier).gaussians.means, later.gaussians.means)
 
 
 def test_another_light_and_another_size(session, earlier):
@@ -131,8 +130,7 @@ def test_refused(session, earlier):
 def test_the_same_look_changes_nothing(session, earlier):
     field = earlier.field
     same, before = recolor_earlier(earlier, field), to_box_frame(earlier.gaussians, field.source.volume)
-    clipped = opacity(before).clip(*OPAQUE)
-    assert np.allclose(opacity(same), clipped, atol=1e-6)
+    assert np.allclose(opacity(same), opacity(before).clip(*OPAQUE), atol=1e-6)
     assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
     assert np.array_equal(same.means, before.means)
 

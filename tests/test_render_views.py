@@ -132,8 +132,7 @@ def test_pycolmap_reads_the_model_and_projects_as_we_do(made, expected):
 
 
 def test_points_are_the_volume(made):
-    data = (made / "points3d.ply").read_bytes()
-    header, _, body = data.partition(b"end_header\n")
+    header, _, body = (made / "points3d.ply").read_bytes().partition(b"end_header\n")
     lines = header.decode().splitlines()
     assert lines[2].startswith("element vertex ")
     names = [line.split()[1:] for line in lines if line.startswith("property")]
@@ -153,8 +152,7 @@ def test_load_views_prefers_exr_and_falls_back_to_png(copied, expected):
     np.testing.assert_array_equal(images, np.stack([image for _, image in expected["test"]]))
     for path in (copied / "test").glob("*.exr"):
         path.unlink()
-    rounded = load_views(copied, "test")[1]
-    assert 0 < np.abs(rounded - images).max() < 1.01 / 255
+    assert 0 < np.abs(load_views(copied, "test")[1] - images).max() < 1.01 / 255
     (copied / "test" / "test_001.png").unlink()
     with pytest.raises(DataError, match="test_001: no such image"):
         load_views(copied, "test")

@@ -229,8 +229,7 @@ def test_the_front_is_what_nothing_beats():
 
 
 def test_the_scoring_costs_nothing_and_units_are_medians():
-    one = run("a", "a", "steps", 1000, 10.0, 30.0, 100)
-    assert cost(one) == pytest.approx(10.0)
+    assert cost(run("a", "a", "steps", 1000, 10.0, 30.0, 100)) == pytest.approx(10.0)
     found = unit_costs(runs())
     steps = sorted(
         s["seconds"] / r["refinement"]["steps"]
@@ -295,8 +294,7 @@ def test_names_cannot_break_out_of_the_page():
         one["name"] = "</script><img src=x onerror=alert(1)>"
     pictures = Pictures([0], [b"png"], [[b"png"]] * len(bad["runs"]))
     one = [Series("<i>", bad["runs"], bad)]
-    text = page(one, draw(one), "<u>", pictures)
-    reader = Reader(text)
+    reader = Reader(page(one, draw(one), "<u>", pictures))
     assert reader.tags.count("img") == 4
     assert reader.tags.count("script") == 2
     assert "u" not in reader.tags

@@ -206,8 +206,7 @@ def test_a_missing_chunk_is_fill_value_and_a_damaged_one_a_line_with_its_index(v
 
 
 def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
-    zarr = pytest.importorskip("zarr")
-    group = zarr.open_group(tmp_path / "v.zarr", mode="w", zarr_format=3)
+    group = pytest.importorskip("zarr").open_group(tmp_path / "v.zarr", mode="w", zarr_format=3)
     values = np.round(bodies((64, 64, 64)) * 255).astype(np.uint8)
     for n in range(3):
         group.create_array(str(n), data=values[:: 2**n, :: 2**n, :: 2**n])

@@ -195,8 +195,7 @@ def test_statistics_together() -> None:
     assert (joined.lo, joined.hi, joined.nan_count) == (whole.lo, whole.hi, 1)
     np.testing.assert_allclose(joined.edges, whole.edges)
     assert joined.histogram.sum() == whole.histogram.sum() == 479
-    off = np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max()
-    assert off <= 0.02 * 479
+    assert np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max() <= 0.02 * 479
     constant = merge_statistics([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
     assert (constant.lo, constant.hi, constant.histogram.sum()) == (3, 3, 16)
 

@@ -43,8 +43,7 @@ def test_frame(make) -> None:
 def test_marschner_lobb() -> None:
     volume = shapes.marschner_lobb(40)
     x, y, z = centres(volume)
-    r = np.sqrt(x**2 + y**2)
-    rho = np.cos(2 * math.pi * 6 * np.cos(math.pi * r / 2))
+    rho = np.cos(2 * math.pi * 6 * np.cos(math.pi * np.sqrt(x**2 + y**2) / 2))
     np.testing.assert_allclose(volume.data, (1 - np.sin(math.pi * z / 2) + 0.25 * (1 + rho)) / (2 * 1.25), atol=1e-6)
     assert volume.data.min() >= 0
     assert volume.data.max() <= 1

@@ -34,13 +34,11 @@ def test_shells_lie_within_each_other():
 
 
 def test_tubes_are_thin_and_bright():
-    values = make_shape("tubes", 48, 0).data
-    assert 0.002 < (values > 0.3).mean() < 0.1
+    assert 0.002 < (make_shape("tubes", 48, 0).data > 0.3).mean() < 0.1
 
 
 def test_plates_are_flat_inside_and_sharp_at_their_edges():
-    values = make_shape("plates", 48, 3).data
-    steps = np.abs(np.diff(values, axis=2))
+    steps = np.abs(np.diff(make_shape("plates", 48, 3).data, axis=2))
     assert (steps < 1e-6).mean() > 0.8
     assert steps.max() > 0.2
 
@@ -55,8 +53,7 @@ def test_wells_are_smooth():
 
 
 def test_noise_has_the_spectrum_of_a_power_law():
-    values = make_shape("noise", 48, 0).data.astype(np.float64)
-    power = np.abs(np.fft.fftn(values)) ** 2
+    power = np.abs(np.fft.fftn(make_shape("noise", 48, 0).data.astype(np.float64))) ** 2
     line = np.fft.fftfreq(48, 1 / 48)
     k = np.sqrt(line[:, None, None] ** 2 + line[None, :, None] ** 2 + line[None, None, :] ** 2)
     shells = np.arange(2, 14)
@@ -74,8 +71,7 @@ def test_a_volume_written_as_nrrd_reads_back(tmp_path):
     assert np.array_equal(back.data, values * np.float32(2) - np.float32(1))
     assert back.spacing == pytest.approx(volume.spacing, rel=1e-15)
     assert back.origin == pytest.approx(volume.origin, rel=1e-15)
-    big = Volume(values.astype(">f8"))
-    write_nrrd(tmp_path / "v.nrrd", big, overwrite=True)
+    write_nrrd(tmp_path / "v.nrrd", Volume(values.astype(">f8")), overwrite=True)
     assert np.array_equal(read_volume(str(tmp_path / "v.nrrd")).data, values)
 
 

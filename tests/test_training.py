@@ -154,8 +154,7 @@ def test_training_from_random_points_learns(monkeypatch, tmp_path):
     gsplat = SimpleNamespace(rasterization=drawn, MCMCStrategy=lambda cap_max: strategy)
     monkeypatch.setitem(sys.modules, "gsplat", gsplat)
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
-    bench = importlib.import_module
-    module = bench("gsplat_trainer")
+    module = importlib.import_module("gsplat_trainer")
     for constant, value in {"COUNT": 300, "SIZE": 24, "SCORED": 24, "REPORTED": (1,)}.items():
         monkeypatch.setattr(module, constant, value)
     write_nrrd(tmp_path / "blob.nrrd", read_volume("example:blob:10"))
@@ -364,8 +363,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_weights(data, straight, t
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     assert process.wait() == 143, process.stderr.read()
-    done = len(rows_of(tmp_path / "run"))
-    assert 1 <= done < CONFIG.steps
+    assert 1 <= len(rows_of(tmp_path / "run")) < CONFIG.steps
     assert loop.train(CONFIG, str(data), str(tmp_path / "run"), Console(quiet=True)) == 0
     ended = weights(tmp_path / "run" / "last.pt")
     assert all(torch.equal(value, ended[name]) for name, value in weights(straight / "last.pt").items())

@@ -203,8 +203,7 @@ def test_times_as_in_dcm2niix(tmp_path: Path) -> None:
 
 def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt: Callable, tmp_path: Path) -> None:
     source = series(tmp_path / "in", [{"EchoTime": e} for e in (4.92, 7.38)])
-    said = vvgt("info", source).out.decode()
-    assert "step 1, name EchoTime 7.38 ms, option --time 1" in said
+    assert "step 1, name EchoTime 7.38 ms, option --time 1" in vvgt("info", source).out.decode()
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
     vvgt.ok("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
     assert sorted(p.name for p in tmp_path.glob("p_*.ply")) == ["p_00.ply", "p_01.ply"]
@@ -280,8 +279,7 @@ def test_uneven_slices_are_resampled_or_taken_as_even(tmp_path: Path) -> None:
     np.testing.assert_allclose(volume.spacing, (0.5, 1.5, 0.5))
     index = np.indices(volume.dims).reshape(3, -1)
     place = volume.affine[:3, :3] @ index + volume.affine[:3, 3:] - [[5], [6], [7]]
-    axes = np.column_stack([OBLIQUE[:3], OBLIQUE[3:], np.cross(OBLIQUE[:3], OBLIQUE[3:])])
-    x, y, z = axes.T @ place
+    x, y, z = np.column_stack([OBLIQUE[:3], OBLIQUE[3:], np.cross(OBLIQUE[:3], OBLIQUE[3:])]).T @ place
     np.testing.assert_allclose(volume.data[index[2], index[1], index[0]], 100 * z + 10 * y / 1.5 + x / 0.5, atol=1e-3)
     with pytest.raises(UsageError, match="its slices lie at even distances; leave out --dims"):
         read_volume(series(tmp_path / "even", [{}]), ReadOptions(dims=(2, 2, 2)))
@@ -376,8 +374,7 @@ def test_modality_look_up_tables_as_in_pydicom(tmp_path: Path) -> None:
     table = Dataset()
     table.LUTDescriptor, table.ModalityLUTType = [200, 0, 16], "US"
     table.add_new("LUTData", "OW", (3 * np.arange(200) + 5).astype("<u2").tobytes())
-    source = series(tmp_path, [{}], ModalityLUTSequence=[table], PixelRepresentation=0)
-    volume = read_volume(source)
+    volume = read_volume(series(tmp_path, [{}], ModalityLUTSequence=[table], PixelRepresentation=0))
     np.testing.assert_array_equal(volume.data, 3 * STACK + 5)
     one = pydicom.dcmread(next(iter(sorted(tmp_path.iterdir()))))
     k = int(one.InstanceNumber) - 1

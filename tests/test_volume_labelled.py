@@ -33,8 +33,7 @@ def write_netcdf(path: Path, order: str = "zyx", axes: dict | None = None, units
             variable[:] = centres
             variable.units = (units or {}).get(name, "m")
         values = np.transpose(ramp(axes["x"], axes["y"], axes["z"]), ["zyx".index(name) for name in order])
-        variable = file.createVariable("field", how.pop("dtype", "f4"), tuple(order), **how)
-        variable[:] = values
+        file.createVariable("field", how.pop("dtype", "f4"), tuple(order), **how)[:] = values
     return str(path)
 
 
@@ -116,8 +115,7 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
         holed.set_auto_maskandscale(False)
         stored[0, 0, 0] = -32768
         holed[:] = stored
-        unwritten = file.createVariable("unwritten", "f4", ("z", "y", "x"))
-        unwritten[1:] = VALUES[1:]
+        file.createVariable("unwritten", "f4", ("z", "y", "x"))[1:] = VALUES[1:]
     volume = read_volume(str(path), ReadOptions(array="packed"))
     assert (volume.data.dtype, volume.slope, volume.intercept) == (np.int16, 0.5, 5000)
     np.testing.assert_allclose(volume.data * volume.slope + volume.intercept, VALUES, atol=0.26)

@@ -222,8 +222,7 @@ def test_dx(tmp_path: Path, form: str) -> None:
 
 def test_dx_as_another_library_writes_it(tmp_path: Path) -> None:
     grids = pytest.importorskip("gridData")
-    grid = grids.Grid(GRID[..., 0], origin=[1, 2, 3], delta=[0.5, 1, 2])
-    grid.export(str(tmp_path / "v.dx"))
+    grids.Grid(GRID[..., 0], origin=[1, 2, 3], delta=[0.5, 1, 2]).export(str(tmp_path / "v.dx"))
     volume = read_volume(str(tmp_path / "v.dx"))
     np.testing.assert_allclose(volume.data, GRID[..., 0], rtol=1e-5)
     np.testing.assert_allclose(place(volume, 2, 3, 4), [2, 5, 11], atol=1e-4)

@@ -275,8 +275,7 @@ def write_tiff(path: Path, values: np.ndarray) -> None:
 
 
 def write_zarr(path: Path, values: np.ndarray) -> None:
-    zarr = pytest.importorskip("zarr")
-    group = zarr.open_group(str(path), mode="w", zarr_format=2)
+    group = pytest.importorskip("zarr").open_group(str(path), mode="w", zarr_format=2)
     group.create_array("0", data=values[0], chunks=(1, 4, 4, 4))
     kinds = [{"name": "c", "type": "channel"}, *({"name": a, "type": "space", "unit": "micrometer"} for a in "zyx")]
     scale = {"type": "scale", "scale": [1, *SPACING[::-1]]}

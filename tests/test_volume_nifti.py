@@ -126,8 +126,7 @@ def test_series(tmp_path: Path, suffix: str) -> None:
         volume = read_volume(source, ReadOptions(component=step))
         np.testing.assert_array_equal(data_values(volume), expected[..., step])
         assert isinstance(volume.data, np.memmap) == (suffix == ".nii")
-        by_time = read_volume(source, ReadOptions(time=step))
-        np.testing.assert_array_equal(by_time.data, volume.data)
+        np.testing.assert_array_equal(read_volume(source, ReadOptions(time=step)).data, volume.data)
     for options, message in (
         ({"time": 2}, "expected a time step from 0 to 1"),
         ({"time": 0, "component": 1}, "leave out --component 1"),
@@ -158,8 +157,7 @@ def test_vectors_over_time(tmp_path: Path, suffix: str) -> None:
 
 
 def test_pair(tmp_path: Path) -> None:
-    image = nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4))
-    image.to_filename(tmp_path / "v.img")
+    nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4)).to_filename(tmp_path / "v.img")
     np.testing.assert_array_equal(data_values(read_volume(str(tmp_path / "v.hdr"))), VALUES)
     (tmp_path / "v.img").unlink()
     with pytest.raises(DataError, match=r"without its .img file"):

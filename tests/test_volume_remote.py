@@ -54,8 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     group = zarr.open_group(store=str(folder / "x.ome.zarr"), mode="w", zarr_format=3)
     levels = []
     for number, some in enumerate((values, values[::2, ::2, ::2])):
-        array = group.create_array(str(number), shape=some.shape, chunks=(32, 32, 32), dtype="uint8")
-        array[:] = some
+        group.create_array(str(number), shape=some.shape, chunks=(32, 32, 32), dtype="uint8")[:] = some
         scale = {"type": "scale", "scale": [2.0 * 2**number] * 3}
         levels.append({"path": str(number), "coordinateTransformations": [scale]})
     axes = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
@@ -82,8 +81,7 @@ def test_an_address_is_read_as_the_folder(address: str, folder: Path) -> None:
     np.testing.assert_array_equal(np.asarray(there.data), np.asarray(here.data))
     assert (there.spacing, there.origin, there.name) == (here.spacing, here.origin, here.name)
     assert there.unit == here.unit
-    inner = read_volume(f"{address}/x.ome.zarr:/1")
-    assert inner.dims == (50, 45, 40)
+    assert read_volume(f"{address}/x.ome.zarr:/1").dims == (50, 45, 40)
     assert level_shapes(f"{address}/x.ome.zarr", ReadOptions()) == [(80, 90, 100), (40, 45, 50)]
     assert int(np.asarray(read_volume(f"{address}/t.zarr", ReadOptions(time=1)).data).min()) == 7
 
@@ -111,8 +109,7 @@ def test_two_colons_are_part_of_a_name(address: str, folder: Path) -> None:
 def test_only_the_chunks_that_are_needed_are_asked_for(address: str) -> None:
     volume = read_volume(f"{address}/x.ome.zarr", ReadOptions(stored=True))
     assert not [path for path in Handler.asked if "/c/" in path]
-    some = np.asarray(volume.data[:20, :20, :20])
-    assert some.shape == (20, 20, 20)
+    assert np.asarray(volume.data[:20, :20, :20]).shape == (20, 20, 20)
     assert len({path for path in Handler.asked if "/c/" in path}) == 1
 
 
@@ -122,8 +119,7 @@ def test_converted_in_blocks_it_has_the_bytes_of_the_folder(vvgt, address: str, 
         vvgt.ok(*line, "-o", tmp_path / f"{name}.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     vvgt.ok("convert", f"{address}/x.ome.zarr", *FIT, "--steps", 0, "-o", tmp_path / "c.ply")
-    facts = json.loads(vvgt("info", f"{address}/x.ome.zarr", "--json").out)
-    assert facts["dims"] == [100, 90, 80]
+    assert json.loads(vvgt("info", f"{address}/x.ome.zarr", "--json").out)["dims"] == [100, 90, 80]
 
 
 def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> None:
@@ -132,8 +128,7 @@ def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> Non
     named = xarray.DataArray(array, dims=("z", "y", "x"), name="bodies")
     assert not [path for path in Handler.asked if "/c/" in path]
     goal = {"max_gaussians": 500, "size": 60, "steps": 0}
-    found = vvgt_cli.convert(named, None, goal, blocks=32)
-    assert len(found.gaussians) > 100
+    assert len(vvgt_cli.convert(named, None, goal, blocks=32).gaussians) > 100
     assert [path for path in Handler.asked if "/c/" in path]
 
 

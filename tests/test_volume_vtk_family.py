@@ -187,8 +187,7 @@ def test_plot3d_with_functions(tmp_path: Path) -> None:
         volume = read_volume(str(tmp_path / name), ReadOptions(dims=(8, 6, 4)))
         check_place(volume)
         np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)), rtol=1e-6)
-    described = json.loads(path.read_text())
-    path.write_text(json.dumps({**described, "filenames": [{"xyz": "v.xyz"}]}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), "filenames": [{"xyz": "v.xyz"}]}))
     with pytest.raises(DataError, match="coordinates alone; expected values beside them"):
         read_volume(str(path))
 

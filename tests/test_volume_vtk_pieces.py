@@ -104,8 +104,7 @@ def test_hidden_cells_are_nan(tmp_path: Path) -> None:
     path = by_hand(tmp_path, marks={0: 1, 1: 32})
     for stored in (False, True):
         volume = read_volume(str(path), ReadOptions(array="cells", stored=stored))
-        values = volume.data[:, :, :]
-        assert np.argwhere(np.isnan(values)).tolist() == [[0, 0, 2]]
+        assert np.argwhere(np.isnan(volume.data[:, :, :])).tolist() == [[0, 0, 2]]
     points = read_volume(str(path), ReadOptions(array="ramp"))
     assert not np.isnan(points.data).any()  # each has another cell beside it
     duplicates = by_hand(tmp_path, marks={0: 1, 1: 1})
@@ -113,8 +112,7 @@ def test_hidden_cells_are_nan(tmp_path: Path) -> None:
 
 
 def test_a_box_reads_the_pieces_that_it_meets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = by_hand(tmp_path, (0, 1, 2, 3, 4))
-    volume = read_volume(str(path), ReadOptions(array="cells", stored=True))
+    volume = read_volume(str(by_hand(tmp_path, (0, 1, 2, 3, 4))), ReadOptions(array="cells", stored=True))
     opened: list[str] = []
     real = vtk_pieces.scan
     monkeypatch.setattr(vtk_pieces, "scan", lambda file: opened.append(file.name) or real(file))

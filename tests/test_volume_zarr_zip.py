@@ -56,8 +56,7 @@ def test_a_store_of_zarrs_own(tmp_path: Path, version: int, stored: bool) -> Non
 )
 def test_zipped_folders(tmp_path: Path, version: int, name: str, inside: str, packed: bool) -> None:
     source = zipped(tmp_path, version, name, inside, packed)
-    volume = read_volume(source, ReadOptions(time=0))
-    np.testing.assert_array_equal(volume.data, VALUES[0])
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(time=0)).data, VALUES[0])
     for other in (read_volume(source + ":/1", ReadOptions(time=0)), read_volume(source, ReadOptions(time=0, level=1))):
         np.testing.assert_array_equal(other.data, VALUES[0, :, ::2, ::2])
         assert other.spacing == (2, 4, 3)
