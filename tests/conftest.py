@@ -114,14 +114,18 @@ class Result:
 
 
 class CommandLine:
-    """Run command lines in this process; output is captured at the file descriptors, so VTK's is seen too."""
+    """Run command lines in this process; output is captured at the file descriptors, so VTK's is seen too.
+
+    An argument that begins with ``--`` is split at blanks: vvgt("info", path, "--time 1 --json").
+    """
 
     def __init__(self, captured: pytest.CaptureFixture[bytes]) -> None:
         self.captured = captured
 
     def __call__(self, *args: object) -> Result:
         self.captured.readouterr()
-        code = run([str(arg) for arg in args])
+        words = [text.split() if text.startswith("--") else [text] for text in map(str, args)]
+        code = run([word for group in words for word in group])
         out, err = self.captured.readouterr()
         return Result(code, out, err.decode())
 

@@ -60,9 +60,8 @@ def made(folder):
 
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
-    result = vvgt.ok(
-        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-conditions", "--json", *more
-    )
+    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--json", *more)
+    result = vvgt.ok("evaluate", ply, "--volume", folder / volume, *how)
     return json.loads(result.out)["certificate"]
 
 
@@ -302,9 +301,8 @@ def test_a_run_that_ends_among_its_scores_leaves_the_whole_file(vvgt, folder, tm
 
     monkeypatch.setattr(ViewingConditions, "run", end)
     how = SMALL[: 4 if more else 6]
-    result = vvgt(
-        "convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name
-    )  # fmt: skip
+    more = ("--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name)
+    result = vvgt("convert", folder / "ball.raw", *RAW, *more)
     assert result.code == 130
     assert "complete; scoring next" in result.err
     assert os.listdir(tmp_path) == [name]

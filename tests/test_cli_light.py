@@ -61,10 +61,8 @@ def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
 
 def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):
     out = folder / "fixed.ply"
-    vvgt.ok(
-        "convert", SOURCE, *tf(folder), *SMALL, "--light", "1,0,2", "--shadows", "--specular", "0",
-        "--ambient-occlusion", "-o", out,
-    )  # fmt: skip
+    lit = "--light 1,0,2 --shadows --specular 0 --ambient-occlusion"
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, lit, "-o", out)
     gaussians, header = read_ply(out)
     assert (gaussians.harmonics, header.sh_degree) == (None, 0)
     assert header.light.shadows
@@ -83,18 +81,8 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
     gaussians, header = read_ply(out)
     assert (gaussians.degree, header.light) == (0, Lighting(diffuse=0.9))
     for degree in (1, 3):
-        again = vvgt(
-            "init",
-            SOURCE,
-            *tf(folder, "lit"),
-            "--max-gaussians",
-            "300",
-            "--sh-degree",
-            degree,
-            "-o",
-            out,
-            "--overwrite",
-        )
+        few = ("--max-gaussians 300 --overwrite --sh-degree", degree, "-o", out)
+        again = vvgt("init", SOURCE, *tf(folder, "lit"), *few)
         assert read_ply(out)[1].sh_degree == degree
         assert ("change with the view" in again.err) == (degree == 1)
 
@@ -102,10 +90,8 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
 def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
     shown = {}
     for name, more in (("preset", ()), ("none", ("--light", "none")), ("left", ("--light", "left"))):
-        vvgt.ok(
-            "render-views", SOURCE, *tf(folder, "lit"), "--views", "1", "--test-views", "0", "--size", "32", "--format",
-            "exr", "--no-points", *more, "-o", folder / name,
-        )  # fmt: skip
+        views = "--views 1 --test-views 0 --size 32 --format exr --no-points"
+        vvgt.ok("render-views", SOURCE, *tf(folder, "lit"), views, *more, "-o", folder / name)
         shown[name] = next((folder / name).rglob("*.exr")).read_bytes()
     assert len(set(shown.values())) == 3
 

@@ -263,10 +263,8 @@ def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
 
 
 def evaluated(vvgt, ply: str, volume: str, *options: str) -> dict:
-    result = vvgt.ok(
-        "evaluate", ply, "--volume", volume, "--tf", "tf.json", "--size", 48, "--no-conditions", "--step", 0.5,
-        "--json", *options,
-    )  # fmt: skip
+    how = "--tf tf.json --size 48 --no-conditions --step 0.5 --json"
+    result = vvgt.ok("evaluate", ply, "--volume", volume, how, *options)
     return json.loads(result.out)["scores"] | {"said": result.err}
 
 

@@ -195,19 +195,7 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
     vvgt.ok("recolor", live, "--tf", "viridis", "-o", tmp_path / "fixed.ply")
     labels = tmp_path / "labels.ply"
     np.save(tmp_path / "map.npy", np.arange(512).reshape(8, 8, 8).astype(np.uint8) // 128)
-    vvgt.ok(
-        "convert",
-        tmp_path / "map.npy",
-        "--labels",
-        "auto",
-        "--live",
-        "--max-gaussians",
-        200,
-        "--size",
-        64,
-        "-o",
-        labels,
-    )
+    vvgt.ok("convert", tmp_path / "map.npy", "--labels auto --live --max-gaussians 200 --size 64 -o", labels)
     out = tmp_path / "a.png"
     for rule in ("mip", "xray"):
         for arguments, code, text in (

@@ -198,18 +198,7 @@ def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int)
 
 def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
-    given = (
-        "convert",
-        tmp_path / "a.nrrd",
-        "--max-gaussians",
-        100,
-        "--size",
-        40,
-        "--steps",
-        0,
-        "-o",
-        tmp_path / "a.ply",
-    )
+    given = ("convert", tmp_path / "a.nrrd", "--max-gaussians 100 --size 40 --steps 0 -o", tmp_path / "a.ply")
     for more in ((), ("--blocks", 16), ("--component", "color")):
         done = vvgt(*given, "--keep-largest", 10, *more)
         assert (done.code, "a.nrrd has colours; expected scalars: give a --mask" in done.error) == (2, True)
@@ -297,19 +286,8 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     assert "--channel 0 to 1, a name, all" in unsure.error
     done = vvgt.ok("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
     layer = f"{tmp_path / 'a.ome.tif'},channel=cyan,tf=gray"
-    done = vvgt.ok(
-        "init",
-        tmp_path / "a.ome.tif",
-        "--channel",
-        0,
-        "--tf",
-        "hot",
-        "--layer",
-        layer,
-        *SMALL[:4],
-        "-o",
-        tmp_path / "b.ply",
-    )
+    how = ("--channel 0 --tf hot --layer", layer, *SMALL[:4], "-o", tmp_path / "b.ply")
+    done = vvgt.ok("init", tmp_path / "a.ome.tif", *how)
     assert "gray" in done.err
 
 
@@ -410,9 +388,8 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
     assert red.sum() > 5
     assert np.abs(made.means[red]).max() < 0.35 < np.abs(made.means[~red]).max()
     assert len(json.loads(report.read_text())["transfer_function"]["layers"]) == 2
-    own = vvgt(
-        "evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, "--no-conditions", "--step", 0.5, "--json", "-q"
-    )
+    how = "--no-conditions --step 0.5 --json -q"
+    own = vvgt("evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, how)
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(
         json.loads(report.read_text())["scores"]["psnr"], abs=1
     )

@@ -169,10 +169,8 @@ class TestEitherWay:
     """What has no error of its own to compare."""
 
     def test_preview_and_checkpoint(self, vvgt, at, tmp_path, blocks):
-        vvgt.ok(
-            "convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / "x.ply",
-            "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept",
-        )  # fmt: skip
+        more = ("-o", tmp_path / "x.ply", "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept")
+        vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, *more)
         picture = read_png(tmp_path / "x.png")
         assert picture.shape[:2] == (3 * 64, 3 * 64)
         assert picture[:, :64].max() > 0.5
@@ -240,10 +238,7 @@ class TestEitherWay:
     @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
         volume, options = ROWS[row]
-        vvgt.ok(
-            "render-views", volume, *options, *blocks, "--views", "3", "--test-views", "1", "--size", "48",
-            "-o", tmp_path / "views",
-        )  # fmt: skip
+        vvgt.ok("render-views", volume, *options, *blocks, "--views 3 --test-views 1 --size 48 -o", tmp_path / "views")
         assert [path.name for path in tmp_path.iterdir()] == ["views"]
 
 

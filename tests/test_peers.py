@@ -43,9 +43,7 @@ def test_a_peer_is_run_timed_and_scored_beside_ours(vvgt, start, tmp_path) -> No
     found = json.loads((tmp_path / "out" / "report.json").read_text())
     peer, closed = found["runs"][0], found["runs"][4]
     assert (peer["name"], peer["kind"], closed["name"]) == ("Other one", "peer", "closed form, K = 60")
-    alone = vvgt(
-        "evaluate", start / "start.ply", "--volume", "example:blob:10", "--tf", "viridis", "--no-conditions", "--json"
-    )
+    alone = vvgt("evaluate", start / "start.ply", "--volume example:blob:10 --tf viridis --no-conditions --json")
     assert peer["scores"]["psnr"] == pytest.approx(json.loads(alone.out)["scores"]["psnr"], abs=1e-3)
     assert peer["gaussians"] == closed["gaussians"]
     assert [stage["name"] for stage in peer["stages"]] == ["views", "training"]

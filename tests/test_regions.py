@@ -245,18 +245,7 @@ def test_results_of_another_number_of_steps_are_not_taken(vvgt, volume: Path, fo
 
 
 def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path: Path) -> None:
-    line = (
-        "convert",
-        volume,
-        "--max-gaussians",
-        "1",
-        *STEPS,
-        "--size",
-        "64",
-        "-q",
-        "-o",
-        tmp_path / "o" / "lod-meta.json",
-    )
+    line = ("convert", volume, "--max-gaussians 1", *STEPS, "--size 64 -q -o", tmp_path / "o" / "lod-meta.json")
     vvgt.ok(*line)
     assert json.loads((tmp_path / "o" / "lod-meta.json").read_text())["count"] >= 1
 

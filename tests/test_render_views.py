@@ -173,10 +173,8 @@ def test_half_rounds_to_half(vvgt, tmp_path, expected):
 def test_several_functions_get_a_folder_each(vvgt, tmp_path):
     tf = tmp_path / "a.b.json"
     tf.write_text('{"points": [{"x": 0, "opacity": 0}, {"x": 1, "opacity": 1, "rgb": [1, 0, 0]}]}')
-    vvgt.ok(
-        "render-views", VOLUME, "--tf", tf, "--tf", "magma", "--views", 1, "--test-views", 0, "--size", 16,
-        "--format", "exr", "-o", tmp_path / "v",
-    )  # fmt: skip
+    how = "--tf magma --views 1 --test-views 0 --size 16 --format exr -o"
+    vvgt.ok("render-views", VOLUME, "--tf", tf, how, tmp_path / "v")
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.b", "magma"]
     red, other = (load_views(tmp_path / "v" / name)[1][0] for name in ("a.b", "magma"))
     assert (red[..., 1:3] == 0).all()
@@ -200,10 +198,8 @@ def test_cameras_of_a_file_with_their_split(vvgt, tmp_path, made):
         frame["file_path"] = frame["file_path"].replace("_0", ".0")
     document["test_filenames"] = [frame["file_path"] for frame in document["frames"][3:]]
     (tmp_path / "t.json").write_text(json.dumps(document))
-    vvgt.ok(
-        "render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "--size", 16, "--format", "exr",
-        "-o", tmp_path / "v",
-    )  # fmt: skip
+    how = ("--cameras", tmp_path / "t.json", "--size 16 --format exr -o", tmp_path / "v")
+    vvgt.ok("render-views", VOLUME, "--tf", TF, *how)
     cameras, images = load_views(tmp_path / "v")
     assert [camera.name for camera in cameras] == ["train_000", "train_001", "train_002"]  # a dot would be a suffix
     assert images.shape == (3, 16, 16, 4)

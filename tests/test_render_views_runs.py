@@ -125,9 +125,7 @@ def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, messag
 
 def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
     (copied / "notes.txt").write_text("mine")
-    vvgt.ok(
-        "render-views", VOLUME, "--tf", TF, "--views", 2, "--test-views", 0, "--size", 20, "-o", copied, "--overwrite"
-    )
+    vvgt.ok("render-views", VOLUME, "--tf", TF, "--views 2 --test-views 0 --size 20 --overwrite -o", copied)
     assert sorted(path.name for path in (copied / "train").iterdir()) == [
         f"train_00{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")
     ]
