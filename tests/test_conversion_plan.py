@@ -10,6 +10,7 @@ import pytest
 from onnx_models import write_model
 from test_cli_infer import DARKER
 
+from tests.refused import refused
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
 from vvgt_cli.conversion.plan import Planner, check_memory
@@ -158,8 +159,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
     check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 26)
     for pictures, size in ((0, 392), (400**2 * 32 * 23, 288)):  # with those that a series keeps
-        with pytest.raises(UsageError, match=f"--size 400.*--size {size} would fit"):
-            check_memory(found, pictures)
+        refused(UsageError, f"--size 400.*--size {size} would fit", check_memory, found, pictures)
 
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
@@ -170,8 +170,7 @@ def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkey
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
     check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 3e5 + views)
-    with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
-        check_memory(found)
+    refused(UsageError, "--max-gaussians 250000 would fit", check_memory, found)
     with pytest.raises(UsageError, match="--max-gaussians 125000 would fit"):  # a series keeps more
         check_memory(found, beside=lambda workload: 0.5 * each * workload.gaussians)
 
@@ -302,8 +301,7 @@ def test_views_come_in_sets():
     ],
 )
 def test_limits_that_cannot_be_are_refused(limits, line):
-    with pytest.raises(UsageError, match=line):
-        Limits(**limits)
+    refused(UsageError, line, Limits, **limits)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -313,8 +311,7 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
     assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
     assert 0.02e6 - 4500 < report.bytes <= 0.02e6  # room for a long legend is left
     assert (tmp_path / "a.ply").stat().st_size == report.bytes
-    with pytest.raises(UsageError, match="no Gaussian fits"):
-        done(tmp_path, limits=Limits(max_megabytes=0.001))
+    refused(UsageError, "no Gaussian fits", done, tmp_path, limits=Limits(max_megabytes=0.001))
 
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
@@ -366,8 +363,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
     assert "120 views of 48 px" in found.text()
     done(tmp_path)
-    with pytest.raises(UsageError, match="exists"):
-        plan_conversion(request, Console(quiet=True))
+    refused(UsageError, "exists", plan_conversion, request, Console(quiet=True))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
@@ -392,8 +388,7 @@ def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
     assert not stage.kept
     assert stage.psnr < stage.psnr_before
     assert worse.scores["psnr"] == plain.scores["psnr"]
-    with pytest.raises(UsageError, match="no such folder"):
-        done(tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
+    refused(UsageError, "no such folder", done, tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
 
 
 def test_without_gaussians_views_are_guessed_by_the_budget():

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as library
+from tests.refused import refused
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -140,8 +141,7 @@ def test_splat(vvgt: Callable, tmp_path: Path) -> None:
 def test_what_is_no_splat_and_what_is_not_written(vvgt: Callable, tmp_path: Path) -> None:
     for content in (b"", splat(GOOD)[:-1]):
         (tmp_path / "a.splat").write_bytes(content)
-        with pytest.raises(DataError, match=r"expected a .splat of 32 bytes a Gaussian"):
-            read_splats(tmp_path / "a.splat")
+        refused(DataError, r"expected a .splat of 32 bytes a Gaussian", read_splats, tmp_path / "a.splat")
     (tmp_path / "a.ksplat").write_bytes(bytes(4096))
     for command in ("info", "check", "view"):
         assert "a.ksplat out.ply" in vvgt(command, tmp_path / "a.ksplat").error
@@ -220,8 +220,7 @@ def test_columns_are_found_by_name(tmp_path: Path, ranges: list[str]) -> None:
     ],
 )
 def test_faulty_compressed_files(tmp_path: Path, content: bytes, said: str) -> None:
-    with pytest.raises(DataError, match=said):
-        read(tmp_path, content)
+    refused(DataError, said, read, tmp_path, content)
 
 
 def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:

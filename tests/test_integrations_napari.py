@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.refused import refused
 from tests.test_integrations_slicer import heaviest
 from tests.vtk_scenes import camera_at, psnr
 from vvgt_cli.conversion.gaussian_files import open_gaussians
@@ -150,11 +151,9 @@ def test_what_napari_draws_otherwise_is_named_once(viewer, tmp_path, recwarn) ->
 @pytest.mark.long
 def test_what_cannot_be_saved_says_why(viewer, tmp_path) -> None:
     viewer.add_image(np.zeros((8, 8, 3), np.uint8), rgb=True, name="photo")
-    with pytest.raises(vvgt_cli.UsageError, match="photo: an RGB image; expected z, y, x"):
-        saved(viewer, tmp_path / "a.html")
+    refused(vvgt_cli.UsageError, "photo: an RGB image; expected z, y, x", saved, viewer, tmp_path / "a.html")
     viewer.add_image(point(), visible=False)
-    with pytest.raises(vvgt_cli.UsageError, match="no visible layer"):
-        saved(viewer, tmp_path / "a.html")
+    refused(vvgt_cli.UsageError, "no visible layer", saved, viewer, tmp_path / "a.html")
 
 
 @pytest.mark.long

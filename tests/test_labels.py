@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as library
+from tests.refused import refused
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr.layers import grid_of
 from vvgt_cli.errors import DataError, UsageError
@@ -127,8 +128,7 @@ def test_recognised_by_type_name_and_number() -> None:
 def test_labels_are_data_values_and_whole() -> None:
     assert labels_in(Volume(balls(), slope=2.0, intercept=1.0)) == [1, 3, 7]
     assert labels_in(Volume(np.where(balls() == 3, np.nan, balls()))) == [0, 1]
-    with pytest.raises(DataError, match=r"such as 0\.5; expected a label map"):
-        labels_in(Volume(balls() / 2))
+    refused(DataError, r"such as 0\.5; expected a label map", labels_in, Volume(balls() / 2))
     assert len(labels_in(Volume(np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)))) == 65_536
 
 
@@ -278,10 +278,8 @@ def test_in_python() -> None:
     _, images = library.render_views(balls(), library.Look(labels=entries), cameras=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
     assert images[..., 1].max() == 0
-    with pytest.raises(DataError, match="no entry"):
-        library.convert(balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
-    with pytest.raises(UsageError, match="no such file"):
-        library.convert(balls(), library.Look(labels="nowhere.ctbl"))
+    refused(DataError, "no entry", library.convert, balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
+    refused(UsageError, "no such file", library.convert, balls(), library.Look(labels="nowhere.ctbl"))
     assert isinstance(distinct([1]), LabelTable)
 
 
@@ -358,8 +356,7 @@ def test_tables_are_listed_and_distinguished_from_functions(vvgt, tmp_path: Path
             ("init", "example:blob:8", "--tf", path, "-o", "b.ply"),
         ):
             assert "a table of labels; expected a transfer function: give the table to --labels" in vvgt(*call).error
-    with pytest.raises(DataError, match="not a transfer function"):
-        library.convert(balls(), table(tmp_path, '{"range": 1}', "b.json"))
+    refused(DataError, "not a transfer function", library.convert, balls(), table(tmp_path, '{"range": 1}', "b.json"))
     (tmp_path / "notes.txt").write_text("nothing of the kind")
     assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
 

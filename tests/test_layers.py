@@ -12,6 +12,7 @@ import pytest
 import tifffile
 
 import vvgt_cli as library
+from tests.refused import refused
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
@@ -48,8 +49,7 @@ def test_a_crop_keeps_its_place_in_the_world() -> None:
 
 @pytest.mark.parametrize("text", ["1:2", "1:2,3:4,5", "2:2,:,:", "5:3,:,:", "a:b,:,:", "-1:3,:,:", "1:2,3:4,5:6,7:8"])
 def test_crops_that_are_none(text: str) -> None:
-    with pytest.raises(UsageError, match="--crop"):
-        ReadOptions(crop=text)
+    refused(UsageError, "--crop", ReadOptions, crop=text)
 
 
 def test_a_mask_hides_and_must_have_the_size() -> None:
@@ -63,8 +63,7 @@ def test_a_mask_hides_and_must_have_the_size() -> None:
     np.testing.assert_array_equal(part.data[1], volume.data[1])
     with pytest.raises(DataError, match=r"--mask m: 4 x 3 x 1 voxels; expected the 4 x 3 x 2 of v"):
         masked(volume, Volume(keep[:1], name="m"))
-    with pytest.raises(DataError, match="all of it is 0"):
-        masked(volume, Volume(keep * 0))
+    refused(DataError, "all of it is 0", masked, volume, Volume(keep * 0))
     big = replace(volume, data=volume.data.astype(np.int32) * 1000003)
     np.testing.assert_array_equal(masked(big, Volume(keep)).data[1], big.data[1])
 
@@ -114,8 +113,7 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
         assert (read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300)).data == 40).sum() == head.sum()
     with pytest.raises(DataError, match="--keep-largest 300: no voxel lies above"):
         read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=300))
-    with pytest.raises(UsageError, match="--keep-largest nan: expected a finite"):
-        ReadOptions(keep_largest=float("nan"))
+    refused(UsageError, "--keep-largest nan: expected a finite", ReadOptions, keep_largest=float("nan"))
     whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
     assert whole.gaussians.means[:, 0].max() < 0.2
     runs = {"a": (), "b": ("--blocks", 16), "c": ("--blocks", 16, "--workers", 2), "live": ("--live",)}
@@ -202,8 +200,7 @@ def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvg
     for more in ((), ("--blocks", 16), ("--component", "color")):
         done = vvgt(*given, "--keep-largest", 10, *more)
         assert (done.code, "a.nrrd has colours; expected scalars: give a --mask" in done.error) == (2, True)
-    with pytest.raises(UsageError, match="has colours"):
-        library.convert(str(tmp_path / "a.nrrd"), keep_largest=10)
+    refused(UsageError, "has colours", library.convert, str(tmp_path / "a.nrrd"), keep_largest=10)
     vvgt.ok(*given, "--keep-largest", 10, "--component", 0)
     for more in (("--overwrite",), ("--overwrite", "--blocks", 16)):
         with pytest.warns(UserWarning, match="--keep-largest 10: hides"):
@@ -351,11 +348,9 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     with pytest.raises(DataError, match="lies beside cloud in the world"):
         common_grid([Layer(first, ramp(0, 1), 1.0), Layer(far, ramp(0, 1), 1.0)])
     tiny = cloud((4, 4, 4), spacing=(0.05, 0.05, 0.05))
-    with pytest.raises(DataError, match="20 times finer"):
-        common_grid([Layer(first, ramp(0, 1), 1.0), Layer(tiny, ramp(0, 1), 1.0)])
+    refused(DataError, "20 times finer", common_grid, [Layer(first, ramp(0, 1), 1.0), Layer(tiny, ramp(0, 1), 1.0)])
     for text in ("", "a.nii,hue=3", "a.nii,time=x", "a.nii,tf="):
-        with pytest.raises(UsageError, match="--layer"):
-            parse_layer(text)
+        refused(UsageError, "--layer", parse_layer, text)
     asked = SourceRequest("a,b.nii", tf="hot:0.2,0.8", labels="none")
     assert parse_layer("a,b.nii,tf=hot:0.2,0.8,labels=none") == asked
     gone = vvgt("init", "example:blob:8", "--layer", tmp_path / "no.nii", "-o", tmp_path / "a.ply")

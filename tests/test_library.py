@@ -19,6 +19,7 @@ import xarray
 
 import vvgt_cli as vvgt
 from tests.headers import uncertified
+from tests.refused import refused
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
 
@@ -199,17 +200,14 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
     ],
 )
 def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
-    with pytest.raises(vvgt.VvgtError, match=words):
-        vvgt.read_volume(volume, **reading)
+    refused(vvgt.VvgtError, words, vvgt.read_volume, volume, **reading)
 
 
 def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     small = converted.save(tmp_path / "a.ply")
     assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
-    with pytest.raises(vvgt.UsageError, match="exists"):
-        converted.save(tmp_path / "a.ply", overwrite=False)
-    with pytest.raises(vvgt.UsageError, match="expected a name ending in"):
-        converted.save(tmp_path / "x.obj")
+    refused(vvgt.UsageError, "exists", converted.save, tmp_path / "a.ply", overwrite=False)
+    refused(vvgt.UsageError, "expected a name ending in", converted.save, tmp_path / "x.obj")
     assert not (tmp_path / "x.obj").exists()
 
 

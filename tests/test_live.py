@@ -13,6 +13,7 @@ import pytest
 import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
 from tests.live_stream import from_bytes
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.gaussian_samples import (
@@ -214,8 +215,7 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live values", b"live valuez", 1))
-    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
-        read_ply(tmp_path / "c.ply")
+    refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
 
 
 def test_a_function_that_json_cannot_hold_is_sampled() -> None:
@@ -415,5 +415,4 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     magma = vvgt_library.recolor(live_file, "magma")
     assert len(magma.gaussians) > 100
     assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
-    with pytest.raises(vvgt_library.DataError, match="carry no values"):
-        other.recolor("magma")
+    refused(vvgt_library.DataError, "carry no values", other.recolor, "magma")

@@ -11,6 +11,7 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.live_stream import from_bytes
+from tests.refused import refused
 from tests.test_live import SMALL, cloud
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import assign_labels
@@ -85,11 +86,9 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     assert read_ply(tmp_path / "b.ply")[0].live[0, LABEL_ROW] == 299  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
-    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
-        read_ply(tmp_path / "c.ply")
+    refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
     (tmp_path / "d.ply").write_bytes(whole[:-1] + b"\x09")
-    with pytest.raises(vvgt_library.DataError, match="row 9"):
-        read_ply(tmp_path / "d.ply")
+    refused(vvgt_library.DataError, "row 9", read_ply, tmp_path / "d.ply")
 
 
 def test_labels_in_the_header_of_a_file_without_their_column_are_ignored(tmp_path: Path) -> None:

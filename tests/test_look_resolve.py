@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look import (
     ColorMap,
@@ -96,8 +97,7 @@ def test_unit_nodes_on_unit_data_are_data_values(recwarn):
 
 @pytest.mark.parametrize("spec", ["all", "1", "1,2,3", "2,1", "1,1", "nan,1", "0,inf", "", (1,)])
 def test_bad_ranges_are_usage_errors(spec):
-    with pytest.raises(UsageError, match="--tf-range"):
-        resolve(function(), DATA, spec)
+    refused(UsageError, "--tf-range", resolve, function(), DATA, spec)
 
 
 def test_fractions_follow_the_data_or_the_range():
@@ -115,15 +115,12 @@ def test_percentiles_follow_the_histogram():
     resolved = resolve(tf, statistics(values))
     expected = np.quantile(values, [0, 0.5, 0.9])
     np.testing.assert_allclose(resolved.breakpoints(), expected, atol=(values.max() - values.min()) / 256)
-    with pytest.raises(UsageError, match="omit --tf-range"):
-        resolve(tf, statistics(values), "rescale")
+    refused(UsageError, "omit --tf-range", resolve, tf, statistics(values), "rescale")
 
 
 def test_a_function_of_one_position_cannot_be_stretched():
-    with pytest.raises(DataError, match="two positions"):
-        resolve(function(x=(5,), y=(1,)), DATA, "rescale")
-    with pytest.raises(DataError, match="cannot stretch"):
-        resolve(function(), statistics([3.0, 3.0]), "rescale")
+    refused(DataError, "two positions", resolve, function(x=(5,), y=(1,)), DATA, "rescale")
+    refused(DataError, "cannot stretch", resolve, function(), statistics([3.0, 3.0]), "rescale")
 
 
 def test_unit_distance_by_paraview_and_by_spacing():
@@ -161,8 +158,7 @@ def test_unit_distance_of_flat_volumes():
 
 @pytest.mark.parametrize("spec", ["0", "-1", "nan", "inf", "vtk", 0.0])
 def test_bad_unit_distances_are_usage_errors(spec):
-    with pytest.raises(UsageError, match="--opacity-unit-distance"):
-        unit_distance(spec, Volume(np.zeros((2, 2, 2), np.uint8)))
+    refused(UsageError, "--opacity-unit-distance", unit_distance, spec, Volume(np.zeros((2, 2, 2), np.uint8)))
 
 
 def test_support_is_where_opacity_is_above_zero():
@@ -189,8 +185,7 @@ def test_support_of_steps_and_bumps_beyond_the_ends():
 def test_nothing_visible_is_an_error_with_both_ranges():
     with pytest.raises(DataError, match=r"the data lie in \[-100, 300\], opacity is above 0 in \[400, inf\]"):
         check_visible(function(x=(0, 400, 500), y=(0, 0, 1)), DATA)
-    with pytest.raises(DataError, match="nowhere"):
-        check_visible(function(y=(0, 0, 0)), DATA)
+    refused(DataError, "nowhere", check_visible, function(y=(0, 0, 0)), DATA)
     check_visible(function(), DATA)
     check_visible(function(x=(0, 299, 500), y=(0, 0, 1)), DATA)
 
@@ -202,8 +197,7 @@ def test_data_without_finite_voxels_are_an_error():
         lambda: check_visible(function(), empty),
         lambda: from_histogram(empty),
     ):
-        with pytest.raises(DataError, match="no finite voxel"):
-            use()
+        refused(DataError, "no finite voxel", use)
 
 
 def ct_values(air=60_000):
@@ -315,8 +309,7 @@ def test_drawing_shows_the_colors_and_is_written_whole(tmp_path):
     picture = read_png(tmp_path / "a.png")[..., :3]
     assert ((picture - (1, 0, 0)) ** 2).sum(-1).min() < 1e-6
     assert (np.abs(picture - (1, 0, 0)).max(-1) < 0.02).mean() > 0.4
-    with pytest.raises(UsageError, match="--overwrite"):
-        draw(red, DATA, tmp_path / "a.png")
+    refused(UsageError, "--overwrite", draw, red, DATA, tmp_path / "a.png")
     before = (tmp_path / "a.png").read_bytes()
     draw(red, DATA, tmp_path / "a.png", overwrite=True)
     assert (tmp_path / "a.png").read_bytes() == before
@@ -327,9 +320,6 @@ def test_drawing_shows_the_colors_and_is_written_whole(tmp_path):
 
 
 def test_node_positions_of_other_domains_lie_in_the_unit_interval():
-    with pytest.raises(DataError, match="for a fraction"):
-        function(domain="fraction")
-    with pytest.raises(DataError, match="node domain 'log'"):
-        function(domain="log")
-    with pytest.raises(DataError, match="unit distance -1"):
-        function(opacity_unit_distance=-1)
+    refused(DataError, "for a fraction", function, domain="fraction")
+    refused(DataError, "node domain 'log'", function, domain="log")
+    refused(DataError, "unit distance -1", function, opacity_unit_distance=-1)

@@ -6,6 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.images.metrics import CAP, score_view, score_views
 
@@ -104,15 +105,10 @@ def test_views_are_read_one_at_a_time():
 
 def test_views_that_do_not_fit_are_refused():
     reference = views(2)
-    with pytest.raises(DataError, match="more reference views"):
-        score_views(reference, reference[:1])
-    with pytest.raises(DataError, match="fewer reference views"):
-        score_views(reference[:1], reference)
-    with pytest.raises(DataError, match="same"):
-        score_views(reference, reference[..., :3])
-    with pytest.raises(DataError, match="no views"):
-        score_views([], [])
+    refused(DataError, "more reference views", score_views, reference, reference[:1])
+    refused(DataError, "fewer reference views", score_views, reference[:1], reference)
+    refused(DataError, "same", score_views, reference, reference[..., :3])
+    refused(DataError, "no views", score_views, [], [])
     broken = reference.copy()
     broken[1, 2, 3, 0] = np.nan
-    with pytest.raises(DataError, match="our view: 1 values are not finite"):
-        score_views(reference, broken)
+    refused(DataError, "our view: 1 values are not finite", score_views, reference, broken)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.random_clouds import extreme_cloud, random_cloud
+from tests.refused import refused
 from vvgt_cli.cameras import default_views, farthest_cameras
 from vvgt_cli.cameras.quaternions import quaternion
 from vvgt_cli.errors import DataError, UsageError
@@ -226,18 +227,12 @@ def test_configs_survive_the_way_through_plain_values():
 def test_a_config_that_makes_no_network_is_refused(change, message):
     values = SMALL.to_dict()
     change(values)
-    with pytest.raises(DataError, match=message):
-        NetworkConfig.from_dict(values)
+    refused(DataError, message, NetworkConfig.from_dict, values)
 
 
 def test_other_values_are_refused():
-    with pytest.raises(UsageError, match="wo_everything"):
-        NetworkConfig(variant="wo_everything")
-    with pytest.raises(DataError, match="multiple"):
-        GeometryConfig(heads=(3, 3, 3, 3, 3))
-    with pytest.raises(DataError, match="4 a head"):
-        ImageConfig(width=150)
-    with pytest.raises(DataError, match="no Gaussians"):
-        prepare(scene(0), [], np.zeros((0, 8, 8, 4)), SMALL)
-    with pytest.raises(DataError, match="no views"):
-        prepare(scene(3), [], np.zeros((0, 8, 8, 4)), SMALL)
+    refused(UsageError, "wo_everything", NetworkConfig, variant="wo_everything")
+    refused(DataError, "multiple", GeometryConfig, heads=(3, 3, 3, 3, 3))
+    refused(DataError, "4 a head", ImageConfig, width=150)
+    refused(DataError, "no Gaussians", prepare, scene(0), [], np.zeros((0, 8, 8, 4)), SMALL)
+    refused(DataError, "no views", prepare, scene(3), [], np.zeros((0, 8, 8, 4)), SMALL)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from random_clouds import random_cloud
 
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
@@ -267,10 +268,8 @@ def test_no_gaussians_stay_none(scene):
 
 def test_wrong_views_and_options_are_refused(scene):
     start, images, check = scene
-    with pytest.raises(DataError, match="5 training images for 6 cameras"):
-        optimize(start, CAMERAS, images[:5])
-    with pytest.raises(DataError, match="check view"):
-        optimize(start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
+    refused(DataError, "5 training images for 6 cameras", optimize, start, CAMERAS, images[:5])
+    refused(DataError, "check view", optimize, start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
     for wrong in (
         {"method": "sgd"},
         {"steps": -1},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt
+from tests.refused import refused
 from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
 from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
@@ -117,14 +118,11 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
 
 
 def test_refused(session, earlier):
-    with pytest.raises(vvgt.UsageError, match="same volume"):
-        vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
-    with pytest.raises(vvgt.UsageError, match=r"after with --live: .*remove it"):
-        session.convert(SHELL, GOAL, after=earlier, live=True)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, "example:blob:16", "viridis", GOAL, after=earlier)
+    refused(vvgt.UsageError, r"after with --live: .*remove it", session.convert, SHELL, GOAL, after=earlier, live=True)
     with pytest.raises(vvgt.UsageError, match=r"after with labels: .*remove it"):
         vvgt.convert("example:blob:16", goal=GOAL, after=earlier, split_labels=True)
-    with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
-        session.convert([SHELL, "gray"], GOAL, after=earlier)
+    refused(vvgt.UsageError, r"after with .*give one function", session.convert, [SHELL, "gray"], GOAL, after=earlier)
 
 
 def test_the_same_look_changes_nothing(session, earlier):
@@ -160,5 +158,4 @@ def test_in_blocks_too(values):
     assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     values = values.copy()
     values[12, 12, 12] = 0
-    with pytest.raises(vvgt.UsageError, match="same volume"):
-        vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, values, tf, GOAL, after=first, spacing=SPACING, blocks=16)

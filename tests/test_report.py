@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.onnx_models import write_model
+from tests.refused import refused
 from tests.report_runs import document, run, runs
 from vvgt_cli.commands.report import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
@@ -208,10 +209,8 @@ UNNAMED = document(runs=[runs()[0] | {"name": 3}])
 def test_files_that_are_no_reports(content, tmp_path):
     path = tmp_path / "r.json"
     path.write_bytes(content.encode("latin-1"))
-    with pytest.raises(DataError, match=r"r\.json"):
-        read_series(str(path))
-    with pytest.raises(DataError, match="not a report"):
-        read_series(str(tmp_path / "none.json"))
+    refused(DataError, r"r\.json", read_series, str(path))
+    refused(DataError, "not a report", read_series, str(tmp_path / "none.json"))
 
 
 def test_the_front_is_what_nothing_beats():

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume, shapes
 
@@ -120,10 +121,8 @@ def test_example_sources(name: str) -> None:
     ],
 )
 def test_example_errors(source: str, options: ReadOptions, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        read_volume(source, options)
+    refused(UsageError, message, read_volume, source, options)
 
 
 def test_a_size_beyond_memory_is_refused() -> None:
-    with pytest.raises(DataError, match="of memory"):
-        read_volume("example:blob:999999")
+    refused(DataError, "of memory", read_volume, "example:blob:999999")

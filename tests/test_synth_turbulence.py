@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.commands.synth import Flow, Solver, fields, flow_of, resolved_viscosity, run
 from vvgt_cli.errors import DataError, UsageError
 
@@ -135,10 +136,7 @@ def test_the_smallest_eddies_fit():
 
 
 def test_sizes_and_states_that_cannot_be():
-    with pytest.raises(UsageError, match="at least 8"):
-        Flow(4, 0.1)
-    with pytest.raises(DataError, match="of memory"):
-        Flow(100_000, 0.1)
+    refused(UsageError, "at least 8", Flow, 4, 0.1)
+    refused(DataError, "of memory", Flow, 100_000, 0.1)
     solver = Solver(QUIET)
-    with pytest.raises(DataError, match="not finite"):
-        run(solver, solver.start(0) * np.nan, 0.1)
+    refused(DataError, "not finite", run, solver, solver.start(0) * np.nan, 0.1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cli.fit import TARGETS as NAMES
 from vvgt_cli.conversion.place import headset_axes
@@ -54,10 +55,8 @@ def test_what_is_given_wins_over_the_target():
     goal = Goal.of({"target": "quest", "size": 1080, "rule": "inria"})  # also where it equals the default
     assert (goal.max_gaussians, goal.size, goal.rule) == (device.max_gaussians, 1080, "inria")
     assert Goal(target="phone", max_gaussians=100_000).max_gaussians == 100_000
-    with pytest.raises(UsageError, match=r"--target-psnr 200"):
-        Goal(target="phone", target_psnr=200)
-    with pytest.raises(UsageError, match=r"target 'watch'; expected one of quest, visionos, phone, desktop"):
-        FitOptions(target="watch")
+    refused(UsageError, r"--target-psnr 200", Goal, target="phone", target_psnr=200)
+    refused(UsageError, r"target 'watch'; expected one of quest, visionos, phone, desktop", FitOptions, target="watch")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import SimpleITK as sitk
 from vtkmodules.vtkIOXML import vtkXMLImageDataReader, vtkXMLImageDataWriter
 
 from tests import vtk_files as files
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import ROWS, way_out
@@ -53,8 +54,7 @@ def test_appended_data_that_vtk_would_break_down_at(tmp_path: Path, old: bytes, 
     data = files.write(writer, files.image(), path).read_bytes()
     assert old in data
     path.write_bytes(data.replace(old, new))
-    with pytest.raises(DataError, match=r"do not begin with _|no whole table"):
-        read_volume(str(path), ReadOptions(array="ramp"))
+    refused(DataError, r"do not begin with _|no whole table", read_volume, str(path), ReadOptions(array="ramp"))
 
 
 @pytest.mark.parametrize(
@@ -95,8 +95,7 @@ def test_marked_headers_as_text(tmp_path: Path, name: str) -> None:
 def test_ensight_is_refused_with_a_mark(tmp_path: Path) -> None:
     path = files.ensight(tmp_path)
     mark(path)  # VTK's reader loses the time steps
-    with pytest.raises(DataError, match="byte order mark"):
-        read_volume(str(path), ReadOptions(time=0))
+    refused(DataError, "byte order mark", read_volume, str(path), ReadOptions(time=0))
 
 
 @pytest.mark.parametrize("kind", [nibabel.Nifti1Pair, nibabel.AnalyzeImage])
@@ -126,8 +125,7 @@ def test_data_files_in_another_case(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"'V\.RAW' does not exist, v\.raw is read"):
         np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
     (tmp_path / "v.Raw").write_bytes(VALUES.tobytes())  # which one?
-    with pytest.raises(DataError, match="does not exist beside it"):
-        read_volume(str(path))
+    refused(DataError, "does not exist beside it", read_volume, str(path))
     (tmp_path / "V.RAW").write_bytes(VALUES.tobytes())
     np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.refused import refused
 from tests.test_scale import bodies
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
@@ -153,8 +154,7 @@ def test_other_codecs_than_were_checked_are_refused(
     told_of = lambda self, encoding: json.dumps(told) if self.name == ".zarray" else real(self, encoding)  # noqa: E731
     monkeypatch.setattr(Remote, "read_text", told_of)
     monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", {"zlib"})  # the array itself has another one
-    with pytest.raises(DataError, match="codec"):
-        read_volume(f"{address}/t.zarr", ReadOptions(time=0))
+    refused(DataError, "codec", read_volume, f"{address}/t.zarr", ReadOptions(time=0))
 
 
 def test_other_codecs_of_coordinates_are_refused(address: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,8 +168,7 @@ def test_other_codecs_of_coordinates_are_refused(address: str, folder: Path, mon
     assert read_volume(f"{address}/c.zarr:/v").dims == (10, 9, 8)
     monkeypatch.setattr(Remote, "read_text", told_of)
     monkeypatch.setattr("vvgt_cli.volume.arrays.zarr._CODECS", set[str]())  # the array itself has one
-    with pytest.raises(DataError, match="codec"):
-        read_volume(f"{address}/c.zarr:/v")
+    refused(DataError, "codec", read_volume, f"{address}/c.zarr:/v")
 
 
 def test_paths_stay_inside_the_store() -> None:
