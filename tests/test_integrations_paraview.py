@@ -168,9 +168,7 @@ def test_the_nearest_source_that_is_shown_is_taken(monkeypatch: pytest.MonkeyPat
         ("scaled", ("Representation.Scale=[1.5,1.5,1.5]",), 42),
     ],
 )
-def test_beside_paraviews_own_picture(
-    case: str, given: tuple[str, ...], least: float, display: str, tmp_path: Path
-) -> None:
+def test_beside_paraviews_own_picture(case, given, least, display, tmp_path) -> None:
     """The same camera; colours in Lab, opacity with midpoints, a unit distance, the representation's place."""
     name = tmp_path / "a.splats.ply"
     theirs, said = paraview(display, volume_file(tmp_path / "lump.vti"), name, *FEW, *given)

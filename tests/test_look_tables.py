@@ -90,9 +90,7 @@ def test_a_reading_that_is_a_guess_is_said(tmp_path: Path, given: tuple, expecte
         ("d.csv", "id,name,red,green,blue\n1.0,a,255,51,0\n3.0,b,0,0,255.0\n", ("a", "b"), 1),
     ],
 )
-def test_separated_tables(
-    tmp_path: Path, name: str, text: str, names: tuple, opacity: float, encoding: str, newline: str
-) -> None:
+def test_separated_tables(tmp_path, name, text, names, opacity, encoding, newline) -> None:
     path = saved(tmp_path, name, text.replace("\n", newline), encoding)
     first, second = (label for label in read_labels(path).labels if label.number)
     assert (first.number, second.number, first.name, second.name) == (1, 3, *names)

@@ -155,9 +155,7 @@ def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("scheduler", [(), ("--scheduler", "local")])
-def test_bytes_depend_on_neither_blocks_nor_workers(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, scheduler: tuple[str, ...]
-) -> None:
+def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume, folder, tmp_path, scheduler) -> None:
     if scheduler:
         pytest.importorskip("distributed")
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "32")
@@ -165,9 +163,7 @@ def test_bytes_depend_on_neither_blocks_nor_workers(
     assert files_in(tmp_path / "out") == files_in(folder)
 
 
-def test_an_interrupted_refinement_goes_on_where_it_ended(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)  # the tiles are regions
     whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
@@ -204,9 +200,7 @@ def test_no_time_for_steps_is_said(vvgt, volume: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [(), ("--light", "headlight")])
-def test_large_clouds_are_refined_by_regions_in_every_format(
-    vvgt, volume: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
-) -> None:
+def test_large_clouds_are_refined_by_regions_in_every_format(vvgt, volume, tmp_path, monkeypatch, options) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.convert.MANY", 5000)
     light = options if "--light" in options else ()
     vvgt.ok("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply")
@@ -250,9 +244,7 @@ def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path:
     assert json.loads((tmp_path / "o" / "lod-meta.json").read_text())["count"] >= 1
 
 
-def test_regions_without_gaussians_are_written_lit_and_not(
-    vvgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_regions_without_gaussians_are_written_lit_and_not(vvgt, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.LARGEST", 1)
     z, y, x = np.mgrid[:160, :60, :60]
     balls = sum((np.hypot(np.hypot(x - 30, y - 30), z - at) < 14) * 200 for at in (24, 80, 136))

@@ -179,9 +179,7 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_run_resumes_with_the_same_bytes(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 2500)
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
@@ -320,9 +318,7 @@ def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Pa
         (lambda m: m["tree"]["children"][0]["lods"].update({"0": []}), "a node has"),
     ],
 )
-def test_manifests_that_cannot_be_are_one_line(
-    folder: Path, tmp_path: Path, change: Callable[[Any], None], text: str
-) -> None:
+def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     change(manifest)
     (tmp_path / "lod-meta.json").write_text(json.dumps(manifest))

@@ -250,9 +250,7 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
         ({**FUNCTION, "file": "/etc/passwd"}, "'file'"),
     ],
 )  # fmt: skip
-def test_what_is_no_function_is_refused_with_the_reason(
-    controller: tuple[str, PageController], sent: Any, said: str
-) -> None:
+def test_what_is_no_function_is_refused_with_the_reason(controller, sent, said) -> None:
     url, of = controller
     status, text = send(url, "function", sent)
     assert status == 400
@@ -383,9 +381,7 @@ def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Pat
         (["example:nope"], 2, "no such example"),
     ],
 )
-def test_what_cannot_be_shown_is_one_line(
-    args: list[str], code: int, said: str, tmp_path: Path, vvgt: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_shown_is_one_line(args, code, said, tmp_path, vvgt, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("one.npy", np.full((4, 4, 4), 5, np.uint8))
     head = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 8 8 8\nencoding: raw\n\nxx"

@@ -93,9 +93,7 @@ DIRECTIONS = [  # name, coordinates, attributes, lowest position, value there
 @pytest.mark.parametrize("reader", [*WRITERS, "xarray"])
 @pytest.mark.parametrize(("name", "centres", "attributes", "lowest", "value"), DIRECTIONS)
 @pytest.mark.filterwarnings("ignore:axis dept.*taken as pointing down", "ignore:axis z.*taken as pointing down")
-def test_vertical_axes_point_up(
-    tmp_path: Path, reader: str, name: str, centres: np.ndarray, attributes: dict, lowest: float, value: float
-) -> None:
+def test_vertical_axes_point_up(tmp_path, reader, name, centres, attributes, lowest, value) -> None:
     if reader == "xarray":
         found = [read_xarray(tmp_path, name, centres, **attributes)]
     else:

@@ -78,9 +78,7 @@ NO_SIZE, NO_DEPTH = "no size of its pixels; taken as 1", "no distance between it
         ("unit=um\nspacing=2.0\n", (4, 5, 2), (0.25, 0.2, 2), "um", ("taken per um",)),
     ],
 )
-def test_imagej_sizes_that_are_half_known(
-    tmp_path: Path, text: str, tags: tuple | None, spacing: tuple, unit: str, told: tuple
-) -> None:
+def test_imagej_sizes_that_are_half_known(tmp_path, text, tags, spacing, unit, told) -> None:
     """Expected as ij.io.TiffDecoder and ij.io.FileOpener take them, except of dots per inch or cm without a unit."""
     source = described(tmp_path / "a.tif", f"images=4\nslices=4\n{text}", tags)
     with warnings.catch_warnings(record=True) as caught:

@@ -320,9 +320,7 @@ def test_npy_lies(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "module", "extra"), [("v.h5", "h5py", "hdf5"), ("v.nc", "netCDF4", "netcdf"), ("v.zarr", "zarr", "zarr")]
 )
-def test_a_missing_library_names_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, extra: str
-) -> None:
+def test_a_missing_library_names_its_extra(tmp_path, monkeypatch, name, module, extra) -> None:
     if name == "v.zarr":
         zarr.create_array(str(tmp_path / name), data=VALUES)
     elif name == "v.h5":

@@ -88,9 +88,7 @@ def test_an_address_is_read_as_the_folder(address: str, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("end", [".zattrs", ".zarray", "/0.0.0.0", "g.zarr/"])
-def test_answers_without_an_end_are_a_line(
-    vvgt, address: str, folder: Path, monkeypatch: pytest.MonkeyPatch, end: str
-) -> None:
+def test_answers_without_an_end_are_a_line(vvgt, address, folder, monkeypatch, end) -> None:
     """Metadata, chunks, a folder's list: no more is read than can be needed."""
     zarr.open_group(store=str(folder / "g.zarr"), mode="w", zarr_format=2)
     monkeypatch.setattr(Handler, "endless", end)
@@ -146,9 +144,7 @@ def test_what_cannot_be_is_a_line(vvgt, address: str, monkeypatch: pytest.Monkey
     assert (done.code, "pip install 'vvgt[remote]'" in done.error) == (1, True), done.error
 
 
-def test_other_codecs_than_were_checked_are_refused(
-    address: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_codecs_than_were_checked_are_refused(address, folder, monkeypatch) -> None:
     told = json.loads((folder / "t.zarr" / ".zarray").read_text()) | {"compressor": {"id": "zlib", "level": 1}}
     real = Remote.read_text
     told_of = lambda self, encoding: json.dumps(told) if self.name == ".zarray" else real(self, encoding)  # noqa: E731

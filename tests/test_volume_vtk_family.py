@@ -100,9 +100,7 @@ def test_images_are_read_as_they_are(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("make", [files.hdf_image, files.hdf_steps])
-def test_vtkhdf_images_stay_in_their_file_and_are_what_vtk_reads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make
-) -> None:
+def test_vtkhdf_images_stay_in_their_file_and_are_what_vtk_reads(tmp_path, monkeypatch, make) -> None:
     path, time = make(tmp_path), 1 if make is files.hdf_steps else None
     arrays = ("ramp",) if time else ("ramp", "cells")
     found = {}
