@@ -90,7 +90,6 @@ def display() -> Iterator[str]:
         pytest.skip("Xvfb is not on the path (Debian: xvfb)")
     words = ["Xvfb", "-noreset", "-displayfd", "1", "-screen", "0", "1280x1024x24"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as server:
-        assert server.stdout is not None
         yield f":{server.stdout.readline().decode().strip()}"
         server.terminate()
 

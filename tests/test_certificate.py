@@ -101,13 +101,11 @@ def test_a_certificate_that_is_none_is_one_line(text) -> None:
 
 def test_a_conversion_certifies_its_file(made) -> None:
     found = read_ply(made)[1].certificate
-    assert found is not None
     assert (found.volume, found.size, found.rule) == ("volume, 20 x 18 x 22", 64, "inria")
     assert (found.views, found.pixels) == (3, 64**2)
     assert found.psnr > 20
     assert len(found.conditions) == 10
     assert found.conditions[0][1] == min(dB for _, dB in found.conditions)
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME --")
     assert "/" not in found.command
     for words in ("--tf tf.json", "--size 64", "--max-gaussians 300", "--steps 8", "--dims 20 18 22"):
@@ -121,8 +119,6 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     args = (tmp_path / "t_*.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--shard", "2/2")
     vvgt.ok("convert", *args, "-o", tmp_path / "out_{}.ply")
     found = read_ply(tmp_path / "out_1.ply")[1].certificate
-    assert found is not None
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME ")
     assert "--shard 2/2" in found.command
 
@@ -134,8 +130,6 @@ def test_no_folder_is_named_whatever_its_name(vvgt, folder, tmp_path) -> None:
     args = (odd / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", tmp_path / "odd.ply")
     vvgt.ok("convert", *args)
     found = read_ply(tmp_path / "odd.ply")[1].certificate
-    assert found is not None
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME ")
 
 
@@ -203,7 +197,6 @@ def test_a_live_file_keeps_its_own_and_a_recolored_one_has_none(vvgt, folder, tm
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--max-gaussians", "300", "--live")
     vvgt.ok("convert", *args, "-o", tmp_path / "live.ply")
     certificate = read_ply(tmp_path / "live.ply")[1].certificate
-    assert certificate is not None
     assert certificate.live_psnr is not None
     found = evaluated(vvgt, folder, tmp_path / "live.ply")  # with --tf: as recolor shows it
     assert (found["holds"], found["recorded"]) == (True, certificate.live_psnr)
@@ -217,7 +210,6 @@ def test_from_python(tmp_path) -> None:
     result = vvgt_cli.convert(ball(), goal={"max_gaussians": 300, "size": 64, "steps": 0})
     result.save(tmp_path / "a.ply")
     found = read_ply(tmp_path / "a.ply")[1].certificate
-    assert found is not None
     assert found.command is None
     assert found.psnr == round(preview_psnr(result.scores), 2)
 

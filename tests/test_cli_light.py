@@ -134,7 +134,6 @@ def test_presets_with_surfaces_and_label_maps_are_lit_unless_told_otherwise() ->
     assert [name for name, light in found.items() if light == MATTE] == list(names[:5])
     assert [name for name, light in found.items() if light is None] == list(names[5:])
     table = load(SourceRequest(labels, labels="auto")).lighting
-    assert table is not None
     assert table.ambient + table.diffuse == 1
     unlit, layer = LightOptions(("none",)), SourceRequest(labels, labels="auto")
     assert load(SourceRequest(scan, tf="ct-bone", light=unlit)).lighting is None

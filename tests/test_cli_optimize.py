@@ -156,7 +156,6 @@ def test_ctrl_c_writes_what_there_is(folder, tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-c", code, "optimize", *map(str, args)], stderr=subprocess.PIPE, env=environment, text=True
     )
-    assert child.stderr is not None
     said = [child.stderr.readline(), child.stderr.readline()]  # read, views: the descent begins
     assert said[1].startswith("views"), said
     time.sleep(5)  # kernels are loaded, on a busy machine too

@@ -110,7 +110,6 @@ def test_what_is_extreme_stays_finite_and_within_its_range():
 @pytest.mark.usefixtures("unbounded")
 def test_harmonics_are_sharpened_as_colours_are():
     gaussians = cloud(300, 6, harmonics=8)
-    assert gaussians.harmonics is not None
     second = replace(gaussians, colors=np.ascontiguousarray(gaussians.harmonics[:, 3]))
     found, beside = sharpened(gaussians, np.ones(300), BOX).harmonics, sharpened(second, np.ones(300), BOX).colors
     np.testing.assert_allclose(found[:, 3], beside, atol=1e-6)

@@ -153,7 +153,6 @@ def shown(*args: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], str
         env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     try:
-        assert child.stdout is not None
         yield child, child.stdout.readline().strip()
     finally:
         child.kill()

@@ -49,7 +49,6 @@ def test_a_mip_is_its_twins() -> None:
     """Value and place are jointly normal: their covariance on the screen gives mean and deviation along a ray."""
     some, eye = cloud(60), camera()
     p, offsets, flat, place = falloffs(some)
-    assert some.live is not None
     along, explained = directions(some)
     spread = some.live[:, SPREAD].astype(np.float64) / (HI - LO) * explained
     axes = twin.rotations(some.quaternions.astype(np.float64)) * np.exp(some.log_scales.astype(np.float64))[:, None]
@@ -73,7 +72,6 @@ def test_a_mip_is_its_twins() -> None:
 def test_an_x_ray_is_its_twins() -> None:
     some, eye = cloud(60), camera()
     table = Table.of_function(RAMP, LO, HI, 2.0, 1e-8)
-    assert some.live is not None
     mass = table.of(some.live)[:, TAU] * some.live[:, LENGTH].astype(np.float64) ** 3
     p, _, flat, place = falloffs(apply_look(some, table))
     area = 2 * np.pi * np.sqrt(np.linalg.det(flat)) * place[:, 2] ** 2 / (eye.fx * eye.fy)

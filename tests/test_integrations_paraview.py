@@ -84,7 +84,6 @@ def series_file(folder: Path) -> Path:
 def ours(path: Path, said: str) -> np.ndarray:
     """Draw a file at the camera that it states, with ParaView's up."""
     gaussians, facts = open_gaussians(str(path))
-    assert facts.camera is not None
     up = [float(v) for v in re.search(r"^up (.*)$", said, re.M)[1].split()]  # type: ignore[index]
     camera = camera_at(facts.camera[:3], facts.camera[3:6], up, facts.camera[6], facts, 300)
     return render(gaussians, camera, rule_of("inria"))

@@ -101,7 +101,6 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
     some = cloud()
-    assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
     shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
@@ -207,7 +206,6 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == facts()
     assert [name for name in header.dtype.names or ()][-6:] == list(COLUMNS)
-    assert back.live is not None
     np.testing.assert_array_equal(back.live[:, :3], some.live[:, :3])  # type: ignore[index]
     axes = [np.sort(np.abs(g.live[:, AXIS])) for g in (back, some)]  # type: ignore[index]
     np.testing.assert_allclose(*axes, atol=1e-6)

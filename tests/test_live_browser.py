@@ -67,7 +67,6 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def table(file: Path, folder: Path, shown: set[int]) -> str:
     header = read_ply(file)[1]
-    assert header.live is not None
     entries = {
         str(e.number): {"name": e.name, "color": e.color, "opacity": e.opacity if e.number in shown else 0}
         for e in header.live.labels

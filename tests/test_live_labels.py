@@ -34,7 +34,6 @@ LABELS = (
 
 def labels_cloud(labels: tuple[Label, ...] = LABELS) -> Gaussians:
     some = cloud()
-    assert some.live is not None
     row = np.arange(len(some)) % len(labels)
     return replace(some, live=np.column_stack([np.zeros((len(some), 2)), some.live[:, 2:], row]))
 
@@ -76,7 +75,6 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == facts()
     assert header.dtype["label"] == np.uint8
-    assert back.live is not None
     np.testing.assert_array_equal(back.live[:, [0, 1, 2, LABEL_ROW]], some.live[:, [0, 1, 2, LABEL_ROW]])  # type: ignore[index]
     many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
     row = np.full(len(some), 299.0)
@@ -187,7 +185,6 @@ def test_cells_do_not_straddle_labels() -> None:
         halves(), vvgt_library.Look(labels="auto"), {"max_gaussians": 800, "size": 48}, live=True
     )
     live, means = result.gaussians.live, result.gaussians.means
-    assert live is not None
     assert set(live[:, LABEL_ROW]) == {0, 1}
     right = (means[:, 0] > 0) == (live[:, LABEL_ROW] == 1)
     assert right.mean() > 0.97
@@ -234,9 +231,7 @@ def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tm
         source = (volume, "--labels", tmp_path / "t.json", "--live", *more, "-o", first, "--overwrite")
         vvgt.ok("convert", *source, *SMALL)
         gaussians, header = read_ply(first)
-        assert header.live is not None
         assert [label.opacity for label in header.live.labels] == [1, 0]
-        assert gaussians.live is not None
         counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(int))
         assert 0.05 < counts[1] / counts.sum() < 0.5
         assert gaussians.opacity_logits[gaussians.live[:, LABEL_ROW] == 1].max() < -10
@@ -270,7 +265,6 @@ def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
     vvgt.ok("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL)
     for file in (label_file, tmp_path / "b.ply"):
         gaussians = read_ply(file)[0]
-        assert gaussians.live is not None
         found.append(
             (gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, LABEL_ROW].astype(int)) / len(gaussians))
         )

@@ -55,7 +55,6 @@ def test_each_layer_is_looked_up_in_its_own_table() -> None:
 def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None:
     """Values over one range, values over another one, and labels."""
     some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
-    assert some.live is not None
     some.live[:, LAYER_ID] = np.arange(60) % 3
     some.live[some.live[:, LAYER_ID] < 2, LABEL_ROW] = 0
     some.live[:, LABEL_ROW] %= len(LABELS)
@@ -144,11 +143,9 @@ def test_layers_lie_where_they_are_in_the_world(pair: Path) -> None:
     """In memory and in blocks."""
     for name in ("live.ply", "blocked.ply"):
         some, header = read_ply(pair / name)
-        assert header.live is not None
         assert [layer.name for layer in header.live.layers] == ["left", "right", "top_label"]
         assert [len(layer.labels) for layer in header.live.layers] == [0, 0, 1]
         live = some.live
-        assert live is not None
         number = live[:, LAYER_ID].astype(int)
         assert (np.bincount(number) > 40).all()
         bright = [np.flatnonzero((number == k) & (live[:, 0] > 0.6)) for k in (0, 1)]
@@ -232,7 +229,6 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
 def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
     vvgt.ok("view", pair / "live.ply", "-o", tmp_path / "a.html")
     found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)
-    assert found is not None
     layers = json.loads(found[1])["live"]["layers"]
     assert [(layer["title"], layer["row"], len(layer["labels"])) for layer in layers] == [
         ("left", 0, 0),
@@ -249,7 +245,6 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
     saved = cloud.with_layers(sent)
     facts = saved.options.live
-    assert facts is not None
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
     assert facts.layers[2].labels[0].opacity == 0.25
     assert facts.layers[2].labels[0].name == "top"
@@ -270,7 +265,6 @@ def test_channels_in_python(tmp_path) -> None:
     tifffile.imwrite(tmp_path / "c.ome.tif", data, metadata={"axes": "ZCYX"}, ome=True)
     with pytest.warns(UserWarning, match="2 channels"):
         result = vvgt_library.convert(str(tmp_path / "c.ome.tif"), None, {"max_gaussians": 400, "size": 48}, live=True)
-    assert result.ply.live is not None
     assert len(result.ply.live.layers) == 2
     other = result.recolor(layers={1: "magma"})
     assert other.ply.function is not None

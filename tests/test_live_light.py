@@ -75,7 +75,6 @@ def test_a_light_turns_with_its_gaussians() -> None:
     some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN), np.array([2.0, -1.0, 0.7])
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
-        assert gaussians.live is not None
         return relight(apply_look(gaussians, table), gaussians.live[:, AXIS], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))

@@ -53,16 +53,13 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
     largest = []
     for k in range(3):
         some, header = read_ply(tmp_path / f"f_{k}.ply")
-        assert header.live is not None
         assert [header.live.lo, header.live.hi] == live["layers"][0]["values"]
         assert list(header.live.histogram) == live["layers"][0]["histogram"]
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
-        assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
         stream = np.zeros((len(some), BYTES), np.uint8)
         stream[:, :ROW] = planes.T
         back = from_bytes(stream, live)
-        assert some.live is not None
         span = live["layers"][0]["values"][1] - live["layers"][0]["values"][0]
         np.testing.assert_allclose(np.sort(back[:, 0]), np.sort(some.live[:, 0]), atol=span / 500)
         np.testing.assert_allclose(np.sort(back[:, 2]), np.sort(some.live[:, 2]), rtol=0.03)
@@ -106,7 +103,6 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
     assert [label["number"] for label in live["layers"][0]["labels"]] == [1, 7, 9]
     for k, rows in enumerate(({0, 1}, {0, 2})):
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
-        assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(BYTES, -1)
         assert set(planes[ROW].tolist()) == rows
 
@@ -159,7 +155,6 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     value, named = several().layers
     first, second = (replace(value, others=(replace(named, labels=some),)) for some in (LABELS[:2], LABELS[1:]))
     both = shared_facts([first, second])
-    assert both is not None
     assert both.layers == (value, replace(named, labels=LABELS))
     for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
         assert shared_facts([first, other]) is None
@@ -167,7 +162,6 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     assert with_shared_labels(layered(4), second, both).live[:, LABEL_ROW].tolist() == [0, 1, 0, 2]  # type: ignore[index]
     other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
     both = shared_facts([first, replace(value, others=(other,))])
-    assert both is not None
     assert [(label.number, label.name) for label in both.others[0].labels] == [
         (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
     ]  # fmt: skip

@@ -41,7 +41,6 @@ def page_of(gaussians: Gaussians, options: PlyOptions, name: str = "a.html") -> 
     assert known is not None
     content = encoded(known, gaussians, options, name)
     found = re.search(rb'id="scene">(.*?)</script>', content, re.S)
-    assert found is not None
     return content, json.loads(found[1])
 
 
@@ -69,7 +68,6 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     live = scene["live"]
     [layer] = live["layers"]
     held = re.search(rb'id="values-0">([^<]+)<', content)
-    assert held is not None
     planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
     stream = np.zeros((600, BYTES), np.uint8)
     stream[:, :ROW] = planes.T
@@ -79,7 +77,6 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     assert sorted(order.tolist()) == list(range(600))
     assert away.min(axis=0).max() < 2e-3
     carried = wanted.take(order).live
-    assert carried is not None
     found = from_bytes(stream, live)
     np.testing.assert_allclose(found[:, 0], carried[:, 0], atol=0.51 * (HI - LO) / 255)
     np.testing.assert_allclose(np.log(found[:, 2]), np.log(carried[:, 2]), atol=0.01)
@@ -180,7 +177,6 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
         pytest.skip("node is not on the path")
     content, scene = page_of(some, laid)
     held = re.search(rb'id="values-0">([^<]+)<', content)
-    assert held is not None
     assert laid.live is not None
     planes, own = gzip.decompress(base64.b64decode(held[1])), planes_of(laid.live)
     wanted = turn(some, "z").take(morton_order(turn(some, "z").means))
@@ -188,8 +184,6 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
     stream[:, :own] = np.frombuffer(planes, np.uint8).reshape(own, -1).T
     carried = wanted.live
     wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
-    assert carried is not None
-    assert wanted.live is not None
     np.testing.assert_array_equal(wanted.live[:, LABEL_ROW:], carried[:, LABEL_ROW:])
     axes = rotations(wanted.quaternions.astype(float)) * np.exp(wanted.log_scales.astype(float))[:, None, :]
     flip = np.array([-1.0, -1, 1])  # the viewer has PLY (x, y, z) at (-x, -y, z)

@@ -63,7 +63,6 @@ def send(url: str, name: str, what: Any, **headers: str) -> tuple[int, bytes]:
 
 def scene_of(url: str) -> dict[str, Any]:
     found = re.search(r'id="scene">(.*?)</script>', ask(url)[1].decode(), re.S)
-    assert found is not None
     return dict(json.loads(found[1]))
 
 
@@ -135,7 +134,6 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         status, saved = send(url, "save", {"file": "ply", "function": FUNCTION})
         live = Cloud.of(saved, "x")
         assert live.live
-        assert live.options.live is not None
         assert live.options.live.baked()["name"] == "mine"
         assert b'"live"' in send(url, "save", {"file": "html", "function": FUNCTION})[1]
         # no function: nothing is at work, and what was made is gone
@@ -329,7 +327,6 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple
     np.testing.assert_allclose(kept.gaussians.colors, apply_light(dark, side).colors, atol=1e-5)
     base = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
     again = saved(light=base).options.light
-    assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)
     assert replace(again, directions=side.directions) == side
     assert saved(light=base | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
@@ -368,7 +365,6 @@ def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Pat
         assert state_of(url)["state"] in ("first", "failed")
         assert controller.shown.wait(120)
         assert "no such file" in state_of(url)["said"]
-        assert controller.error is not None
         assert controller.error.exit_code == 1
 
 

@@ -334,14 +334,14 @@ def test_a_missing_library_names_its_extra(tmp_path, monkeypatch, name, module, 
 @pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF3_64BIT_DATA"])
 def test_netcdf_classic_headers_are_checked_before_the_library(tmp_path: Path, form: str) -> None:
     whole = Path(write_netcdf(tmp_path / "w.nc", format=form)).read_bytes()
-    path, refused = tmp_path / "v.nc", 0
+    path, told = tmp_path / "v.nc", 0
     for at in range(4, 360):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
         try:
             check_header(path)
         except DataError:
-            refused += 1
-    assert refused > 100
+            told += 1
+    assert told > 100
     for cut in range(8, len(whole), 5):
         path.write_bytes(whole[:cut])
         refused(DataError, "NetCDF header", read_volume, str(path))

@@ -52,7 +52,6 @@ class Case:
 def cases() -> list[Case]:
     with tarfile.open(ARCHIVE) as archive:
         table = archive.extractfile("./expected.tsv")
-        assert table is not None
         return [Case.parse(line) for line in table.read().decode().splitlines()]
 
 
