@@ -134,6 +134,12 @@ class CommandLine:
         assert result.code == 0, result.err
         return result
 
+    def fails(self, code: int, *args: object) -> str:
+        """Run a command line that must end with an exit status, and return the one line that says why."""
+        result = self(*args)
+        assert result.code == code, result.err
+        return result.error
+
 
 @pytest.fixture
 def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[CommandLine]:

@@ -61,8 +61,7 @@ def made(folder):
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
     how = (*RAW, "--tf", folder / tf, "--no-conditions", "--json", *more)
-    result = vvgt.ok("evaluate", ply, "--volume", folder / volume, *how)
-    return json.loads(result.out)["certificate"]
+    return json.loads(vvgt.ok("evaluate", ply, "--volume", folder / volume, *how).out)["certificate"]
 
 
 def test_a_line_gives_the_certificate_back() -> None:

@@ -148,8 +148,7 @@ def test_render_writes_views_that_render_again(converted, folder, vvgt):
     ]
     assert read_png("turn/orbit_000.png").shape == (40, 40, 3)
     assert len(read_cameras("turn/transforms.json")) == 3
-    taken = vvgt("render", ply, "--orbit", 3, "--size", 40, "-o", "turn")
-    assert (taken.code, "exists" in taken.error) == (2, True)
+    assert "exists" in vvgt.fails(2, "render", ply, "--orbit", 3, "--size", 40, "-o", "turn")
     vvgt.ok("render", ply, "--camera", "turn/transforms.json", "--size", 20, "-o", "again")
     assert read_png("again/orbit_002.png").shape == (20, 20, 4)
 
@@ -204,9 +203,7 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
     assert near[:, :48].mean((0, 1)) == pytest.approx(middle.mean((0, 1)), rel=0.1)
     assert far[:, :48].mean((0, 1)) != pytest.approx(middle.mean((0, 1)), rel=0.1)
     assert psnr(near[:, :48], near[:, 48:96]) > 20
-    again = vvgt(*options)
-    assert again.code == 2
-    assert "exists" in again.error
+    assert "exists" in vvgt.fails(2, *options)
 
 
 def test_rules_are_the_tables():
@@ -224,8 +221,7 @@ def test_a_scene_without_anything_to_see_is_an_error(folder, vvgt):
     points = [{"x": x, "rgb": [1, 1, 1], "opacity": float(x > 0.5)} for x in (0, 0.5, 0.51, 1)]
     Path("high.json").write_text(json.dumps({"range": [0, 1], "points": points}))
     raw = ("v.raw", "--dims", 9, 9, 9, "--dtype", "float32")
-    result = vvgt("convert", *raw, "--tf", "high.json", *SMALL, "-o", "a.ply")
-    assert (result.code, "nothing visible" in result.error) == (1, True)
+    assert "nothing visible" in vvgt.fails(1, "convert", *raw, "--tf", "high.json", *SMALL, "-o", "a.ply")
     assert not Path("a.ply").exists()
 
 

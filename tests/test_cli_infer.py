@@ -165,16 +165,13 @@ def test_bad_input_gets_one_line_and_leaves_nothing(case, made, tmp_path, vvgt, 
         args[args.index(change) + 1] = value
     else:
         args += [change, value]
-    result = vvgt(*args)
-    assert result.code == code, result.err
-    assert message in result.error
-    assert "internal" not in result.error
+    result = vvgt.fails(code, *args)
+    assert message in result
+    assert "internal" not in result
     assert not list(Path().iterdir())
 
 
 def test_nothing_is_overwritten_unasked(made, tmp_path, vvgt):
     (tmp_path / "out.ply").write_bytes(b"mine")
-    result = vvgt(*call(made, "brighter", tmp_path / "out.ply"))
-    assert result.code == 2
-    assert "--overwrite" in result.error
+    assert "--overwrite" in vvgt.fails(2, *call(made, "brighter", tmp_path / "out.ply"))
     assert (tmp_path / "out.ply").read_bytes() == b"mine"

@@ -103,9 +103,7 @@ def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
         (("--light", "headlight", "--ambient", "nan"), "--ambient nan"),
         (("--light", "headlight", "--shadows"), "--shadows: a headlight casts no visible shadows"),
     ):
-        failed = vvgt("convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
-        assert failed.code == 2
-        assert message in failed.error
+        assert message in vvgt.fails(2, "convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
         assert not (folder / "no.ply").exists()
 
 

@@ -215,6 +215,4 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
         ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "blocks of moments"),
         ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
     ):
-        run = vvgt(command, path, *options)
-        assert run.code == 2, run.err
-        assert word in run.err
+        assert word in vvgt.fails(2, command, path, *options)

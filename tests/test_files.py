@@ -65,8 +65,7 @@ def test_two_equal_series_in_one_folder(tmp_path, vvgt, monkeypatch):
     holder = process(HOLD.replace("a.ply", "manifest.json"), tmp_path)
     assert holder.stdout.readline() == "held\n"
     line = ("convert", "f*.raw", *INIT[2:], "--steps", "0", "-o", "p_{}.ply")
-    result = vvgt(*line)
-    assert (result.code, "manifest.json: another run is at work on it" in result.error) == (2, True)
+    assert "manifest.json: another run is at work on it" in vvgt.fails(2, *line)
     holder.communicate("\n")
     vvgt.ok(*line)
 
@@ -86,8 +85,8 @@ def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     disk = {"f_frsize": 512, "f_blocks": 1000, "f_bavail": 4}
     monkeypatch.setattr(os, "statvfs", lambda folder: SimpleNamespace(**disk))
-    result = vvgt("convert", *INIT[1:], "-o", "a.ply")
-    assert (result.code, "No space left on device: needs 4096 bytes, 2048 are free" in result.error) == (1, True)
+    result = vvgt.fails(1, "convert", *INIT[1:], "-o", "a.ply")
+    assert "No space left on device: needs 4096 bytes, 2048 are free" in result
     disk["f_bavail"] = 8  # enough to begin with; not for the Gaussians that are found
     result = vvgt("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "-o", "a.ply")
     assert (result.code, "No space left on device" in result.error) == (1, True)

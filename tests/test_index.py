@@ -117,8 +117,7 @@ def test_an_index_that_is_none_is_a_line(vvgt, at):
     for text in ("{", '"files": []}', '"schema": 1, "kind": "frames", "files": [{"name": "a", "file": "../a.ply"}]}'):
         Path("bad.json").write_text('{"format": "vvgt-clouds", ' + text)
         for command in (("info", "bad.json"), ("view", "bad.json", "-o", "p.html")):
-            done = vvgt(*command)
-            assert (done.code, "not an index of 'vvgt convert'" in done.error) == (1, True)
+            assert "not an index of 'vvgt convert'" in vvgt.fails(1, *command)
     good = '"schema": 1, "kind": "frames", "files": [{"name": "a", "file": "a.ply"}]}'
     Path("bad.json").write_text('{"format": "vvgt-clouds", ' + good)
     assert "a.ply is missing" in vvgt("view", "bad.json", "-o", "p.html").error

@@ -253,10 +253,9 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):
-        done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
-        assert (done.code, said in done.error) == (code, True), done.error
-    done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
-    assert (done.code, "replace --tf-range" in done.error) == (2, True), done.error
+        assert said in vvgt.fails(code, "recolor", label_file, *more, "-o", tmp_path / "a.ply")
+    done = vvgt.fails(2, "render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
+    assert "replace --tf-range" in done
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 

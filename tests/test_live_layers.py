@@ -173,8 +173,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     for left, gone in zip(without, seen, strict=True):
         assert len(own) - gone <= left < len(own)
     every = ("--layer", hidden, "--layer", f"0,{dark}", "--layer", f"1,{dark}")
-    done = vvgt("recolor", live, *every, "-o", tmp_path / "x.ply")
-    assert (done.code, "not one of" in done.error) == (1, True), done.error
+    assert "not one of" in vvgt.fails(1, "recolor", live, *every, "-o", tmp_path / "x.ply")
     for more, said in (
         (("--tf", "viridis"), "3 layers, each with its own look"),
         (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),
@@ -182,8 +181,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
         (("--layer", "2,tf=viridis"), "carry labels, not values"),
         (("--layer", "0"), "expected LAYER,tf=TF"),
     ):
-        done = vvgt("recolor", live, *more, "-o", tmp_path / "x.ply")
-        assert (done.code, said in done.error) == (2, True), done.error
+        assert said in vvgt.fails(2, "recolor", live, *more, "-o", tmp_path / "x.ply")
     told = json.loads(vvgt("info", live, "--json").out)["live_layers"]
     assert [row["name"] for row in told] == ["left", "right", "top_label"]
     under = json.loads(vvgt("info", live, "--json", "--layer", "1,tf=viridis").out)
@@ -198,8 +196,8 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     for name in ("live.ply", "blocked.ply"):
         done = vvgt.ok("evaluate", pair / name, *source, "--json", "--no-conditions")
         assert json.loads(done.out)["scores"]["psnr"] > 21
-    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
-    assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
+    done = vvgt.fails(2, "evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
+    assert "the Gaussians carry values, values, labels" in done
 
 
 def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tmp_path) -> None:
@@ -222,8 +220,7 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
         number = read_ply(tmp_path / "l.ply")[0].live[:, LAYER_ID]  # type: ignore[index]
         assert (np.bincount(number.astype(int)) > 40).all()
     every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
-    done = vvgt("evaluate", pair / "live.ply", "--volume", *every)
-    assert (done.code, "nothing is visible" in done.error) == (1, True), done.error
+    assert "nothing is visible" in vvgt.fails(1, "evaluate", pair / "live.ply", "--volume", *every)
 
 
 def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:

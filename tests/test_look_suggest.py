@@ -111,9 +111,7 @@ def test_what_cannot_be_suggested(vvgt, tmp_path):
     call = ("tf", "suggest", "example:blob:8", "-o", tmp_path / "a", "-n", 2)
     vvgt.ok(*call)
     (tmp_path / "a" / "band_1.json").write_text("mine")
-    again = vvgt(*call)
-    assert again.code == 2
-    assert "--overwrite" in again.error
+    assert "--overwrite" in vvgt.fails(2, *call)
     assert (tmp_path / "a" / "band_1.json").read_text() == "mine"
     vvgt.ok(*call, "--overwrite")
     assert (tmp_path / "a" / "band_1.json").read_text() != "mine"

@@ -168,8 +168,7 @@ def test_layers_are_nodes_in_one_frame(vvgt, atlas) -> None:
     assert nodes["ctx-lh-superiorfrontal"][0] == ("Splats", "aseg", "Left", "Left cortex")
     for name, centre in (("ct", (44, 44, 44)), ("Left-Hippocampus", CENTRES[17]), ("Right-Hippocampus", CENTRES[53])):
         assert np.abs(middle(atlas / "both.glb", nodes[name][1]) - centre).max() < 4, name
-    each = vvgt(*line, "-o", "x_{}.glb")
-    assert (each.code, "each layer has a frame of its own" in each.error) == (2, True)
+    assert "each layer has a frame of its own" in vvgt.fails(2, *line, "-o", "x_{}.glb")
     vvgt.ok(*line, "-o", "both.html")
 
 
@@ -182,9 +181,8 @@ def test_layers_of_one_name_stay_apart_and_units_must_agree(vvgt, atlas) -> None
     assert sorted(set(groups)) == ["aseg", "aseg 2"]
     assert len(groups) == 2 * len(CENTRES)  # no name twice
     np.save("plain_label.npy", np.eye(28, dtype=np.uint8)[None].repeat(28, 0))
-    refused = vvgt(*line, "--layer", "plain_label.npy,labels=auto")
-    assert refused.code == 1
-    assert "plain_label: its lengths are in no stated unit, those of aseg in mm" in refused.error
+    refused = vvgt.fails(1, *line, "--layer", "plain_label.npy,labels=auto")
+    assert "plain_label: its lengths are in no stated unit, those of aseg in mm" in refused
 
 
 def test_a_label_without_a_name_is_no_root(vvgt, atlas) -> None:

@@ -134,9 +134,8 @@ def test_a_page_opens_at_the_camera_of_the_file(up: str, frame: str) -> None:
 
 @pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1,2,3,1,2,3,40", "1,2,3,4,5,6,180", "1,2,3,4,5,x,40"])
 def test_a_camera_that_is_none_is_refused(vvgt, text: str, tmp_path: Path) -> None:
-    done = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
-    assert done.code == 2
-    assert "expected eye, target" in done.err
+    done = vvgt.fails(2, "convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
+    assert "expected eye, target" in done
 
 
 def test_files_without_an_anatomical_space_use_the_volume_axes(tmp_path: Path) -> None:

@@ -67,9 +67,7 @@ def test_a_peer_is_run_timed_and_scored_beside_ours(vvgt, start, tmp_path) -> No
 )  # fmt: skip
 def test_peers_that_fail_are_one_line_and_leave_no_report(vvgt, tmp_path, command, code, what) -> None:
     few = ("--tf", "viridis", "--size", 16, "--max-gaussians", 4, "--steps", 1)
-    result = vvgt("report", "example:blob:6", *few, "--peer", command, "-o", tmp_path / "out")
-    assert result.code == code
-    assert what in result.error
+    assert what in vvgt.fails(code, "report", "example:blob:6", *few, "--peer", command, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -179,9 +179,8 @@ def test_several_functions_get_a_folder_each(vvgt, tmp_path):
     assert (red[..., 1:3] == 0).all()
     assert red[..., 0].max() > 0.1
     assert other[..., 2].max() > 0.1
-    twice = vvgt("render-views", VOLUME, "--tf", "magma", "--tf", "magma", "-o", tmp_path / "w")
-    assert twice.code == 2
-    assert "would both go to" in twice.error
+    twice = vvgt.fails(2, "render-views", VOLUME, "--tf", "magma", "--tf", "magma", "-o", tmp_path / "w")
+    assert "would both go to" in twice
 
 
 def test_names_of_functions():
@@ -258,17 +257,15 @@ def test_orbit():
     ],
 )
 def test_wrong_calls_get_one_line_and_leave_nothing(vvgt, tmp_path, arguments, code, message):
-    result = vvgt("render-views", VOLUME, *arguments, "-o", tmp_path / "v")
-    assert result.code == code
-    assert message in result.error
+    assert message in vvgt.fails(code, "render-views", VOLUME, *arguments, "-o", tmp_path / "v")
     assert not (tmp_path / "v").exists()
 
 
 def test_options_that_a_file_of_cameras_decides(vvgt, tmp_path, made):
     for option in ("--views", "--test-views", "--fov", "--radius"):
-        result = vvgt("render-views", VOLUME, "--cameras", made / "transforms.json", option, 3, "-o", tmp_path / "v")
-        assert result.code == 2
-        assert option in result.error
+        given = ("--cameras", made / "transforms.json", option, 3, "-o", tmp_path / "v")
+        result = vvgt.fails(2, "render-views", VOLUME, *given)
+        assert option in result
     (tmp_path / "file").write_text("")
     assert "is a file" in vvgt(*BASE, "-o", tmp_path / "file").error
     assert "no directory" in vvgt(*BASE, "-o", tmp_path / "a" / "b").error

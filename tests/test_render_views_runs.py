@@ -92,9 +92,8 @@ def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch
 def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
     tf = '{"points": [{"x": 0.9999, "opacity": 0}, {"x": 1, "opacity": 1e-9, "rgb": [1, 0, 0]}]}'
     (tmp_path / "tf.json").write_text(tf)
-    result = vvgt("render-views", VOLUME, "--tf", tmp_path / "tf.json", *SMALL, "-o", tmp_path / "v")
-    assert result.code == 1
-    assert "visible" in result.error
+    result = vvgt.fails(1, "render-views", VOLUME, "--tf", tmp_path / "tf.json", *SMALL, "-o", tmp_path / "v")
+    assert "visible" in result
     assert not (tmp_path / "v").exists()
 
 
@@ -116,10 +115,9 @@ def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
 def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, message):
     before = stamps(made)
     base = ["render-views", VOLUME, *SMALL, "--background", 1, 0, 0.5]
-    result = vvgt(*base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
-    assert result.code == 2
-    assert message in result.error
-    assert "--overwrite" in result.error
+    result = vvgt.fails(2, *base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
+    assert message in result
+    assert "--overwrite" in result
     assert stamps(made) == before
 
 
@@ -137,15 +135,11 @@ def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
 def test_files_that_no_manifest_knows_are_not_replaced(vvgt, tmp_path):
     (tmp_path / "v").mkdir()
     (tmp_path / "v" / "transforms.json").write_text("mine")
-    result = vvgt(*BASE, "-o", tmp_path / "v")
-    assert result.code == 2
-    assert "transforms.json exists, and no manifest" in result.error
+    assert "transforms.json exists, and no manifest" in vvgt.fails(2, *BASE, "-o", tmp_path / "v")
     assert [path.name for path in (tmp_path / "v").iterdir()] == ["transforms.json"]
     for text in ("{", "[]", '{"format": "other"}', '{"files": {"../x": {"bytes": 1, "sha256": ""}}}'):
         (tmp_path / "v" / "manifest.json").write_text(text)
-        result = vvgt(*BASE, "-o", tmp_path / "v")
-        assert result.code == 1
-        assert "not a manifest" in result.error
+        assert "not a manifest" in vvgt.fails(1, *BASE, "-o", tmp_path / "v")
     assert (tmp_path / "v" / "transforms.json").read_text() == "mine"
 
 

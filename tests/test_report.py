@@ -156,9 +156,7 @@ def test_csv_and_plots_of_a_report(scene_report):
 
 def test_nothing_is_overwritten_unasked(scene_report, vvgt):
     folder, _ = scene_report
-    result = vvgt("report", "example:blob:10", *SMALL, "-o", folder)
-    assert result.code == 2
-    assert "exists; give --overwrite" in result.error
+    assert "exists; give --overwrite" in vvgt.fails(2, "report", "example:blob:10", *SMALL, "-o", folder)
 
 
 def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
@@ -191,9 +189,7 @@ def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
 def test_calls_that_are_wrong(args, message, vvgt, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("{}")
-    result = vvgt(*args)
-    assert result.code == 2
-    assert message in result.error
+    assert message in vvgt.fails(2, *args)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 

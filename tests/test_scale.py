@@ -194,9 +194,8 @@ def test_a_missing_chunk_is_fill_value_and_a_damaged_one_a_line_with_its_index(v
     chunks = chunk_files(source)
     assert len(chunks) == 8
     chunks[5].write_bytes(b"nonsense")
-    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
-    assert run.code == 1
-    assert "chunk (1, 0, 1) (z, y, x) is damaged" in run.err
+    run = vvgt.fails(1, "init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
+    assert "chunk (1, 0, 1) (z, y, x) is damaged" in run
     chunks[5].unlink()
     vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
     values[32:, :32, 32:] = 0
@@ -221,12 +220,10 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
         chosen = ["--level", level] if level else ["--blocks", "auto"]
         run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
         assert f": {grid} uint8" in run.err
-    run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
-    assert run.code == 2
-    assert "expected full, or 0 to 2" in run.err
-    run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
-    assert run.code == 2
-    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run.err
+    run = vvgt.fails(2, "init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
+    assert "expected full, or 0 to 2" in run
+    run = vvgt.fails(2, "init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
+    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
@@ -240,9 +237,7 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     assert "processed in blocks" in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source).err
     assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
-    none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
-    assert none.code == 2
-    assert "MiB more" in none.err
+    assert "MiB more" in vvgt.fails(2, "init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
 
 
 def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
@@ -251,9 +246,7 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
-        run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *options)
-        assert run.code == 2, options
-        assert word in run.err
+        assert word in vvgt.fails(2, "init", raw, "-o", tmp_path / "a.ply", *FIT, *options)
     packed = tmp_path / "v_100x90x80_uint8.raw.gz"
     import gzip
 

@@ -47,9 +47,8 @@ def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path
 
     for z in range(20):
         tifffile.imwrite(tmp_path / f"s{z}.tif", np.zeros((8, 9 if z == 17 else 10), np.uint8))
-    run = vvgt("init", tmp_path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "16")
-    assert run.code == 1
-    assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run.error
+    run = vvgt.fails(1, "init", tmp_path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "16")
+    assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run
 
 
 def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt, tmp_path, monkeypatch):

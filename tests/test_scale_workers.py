@@ -62,14 +62,10 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
     folder, out = tmp_path / "v.blocks", tmp_path / "merged.ply"
     for shard in ("2/3", "3/3"):
         assert "run the same array again" in vvgt.ok("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard).err
-    early = vvgt("merge", folder, "-o", out)
-    assert early.code == 1
-    assert "run the same array again" in early.err
+    assert "run the same array again" in vvgt.fails(1, "merge", folder, "-o", out)
     for shard in ("1/3", "3/3"):
         vvgt.ok("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard)
-    early = vvgt("merge", folder, "-o", out)
-    assert early.code == 1
-    assert "is missing; remove its other files" in early.err
+    assert "is missing; remove its other files" in vvgt.fails(1, "merge", folder, "-o", out)
     assert "all blocks are complete" in vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3").err
     raw.unlink()  # is not needed any more
     vvgt.ok("merge", folder, "-o", out)
@@ -81,17 +77,14 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
 def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):
     folder = tmp_path / "v.blocks"
     vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/2")
-    other = vvgt("init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
-    assert other.code == 2
-    assert "another run (other files, function)" in other.err
-    other = vvgt("init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
-    assert other.code == 2
-    assert "another run (other blocks)" in other.err
+    other = vvgt.fails(2, "init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
+    assert "another run (other files, function)" in other
+    other = vvgt.fails(2, "init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
+    assert "another run (other blocks)" in other
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("x")
-    other = vvgt("init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
-    assert other.code == 2
-    assert "holds no blocks of vvgt" in other.err
+    other = vvgt.fails(2, "init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
+    assert "holds no blocks of vvgt" in other
 
 
 def test_shards_may_start_together(tmp_path, monkeypatch):
@@ -119,13 +112,9 @@ def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
     vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1")
     rows = sorted((folder / "cells").glob("*.rows"), key=lambda path: path.stat().st_size)[-1]
     rows.write_bytes(rows.read_bytes()[:-1000])
-    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
-    assert run.code == 1
-    assert "truncated; remove" in run.err
+    assert "truncated; remove" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     rows.with_suffix(".npz").write_bytes(b"PK nonsense")
-    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
-    assert run.code == 1
-    assert "damaged" in run.err
+    assert "damaged" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -331,9 +320,7 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
     assert "sbatch not found" in run.err
     for name, value in {**variables, "SBATCH_REFUSES": "1"}.items():
         monkeypatch.setenv(name, value)
-    run = vvgt(*call)
-    assert run.code == 2
-    assert "expected --memory" in run.err
+    assert "expected --memory" in vvgt.fails(2, *call)
     run = start(*call, "--memory", "3G", **variables, SBATCH_REFUSES="1")
     said = run.communicate(timeout=300)[1]
     assert (run.returncode, said.count("\n")) == (1, 1), said

@@ -117,9 +117,8 @@ def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
 
 def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
     out = series / "out" / "{:02d}.ply"
-    done = vvgt("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
-    assert done.code == 2
-    assert "--dry-run with frames: a plan is for one volume" in done.err
+    done = vvgt.fails(2, "convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
+    assert "--dry-run with frames: a plan is for one volume" in done
     assert not list((series / "out").iterdir())
 
 
