@@ -1,7 +1,5 @@
 """Volumes at known places: three balls and an F, on grids of any orientation, written in formats that have one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import nibabel as nib

@@ -1,7 +1,5 @@
 """Shared fixtures: the command line in-process, the `long` marker, hypothesis profiles."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

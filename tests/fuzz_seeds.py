@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: small whole files of every format that the package reads by itself."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: DICOM, and conventions on top of HDF5 and Zarr."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

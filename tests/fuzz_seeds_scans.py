@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: formats of neuroimaging, density maps and molecules."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

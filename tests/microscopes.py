@@ -1,7 +1,5 @@
 """Files of microscopes, written by hand where no program at hand writes them (LIF, ND2), else by its library."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

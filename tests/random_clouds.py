@@ -1,7 +1,5 @@
 """Random Gaussians of tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians

@@ -1,7 +1,5 @@
 """Stiff, extreme and odd scenes, and the few helpers that make them: scalar volumes, label maps, colours, layers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

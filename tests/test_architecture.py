@@ -1,7 +1,5 @@
 """The rules of the house: import order of the rooms, sizes of files and functions, where heavy imports sit."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

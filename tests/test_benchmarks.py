@@ -1,7 +1,5 @@
 """Every program of benchmarks/, run on one tiny scene with tiny pictures."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import importlib

@@ -1,7 +1,5 @@
 """Blocks of pixels that stand for a picture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

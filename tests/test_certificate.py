@@ -1,7 +1,5 @@
 """What files say of their own error: written, read from every format, checked against the volume."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """`vvgt check`: its self-test, the stiffness of a scene, and what it prints when cases fail."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """`vvgt check` of files of Gaussians, whatever wrote them: what is found in good ones and in damaged ones."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """The commands end to end on small volumes."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Bad calls and bad input: the exit status, one line, and nothing left behind."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

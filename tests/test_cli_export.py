@@ -1,7 +1,5 @@
 """`vvgt export`: one real export of a tiny network, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

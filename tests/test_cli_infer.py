@@ -1,7 +1,5 @@
 """`vvgt infer` on models built by hand: what is kept, what is dropped, what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

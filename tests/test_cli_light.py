@@ -1,7 +1,5 @@
 """Light on the command line and in the library: files that say what fell on them, degrees, normals, refusals."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of several numbers as people write them, and words that are nearly right."""
 
-from __future__ import annotations
-
 import json
 from itertools import permutations
 from pathlib import Path

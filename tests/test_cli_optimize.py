@@ -1,7 +1,5 @@
 """`vvgt optimize`: nearer to the views, never worse, stopped by budgets and by Ctrl-C with a valid file."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

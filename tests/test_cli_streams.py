@@ -1,7 +1,5 @@
 """Streams that are closed, full or pipes: talk that cannot be heard costs nothing, data that cannot go is one line."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import json

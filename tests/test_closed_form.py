@@ -1,7 +1,5 @@
 """The stage as a whole: invariants, extreme scenes, budgets, and how good the pictures are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

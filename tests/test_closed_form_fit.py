@@ -1,7 +1,5 @@
 """Colours by least squares, and where the image error is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Moments of base cells against a float64 twin in plain numpy, and against integrals with a closed form."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From moments to splats: opacity, rotation, shape, and the offset of opaque surfaces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

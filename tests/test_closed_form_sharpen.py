@@ -1,7 +1,5 @@
 """Colours of the closed form against the blur of its Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

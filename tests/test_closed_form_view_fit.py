@@ -1,7 +1,5 @@
 """Colours and harmonics solved from views together: known ones come back, and what views do not tell stays put."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several clouds from Python: frames, looks and labels as one result, with the bytes of the command line."""
 
-from __future__ import annotations
-
 import html
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `convert` decides to do: limits, estimates, and what is skipped."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

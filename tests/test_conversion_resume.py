@@ -1,7 +1,5 @@
 """Conversions that are ended at every stage and go on: the bytes are those of one that never was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Dask arrays: converted block by block with the bytes of the same array in numpy, and never computed as a whole."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from pathlib import Path

@@ -1,7 +1,5 @@
 """DICOM segmentations, written by highdicom: label maps with their own tables, over their scans; contours refused."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The documentation holds what the program has: a page a command, every option, links that lead somewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

@@ -1,7 +1,5 @@
 """What the pages show runs: Python of docs/python.md, commands of the tutorial and of the how-to, the notebook."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

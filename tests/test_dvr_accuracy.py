@@ -1,7 +1,5 @@
 """What the float64 twin rests on: closed forms, order of convergence; and what the kernel gains over plain stepping."""
 
-from __future__ import annotations
-
 import math
 
 import numba as nb

@@ -1,7 +1,5 @@
 """The ray caster against its float64 twin, closed forms, and hostile volumes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

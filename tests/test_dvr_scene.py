@@ -1,7 +1,5 @@
 """Scenes: stored values of every type, the empty-space map, the optical tables."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numba as nb

@@ -1,7 +1,5 @@
 """Pictures of a volume in blocks: rays cut at pieces of it compose to those of the renderer, whatever the blocks."""
 
-from __future__ import annotations
-
 import json
 import re
 from contextlib import contextmanager

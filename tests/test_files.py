@@ -1,7 +1,5 @@
 """Writing: one run at a time to a name, disks that are full, and what is left where a run is killed."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

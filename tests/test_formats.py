@@ -1,7 +1,5 @@
 """Other programs' formats of Gaussians: what each keeps, what it costs, and what it does with bad input."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import re

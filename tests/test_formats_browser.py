@@ -1,7 +1,5 @@
 """The page of `vvgt view`, and the one in a file, in a real browser that reaches nothing but its own address."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The server of `vvgt view`: what it hands out, and to whom; how it ends."""
 
-from __future__ import annotations
-
 import gzip
 import http.client
 import json

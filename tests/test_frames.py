@@ -1,7 +1,5 @@
 """From files of any orientation to Gaussians, views and back: the right place, the right way round and up."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 from dataclasses import replace

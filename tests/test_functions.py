@@ -1,7 +1,5 @@
 """`vvgt convert` with several transfer functions: one file each, the volume read once."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

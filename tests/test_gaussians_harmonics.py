@@ -1,7 +1,5 @@
 """Spherical harmonics: order and signs of 3DGS, turns and reflections, the .ply, and that nothing loses them."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import replace

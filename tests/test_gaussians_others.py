@@ -1,7 +1,5 @@
 """Gaussians of other programs: rows that cannot be drawn, compressed files of SuperSplat 1, `.splat` and `.ksplat`."""
 
-from __future__ import annotations
-
 import io
 import json
 import warnings

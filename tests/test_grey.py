@@ -1,7 +1,5 @@
 """MIP and X-ray of Gaussians and of volumes, against float64 twins and closed forms."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Optics grids: against the float64 twin, quadrature, the scalar scene that they come from, and themselves turned."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

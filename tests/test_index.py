@@ -1,7 +1,5 @@
 """The index beside several files of Gaussians: one form for frames, functions and labels, read by view and info."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Blender's add-on in Blender itself: imported points in their places and colours, and a Volume object by its ramp."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """napari: layers saved through its own File > Save, by the manifest of the package."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """ParaView's plugin and the Catalyst script, in ParaView itself."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

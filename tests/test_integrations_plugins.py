@@ -1,7 +1,5 @@
 """`vvgt plugin`: every adapter is listed, short, and says how it is enabled."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

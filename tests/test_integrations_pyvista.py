@@ -1,7 +1,5 @@
 """`export_plotter`: what a pyvista.Plotter shows, beside PyVista's own picture."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

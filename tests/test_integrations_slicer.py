@@ -1,7 +1,5 @@
 """3D Slicer: the command as its CLI module, and the scene's nodes through the adapter in Slicer's own Python."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

@@ -1,7 +1,5 @@
 """What is taken from a VTK scene: the functions of a volume property, the volume's place, camera and lights."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled kernels: the same bytes cold and warm, what their code is kept under, damaged and read-only folders."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Memory that is asked for ahead of time: an instruction, and no other effect."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

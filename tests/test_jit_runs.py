@@ -1,7 +1,5 @@
 """What commands have compiled, and what runs where numba is off."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

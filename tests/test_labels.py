@@ -1,7 +1,5 @@
 """Label maps: tables of five programs, recognised volumes, one file a label; RGB and channels are in test_layers."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

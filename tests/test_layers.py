@@ -1,7 +1,5 @@
 """Crops, masks, colours, channels and layers: what adds up, where it lies, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

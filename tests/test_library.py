@@ -1,7 +1,5 @@
 """The library: the same as the commands, for files and for what is in memory."""
 
-from __future__ import annotations
-
 import doctest
 import html
 import json

@@ -1,7 +1,5 @@
 """Light: what is asked for, how samples are shaded and what arrives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

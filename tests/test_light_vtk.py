@@ -1,7 +1,5 @@
 """How VTK's mappers shade, beside ours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Gaussians that carry values, and their look under any function."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Labels, layers and light of live pages in a real browser, by clicking, dragging and typing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

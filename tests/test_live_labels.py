@@ -1,7 +1,5 @@
 """Gaussians that carry the label under them, and their look under any table."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

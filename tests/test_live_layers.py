@@ -1,7 +1,5 @@
 """Live files of several layers or channels: each Gaussian carries its layer's number, and its value or label."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

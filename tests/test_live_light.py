@@ -1,7 +1,5 @@
 """Light on Gaussians that carry values, without the volume."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

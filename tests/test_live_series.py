@@ -1,7 +1,5 @@
 """Live files of a time series: one function and one range for all frames, in files, in Python, and in one page."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

@@ -1,7 +1,5 @@
 """Colour maps of ParaView beside VTK, and those of niivue, MRIcroGL and ImageJ, with their opacity."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

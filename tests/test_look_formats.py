@@ -1,7 +1,5 @@
 """Transfer functions of other programs: ParaView XML, 3D Slicer, Inviwo, vtk.js; and `vvgt tf convert`."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Named functions and contours of densities: what they are over, where they lie on data, in memory and in blocks."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tables of labels: whether A is opacity or transparency, CSV and TSV of several programs, what a table hides."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable

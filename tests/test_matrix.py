@@ -1,7 +1,5 @@
 """Every feature with a volume in memory and in blocks: it works, and the errors of the two agree."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Turntables: every picture is there, in order and in time, and the last leads to the first."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

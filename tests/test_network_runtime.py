@@ -1,7 +1,5 @@
 """The runtime without torch: what it feeds, parts, threads, and models that are not what they must be."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

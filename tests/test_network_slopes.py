@@ -1,7 +1,5 @@
 """Slopes of the image error in each Gaussian's own frame: against differences, and what each column says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from network_models import scene

@@ -1,7 +1,5 @@
 """Curves, windows, pooling and neighbours against plain Python; what the network is given, against the cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

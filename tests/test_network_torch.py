@@ -1,7 +1,5 @@
 """The network in torch: identity at the start, symmetries, attention against a naive twin, gradients everywhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Labels and layers as nodes of one file: the tree, measures in the world, and the Gaussians of the whole."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run that is interrupted and goes on ends with the bytes of one that was not."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

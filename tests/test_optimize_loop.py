@@ -1,7 +1,5 @@
 """Refinement as a whole: it gets nearer, never returns less than it was given, stops when told, repeats to the byte."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

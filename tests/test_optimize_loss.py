@@ -1,7 +1,5 @@
 """Gradients of the loss: against central differences, and SSIM's value against a plain float64 twin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

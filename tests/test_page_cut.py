@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Planes and boxes that cut live pages, dragged in the picture by mouse and by touch, in a real browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What files say of where they are, and what the page's program makes of it."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

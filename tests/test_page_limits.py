@@ -1,7 +1,5 @@
 """Pages at their limits, in a real browser: many labels and frames, one value, no WebGL 2, damaged data."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

@@ -1,7 +1,5 @@
 """The page of Gaussians that carry values: what it holds, and its program's arithmetic against ours."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

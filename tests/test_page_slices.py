@@ -1,7 +1,5 @@
 """Slices of the volume on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

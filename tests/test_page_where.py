@@ -1,7 +1,5 @@
 """Letters, scale bar, ruler, legend, link and picture of pages, in a real browser, as a person uses it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

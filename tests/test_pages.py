@@ -1,7 +1,5 @@
 """Several clouds in one page: frames of a series, functions, labels, files; each with its name, as alone."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

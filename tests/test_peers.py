@@ -1,7 +1,5 @@
 """Other trainers in a report: commands of outside programs, here ones that stand for them."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames of a series that go on from the one before: what stays stays bit for bit, in files, pages and pictures."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Conversions that go on from an earlier one of the same volume: when, how near, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

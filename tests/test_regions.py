@@ -1,7 +1,5 @@
 """Refinement region by region: pictures of parts, levels and large clouds, and what their bytes depend on."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`vvgt report`: all runs end to end; fronts, tables, charts, the page, comparisons."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import io

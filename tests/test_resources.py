@@ -1,7 +1,5 @@
 """Memory and processors are the job's: machine, cgroups at every level, limits of the process, and what was asked."""
 
-from __future__ import annotations
-
 import gzip
 import multiprocessing
 import os

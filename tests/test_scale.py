@@ -1,7 +1,5 @@
 """The closed form in blocks: the same Gaussians as in memory, the same bytes whatever the blocks, workers and order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What blocks read and keep: slices of TIFF page by page, every voxel once, no more than a worker's memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Blocks by shards, processes and Dask's workers: the same bytes, whoever is killed."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`vvgt convert` of a time series: one range for all, resumed by its manifest, in parts."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

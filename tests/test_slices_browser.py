@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Slices of the volume beside the picture, in a real browser, against what nibabel reads from the same file."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

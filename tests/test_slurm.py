@@ -1,7 +1,5 @@
 """The job scripts in `examples`, with the variables that SLURM sets."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

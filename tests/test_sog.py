@@ -1,7 +1,5 @@
 """SOG: what is written against decoding written down pixel by pixel, codebooks against trying all, bad archives."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

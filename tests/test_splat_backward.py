@@ -1,7 +1,5 @@
 """Gradients: the float64 twin against central differences, the kernels against the twin, and the corners of both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The splatter against its float64 twin, the adjointness of `blend` and `gather`, and the corners of both."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`--split-labels`: the files' Gaussians are those of the whole, each once, and what the whole hides is there too."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

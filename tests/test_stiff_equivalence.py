@@ -1,7 +1,5 @@
 """Stiff scenes that do not fit into one block: converted in blocks, live, lit and streamed as they are in memory."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Streamed SOG: what the engine would take from the manifest and its files, errors drawn again, what is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

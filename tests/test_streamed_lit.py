@@ -1,7 +1,5 @@
 """Light on what is written batch by batch: streamed levels and merged shards, against the closed form in memory."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

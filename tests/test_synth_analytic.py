@@ -1,7 +1,5 @@
 """Analytic volumes against their formulas, and as ``example:`` sources."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

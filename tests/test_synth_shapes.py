@@ -1,7 +1,5 @@
 """Shapes: what each has of what it is for; the NRRD that `vvgt synth` writes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The turbulence solver on what is known: Taylor-Green, Arnold's flow, energy balances, order in time, divergence."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Devices that files are made for: what `--for` sets, and how a headset's eyes score it."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

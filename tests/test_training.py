@@ -1,7 +1,5 @@
 """Training: gradients through the splatter, losses, scenes, the loop, and runs that end and go on."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import json

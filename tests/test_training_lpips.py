@@ -1,7 +1,5 @@
 """LPIPS: against a second writing of the formula with torchvision's numbering, and files that are not its weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Labels of `vvgt view`: saved as the page shows them, and converted so."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`vvgt view` of volumes and live files: the page of the live form, conversions for its function, files to save."""
 
-from __future__ import annotations
-
 import http.client
 import io
 import json

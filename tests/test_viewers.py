@@ -1,7 +1,5 @@
 """What web viewers draw, in a real browser, against our pictures by their rules (docs/viewers.md)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """DICOM folders as scanners leave them: scouts, several orientations, dose grids, segmentations, other codings."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

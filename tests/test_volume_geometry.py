@@ -1,7 +1,5 @@
 """Geometry that files state: directions, conventions, units, spellings, decimal commas."""
 
-from __future__ import annotations
-
 import json
 import re
 import warnings

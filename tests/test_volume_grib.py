@@ -1,7 +1,5 @@
 """GRIB written by ecCodes: a linear field on levels, times, scanned either way; read in a process of its own."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any

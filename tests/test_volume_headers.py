@@ -1,7 +1,5 @@
 """Text headers beside or before raw data: NRRD, MetaImage, Inviwo."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import zlib

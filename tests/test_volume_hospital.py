@@ -2,8 +2,6 @@
 copies, nuclear medicine, look-up tables, archives. Beside dcm2niix, SimpleITK and pydicom.
 """
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess

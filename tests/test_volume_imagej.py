@@ -1,7 +1,5 @@
 """TIFF of ImageJ: voxel sizes that are half known, and stacks with one directory for all planes."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """NRRD and MetaImage files of SimpleITK and VTK, as VTK's own readers and SimpleITK have them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arrays with named axes: HDF5, NetCDF, Zarr and NumPy, written by their own libraries."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import sys

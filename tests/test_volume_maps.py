@@ -1,7 +1,5 @@
 """Density maps: MRC against mrcfile, cube and OpenDX against numpy; place, types, byte orders, stacks, damage."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import tracemalloc

@@ -1,7 +1,5 @@
 """VTK meshes and grids, written by VTK: resampled, checked against a field that is linear in position."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CZI, LIF, ND2, Imaris and N5: values, place, channels, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 import warnings

@@ -1,7 +1,5 @@
 """Byte order marks before headers, names in another case than files have, and what unread formats are told."""
 
-from __future__ import annotations
-
 import gzip
 import itertools
 from pathlib import Path

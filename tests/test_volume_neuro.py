@@ -1,7 +1,5 @@
 """MGH, Analyze and MINC against nibabel and the files of MINC's own tools that it brings; sequences of 3D Slicer."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """AFNI and Philips PAR/REC: against nibabel, by headers that come with it, and against the formula in the headers."""
 
-from __future__ import annotations
-
 import gzip
 import re
 import sys

@@ -1,7 +1,5 @@
 """NIfTI against nibabel: types, byte orders, scaling, geometry, series."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 

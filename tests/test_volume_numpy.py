@@ -1,7 +1,5 @@
 """Headers of NumPy's files that numpy itself stumbles over."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.refused import refused

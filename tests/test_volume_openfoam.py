@@ -1,7 +1,5 @@
 """OpenFOAM cases that stop or go on in their processor folders, and cases with fields that VTK cannot read."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

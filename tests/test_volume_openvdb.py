@@ -1,7 +1,5 @@
 """OpenVDB files that OpenVDB 10 wrote (tests/fixtures/vdb/write_vdb.cc), against the values that it read from them."""
 
-from __future__ import annotations
-
 import copy
 import shutil
 import struct
@@ -39,7 +37,7 @@ class Case:
     raw: str
 
     @classmethod
-    def parse(cls, line: str) -> Case:
+    def parse(cls, line: str) -> "Case":
         f = line.split("\t")
         numbers = [tuple(float(v) for v in f[k : k + 3]) for k in (7, 10)]
         return cls(f[0], f[1], f[2], int(f[3]), tuple(map(int, f[4:7])), numbers[0], numbers[1], f[13])

@@ -1,7 +1,5 @@
 """Slices as pictures, the numbers in the names of slices, and voxel sizes in the logs of scanners."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings

@@ -1,7 +1,5 @@
 """Raw volumes: layouts from names and options, sizes, standard input."""
 
-from __future__ import annotations
-
 import gzip
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a format is found, what an option may do to it, and how errors read."""
 
-from __future__ import annotations
-
 import gzip
 import subprocess
 import sys

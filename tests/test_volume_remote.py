@@ -1,7 +1,5 @@
 """Zarr behind an address: an OME-Zarr on a server of this machine, whole, in blocks, and lazily by xarray and Dask."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json

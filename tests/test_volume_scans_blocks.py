@@ -1,7 +1,5 @@
 """Maps and scans in blocks: the same Gaussians as in memory; what their files hold, and their time steps."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Callable

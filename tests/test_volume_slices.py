@@ -1,7 +1,5 @@
 """Volumes as many files: DICOM series, TIFF slices, NRRD with several data files."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import sys

@@ -1,7 +1,5 @@
 """Statistics against numpy, for every type, with scaling, NaN and memory."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

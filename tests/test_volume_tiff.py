@@ -1,7 +1,5 @@
 """TIFF as microscopes write it: axes, channels, time steps and sizes of OME-TIFF and ImageJ, several series."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import struct

@@ -1,7 +1,5 @@
 """VASP's grids, written as VASP's wiki has them: cell, scale, factors of values, blocks of spin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

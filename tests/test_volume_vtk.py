@@ -1,7 +1,5 @@
 """VTK's image formats, written by VTK (or by hand where VTK cannot write them), SLC and TIFF."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

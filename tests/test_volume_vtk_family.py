@@ -1,7 +1,5 @@
 """Indexes of VTK files, and other programs' files that VTK reads (tests/vtk_files.py): places, values, steps."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """`.pvti`: pieces as blocks, the same volume as the `.vti` of the same field, whatever is wrong with a piece."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from pathlib import Path

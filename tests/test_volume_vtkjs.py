@@ -1,7 +1,5 @@
 """vtk.js folders, written by VTK."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

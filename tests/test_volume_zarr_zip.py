@@ -1,7 +1,5 @@
 """Zarr in zip files, written by zarr's ZipStore and by zipping folders: the same as the folder."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

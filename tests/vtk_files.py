@@ -4,8 +4,6 @@ Each function writes into a folder and returns the file to open. Values of step 
 the ramp at their centres.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
