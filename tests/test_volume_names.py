@@ -24,7 +24,7 @@ def mark(path: Path) -> None:
     path.write_bytes(MARK + path.read_bytes())
 
 
-@pytest.mark.parametrize(("mode", "packed", "coded"), itertools.product(range(3), (False, True), (False, True)))
+@pytest.mark.parametrize(("mode", "packed", "coded"), [*itertools.product(range(3), (False, True), (False, True))])
 def test_marked_images_of_vtk_are_as_vtk_reads_them(tmp_path: Path, mode: int, packed: bool, coded: bool) -> None:
     path, image = tmp_path / "v.vti", files.image()
     writer = vtkXMLImageDataWriter()
