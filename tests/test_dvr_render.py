@@ -9,6 +9,7 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.reference import march
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
@@ -116,6 +117,8 @@ def test_a_linear_ramp_of_extinction_is_exact_at_steps_that_meet_the_voxels(step
     depth = peak * (0.5 * (n - 1) + 0.5)  # the ramp between the centres, and the rim of value 1; voxels of edge 1
     image = render_view(scene, camera(1, 1, (-5, 0, 0)), RenderSettings(step=step, samples=1))
     assert abs(image[0, 0, 3] + math.expm1(-depth)) < 1e-6
+    twin = march(scene, np.array([-5.0, 0, 0]), np.array([[1.0, 0, 0]]), step)[0]
+    assert twin[3] == pytest.approx(-math.expm1(-depth), abs=1e-12)
     np.testing.assert_allclose(image[0, 0, :3], image[0, 0, 3] * np.array([1, 0.5, 0.25]), rtol=1e-6)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests import anatomy
+from tests.random_clouds import turns
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
@@ -127,14 +128,8 @@ def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:
 def covariance(cloud: Gaussians, centre: np.ndarray) -> np.ndarray:
     """Of all Gaussians within 8 mm, their own extents included."""
     near = cloud.take(np.flatnonzero(np.linalg.norm(cloud.means - centre, axis=1) < 8))
-    w, x, y, z = (near.quaternions / np.linalg.norm(near.quaternions, axis=1, keepdims=True)).T.astype(float)
-    rotation = np.array(
-        [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
-    ).transpose(2, 0, 1)  # fmt: skip
-    sigma = np.exp(near.log_scales.astype(float))
-    own = np.einsum("kab,kb,kcb->kac", rotation, sigma**2, rotation)
+    turned, sigma = turns(near.quaternions), np.exp(near.log_scales.astype(float))
+    own = np.einsum("kab,kb,kcb->kac", turned, sigma**2, turned)
     mass = sigma.prod(axis=1) / (1 + np.exp(-near.opacity_logits.astype(float)))
     away = near.means - np.average(near.means, axis=0, weights=mass)
     return np.average(own + away[:, :, None] * away[:, None, :], axis=0, weights=mass)

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from tests.random_clouds import turns
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import SH_C0, Gaussians, PlyOptions, as_stored, describe, in_unit_frame, read_ply, write_ply
@@ -126,17 +127,7 @@ def test_a_path_is_written_like_a_stream(tmp_path):
 
 
 def covariance(gaussians):
-    q = gaussians.quaternions.astype(float)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    w, x, y, z = q.T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)  # (K, 3, 3)
-    scaled = rotation * np.exp(gaussians.log_scales.astype(float))[:, None, :]
+    scaled = turns(gaussians.quaternions.astype(float)) * np.exp(gaussians.log_scales.astype(float))[:, None, :]
     return scaled @ scaled.transpose(0, 2, 1)
 
 

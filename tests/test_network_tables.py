@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.random_clouds import extreme_cloud, random_cloud
+from tests.random_clouds import extreme_cloud, random_cloud, turns
 from tests.refused import refused
 from vvgt_cli.cameras import default_views, farthest_cameras
 from vvgt_cli.cameras.quaternions import quaternion
@@ -135,14 +135,8 @@ def test_matrices_project_as_the_cameras_do():
 def test_poses_hold_translation_rotation_and_field_of_view():
     camera = default_views("check")[1]
     pose = view_arrays([camera])["poses"][0]
-    w, x, y, z = pose[3:7]
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    assert np.allclose(rotation, camera.rotation, atol=1e-6)
-    assert w >= 0
+    assert np.allclose(turns(pose[None, 3:7])[0], camera.rotation, atol=1e-6)
+    assert pose[3] >= 0
     assert np.allclose(pose[7:], np.radians(40))
     assert np.allclose(np.abs(quaternion(np.diag([-1.0, 1.0, -1.0]))), [0, 0, 1, 0], atol=1e-12)
 

@@ -121,20 +121,25 @@ def test_nodes_are_those_of_the_function(tf: TransferFunction) -> None:
     np.testing.assert_allclose(colors, tf.color(x), atol=5e-2 if tf is LAB else 2e-4)
 
 
-@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
-def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
+def by_the_page(tf: TransferFunction, folder: Path, names: str, code: str) -> str:
+    """Run code with functions of the page's table in node; return what it prints."""
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
     _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
     program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
-    (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
-    (tmp_path / "run.mjs").write_text(
-        f"import {{ sumsOf, texelsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
-        "const all = JSON.parse(fs.readFileSync('live.json')), live = { ...all, ...all.layers[0] };\n"
-        "const sums = sumsOf(live.nodes, live);\n"
-        "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
+    (folder / "run.mjs").write_text(
+        f"import {{ {names} }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
+        f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n{code}\n"
     )
-    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
+    return subprocess.run(
+        ["node", "run.mjs"], cwd=folder, check=True, timeout=120, capture_output=True, text=True
+    ).stdout
+
+
+@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
+def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
+    write = "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));"
+    by_the_page(tf, tmp_path, "sumsOf, texelsOf", f"const sums = sumsOf(live.nodes, live);\n{write}")
     wanted = Table.of_function(tf, LO, HI, 0.05, GRAIN).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums, wanted, atol=2e-4 * wanted[..., 3].max())
@@ -145,19 +150,11 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
 def test_the_pages_program_exposes_an_x_ray_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
-    if not shutil.which("node"):
-        pytest.skip("node is not on the path")
-    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
-    program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
-    (tmp_path / "run.mjs").write_text(
-        f"import {{ exposed, sumsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
-        f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n"
-        "const found = exposed(live.nodes, live);\n"
-        "fs.writeFileSync('sums', sumsOf(live.nodes, found));\nconsole.log(found.unit_distance);\n"
-    )
-    done = subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120, capture_output=True)
+    told = "const found = exposed(live.nodes, live);\nconsole.log(found.unit_distance);"
+    write = "fs.writeFileSync('sums', sumsOf(live.nodes, found));"
+    found = by_the_page(tf, tmp_path, "exposed, sumsOf", f"{told}\n{write}")
     distance = exposed_distance(tf, facts(tf).statistics(), 2.0)
-    assert float(done.stdout) == pytest.approx(distance, rel=1e-6)
+    assert float(found) == pytest.approx(distance, rel=1e-6)
     wanted = Table.of_function(tf, LO, HI, distance, NO_GRAIN * facts(tf).grain).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums[..., 3:], wanted[..., 3:], atol=2e-3 * wanted[..., 3].max())

@@ -56,23 +56,23 @@ def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, 
     assert [p.name for p in tmp_path.iterdir() if "blocks" in p.name] == []
 
 
-@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "60000"])
-def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    fit = ("--max-gaussians", budget, "--size", "100", "-q")
+def in_memory_and_in_blocks(vvgt, raw, folder, *fit):
+    one, other = folder / "a.ply", folder / "b.ply"
     vvgt.ok("init", raw, "-o", one, *fit)
     vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")
-    assert same_gaussians(one, other)
+    return one, other
+
+
+@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "60000"])
+def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
+    fit = ("--max-gaussians", budget, "--size", "100", "-q")
+    assert same_gaussians(*in_memory_and_in_blocks(vvgt, raw, tmp_path, *fit))
 
 
 def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    fit = ("--max-gaussians", "100000", "--size", "100", "-q")
-    vvgt.ok("init", raw, "-o", one, *fit)
-    vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")
     both = []
-    for path in (one, other):
+    for path in in_memory_and_in_blocks(vvgt, raw, tmp_path, "--max-gaussians", "100000", "--size", "100", "-q"):
         found = read_ply(path)[0]
         both.append(found.take(np.lexsort(found.means.T)))
     assert len(both[0]) == len(both[1]) > 65536
@@ -154,10 +154,7 @@ def store(kind, path, values, chunks=(16, 20, 24)):
 @pytest.mark.parametrize("kind", ["zarr2", "zarr3", "hdf5"])
 def test_chunked_files_are_read_in_blocks(vvgt, tmp_path, kind):
     source = store(kind, tmp_path, bodies().astype(np.float32))
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    vvgt.ok("init", source, "-o", one, *FIT)
-    vvgt.ok("init", source, "-o", other, *FIT, "--blocks", "32")
-    assert same_gaussians(one, other)
+    assert same_gaussians(*in_memory_and_in_blocks(vvgt, source, tmp_path, *FIT))
 
 
 def test_axes_of_an_array_in_a_file_are_turned_as_in_memory(tmp_path):

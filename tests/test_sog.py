@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.random_clouds import turns
 from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.sog import (
@@ -112,13 +113,7 @@ def test_every_pixel_decodes_as_in_the_engine(degree: int) -> None:
 
 
 def matrices(quaternions: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    turn = np.moveaxis(np.array(rows), 2, 0)
+    turn = turns(quaternions)
     return (turn * np.exp(2 * log_scales)[:, None]) @ turn.transpose(0, 2, 1)
 
 
