@@ -8,8 +8,9 @@ import pytest
 from vvgt_cli.errors import VvgtError
 
 
-def refused(error: type[VvgtError], match: str, function: Callable[..., Any], *args: Any, **options: Any) -> None:
-    """Require that a call raises an error whose message, one line, holds a pattern."""
+def refused(error: type[VvgtError], match: str, function: Callable[..., Any], *args: Any, **options: Any) -> str:
+    """Require that a call raises an error whose message, one line, holds a pattern; return the message."""
     with pytest.raises(error, match=match) as caught:
         function(*args, **options)
     assert "\n" not in str(caught.value)
+    return str(caught.value)

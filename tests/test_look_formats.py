@@ -10,6 +10,7 @@ import pytest
 from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
 from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.look import read_transfer_function, unit_distance
 from vvgt_cli.look.lighting import Lighting
@@ -264,10 +265,7 @@ def test_inviwo_mask_and_data_values(file) -> None:
 )  # fmt: skip
 def test_faulty_files_are_one_clear_line(file, content, name: str, message: str) -> None:
     path = file(content, name)
-    with pytest.raises(DataError, match=message) as caught:
-        read_transfer_function(path)
-    assert path in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert path in refused(DataError, message, read_transfer_function, path)
 
 
 def test_presets_that_do_not_exist(file) -> None:

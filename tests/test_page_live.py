@@ -131,9 +131,7 @@ def by_the_page(tf: TransferFunction, folder: Path, names: str, code: str) -> st
         f"import {{ {names} }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
         f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n{code}\n"
     )
-    return subprocess.run(
-        ["node", "run.mjs"], cwd=folder, check=True, timeout=120, capture_output=True, text=True
-    ).stdout
+    return subprocess.check_output(["node", "run.mjs"], cwd=folder, timeout=120, text=True)
 
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])

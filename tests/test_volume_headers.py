@@ -143,9 +143,7 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
 )
 def test_nrrd_lies(tmp_path: Path, fields: dict, message: str) -> None:
     source = write(tmp_path / "v.nrrd", nrrd(fields, VALUES.astype("<i2").tobytes()))
-    with pytest.raises(DataError, match=message) as caught:
-        read_volume(source)
-    assert "\n" not in str(caught.value)
+    refused(DataError, message, read_volume, source)
 
 
 def test_gzip_bomb_is_refused_before_unpacking(tmp_path: Path) -> None:

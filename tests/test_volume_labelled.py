@@ -361,6 +361,4 @@ def test_names_with_line_breaks_are_listed_in_one_line(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "v.h5", "w") as file:
         for name in ("a\nb", "c"):
             file[name] = np.zeros((2, 3, 4))
-    with pytest.raises(UsageError, match=r"several datasets: /a\?b \(2, 3, 4\)") as raised:
-        read_volume(str(tmp_path / "v.h5"))
-    assert "\n" not in str(raised.value)
+    refused(UsageError, r"several datasets: /a\?b \(2, 3, 4\)", read_volume, str(tmp_path / "v.h5"))
