@@ -380,26 +380,10 @@ def readers() -> dict[str, list[Seed]]:
     from fuzz_seeds_scans import scans
 
     return {
-        "raw": raw(),
-        "NRRD": nrrd(),
-        "MetaImage": metaimage(),
-        "Inviwo": inviwo(),
-        **scans(),
-        **hospital(),
-        "SLC": slc(),
-        "TIFF": tiff(),
-        "VTK legacy": vtk_legacy(),
-        "VTK XML": vti(),
-        "OpenVDB": vdb(),
-        "NumPy": numpy_files(),
-        "transfer function": transfer(),
-        "colour map": colormaps(),
-        "label table": label_tables(),
-        "Gaussians": ply(),
-        "Gaussians of others": others(),
-        "SOG": sog(),
-        "view set": cameras(),
-        "model card": model_card(),
-        "manifest of views": manifest(),
+        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), **scans(), **hospital(),
+        "SLC": slc(), "TIFF": tiff(), "VTK legacy": vtk_legacy(), "VTK XML": vti(), "OpenVDB": vdb(),
+        "NumPy": numpy_files(), "transfer function": transfer(), "colour map": colormaps(),
+        "label table": label_tables(), "Gaussians": ply(), "Gaussians of others": others(), "SOG": sog(),
+        "view set": cameras(), "model card": model_card(), "manifest of views": manifest(),
         "checkpoint": checkpoint(),
-    }
+    }  # fmt: skip

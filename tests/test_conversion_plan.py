@@ -315,15 +315,8 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=10.0))
     assert names(report) == [
-        "read",
-        "scene",
-        "closed form",
-        "check views",
-        "write",
-        "test views",
-        "conditions",
-        "certificate",
-    ]
+        "read", "scene", "closed form", "check views", "write", "test views", "conditions", "certificate",
+    ]  # fmt: skip
     assert report.gaussians <= 400 // 8
     assert [name for name, _ in report.skipped[:2]] == ["cells by error", "refinement"]
     assert "Gaussians" in report.skipped[2][0]

@@ -23,12 +23,9 @@ MODERATE = st.floats(-(2.0**100), 2.0**100, width=32)
 def random_gaussians(count=50, seed=0):
     rng = np.random.default_rng(seed)
     return Gaussians(
-        rng.uniform(-1, 1, (count, 3)),
-        rng.normal(-4, 1, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(size=count),
-        rng.uniform(-0.5, 2, (count, 3)),
-    )
+        rng.uniform(-1, 1, (count, 3)), rng.normal(-4, 1, (count, 3)), rng.normal(size=(count, 4)),
+        rng.normal(size=count), rng.uniform(-0.5, 2, (count, 3)),
+    )  # fmt: skip
 
 
 def written(gaussians, **options):

@@ -111,16 +111,8 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
         ball = np.exp(-(((x - 5 * k) / 6) ** 2 + (y / 4) ** 2 + (z / 7) ** 2)).astype(np.float32)
         np.save(tmp_path / f"f{k}.npy", ball)
     source = [
-        "convert",
-        str(tmp_path / "f?.npy"),
-        "--tf",
-        "viridis",
-        "--live",
-        "--max-gaussians",
-        "6000",
-        "--size",
-        "300",
-    ]
+        "convert", str(tmp_path / "f?.npy"), "--tf", "viridis", "--live", "--max-gaussians", "6000", "--size", "300",
+    ]  # fmt: skip
     assert run([*source, "--quiet", "-o", str(tmp_path / "all.html")]) == 0
     assert run([*source, "--quiet", "-o", str(tmp_path / "f_{}.ply")]) == 0
     wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]

@@ -10,14 +10,9 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume, shapes
 
 ALL = [
-    shapes.marschner_lobb,
-    shapes.blob,
-    shapes.slab,
-    shapes.sphere,
-    shapes.checkerboard,
-    shapes.constant,
+    shapes.marschner_lobb, shapes.blob, shapes.slab, shapes.sphere, shapes.checkerboard, shapes.constant,
     shapes.random_field,
-]
+]  # fmt: skip
 
 
 def centres(volume: Volume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

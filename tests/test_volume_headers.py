@@ -14,17 +14,9 @@ from vvgt_cli.volume import ReadOptions, read_volume
 
 VALUES = np.random.default_rng(1).integers(-30000, 30000, (3, 4, 5), np.int16)
 NRRD_TYPES = {
-    "int8": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "unsigned short": "u2",
-    "int": "i4",
-    "uint32": "u4",
-    "long long int": "i8",
-    "uint64": "u8",
-    "float": "f4",
-    "double": "f8",
-}
+    "int8": "i1", "uchar": "u1", "short": "i2", "unsigned short": "u2", "int": "i4", "uint32": "u4",
+    "long long int": "i8", "uint64": "u8", "float": "f4", "double": "f8",
+}  # fmt: skip
 
 
 def nrrd(fields: dict[str, object], data: bytes = b"") -> bytes:
@@ -169,12 +161,9 @@ def test_data_file_may_not_leave_through_a_link(tmp_path: Path) -> None:
 
 def meta(fields: dict[str, object]) -> bytes:
     base: dict[str, object] = {
-        "ObjectType": "Image",
-        "NDims": 3,
-        "DimSize": "5 4 3",
-        "ElementType": "MET_SHORT",
+        "ObjectType": "Image", "NDims": 3, "DimSize": "5 4 3", "ElementType": "MET_SHORT",
         "ElementDataFile": "v.raw",
-    }
+    }  # fmt: skip
     merged = {k: v for k, v in (base | fields).items() if v is not None}
     last = merged.pop("ElementDataFile", None)
     lines = [f"{k} = {v}\n" for k, v in merged.items()]

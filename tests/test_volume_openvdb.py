@@ -88,18 +88,8 @@ def test_the_fixtures_hold_what_is_claimed() -> None:
     found = cases()
     codecs = {"none.vdb", "none_mask.vdb", "zip.vdb", "zip_mask.vdb", "blosc.vdb", "blosc_mask.vdb"}
     kinds = {
-        "float",
-        "half",
-        "double",
-        "half double",
-        "int32",
-        "int64",
-        "bool",
-        "vec3s",
-        "half vec3s",
-        "vec3d",
-        "vec3i",
-    }
+        "float", "half", "double", "half double", "int32", "int64", "bool", "vec3s", "half vec3s", "vec3d", "vec3i",
+    }  # fmt: skip
     assert {(c.file, c.grid) for c in found} >= {(codec, kind) for codec in codecs for kind in kinds}
     assert ARCHIVE.stat().st_size < 600_000
 
@@ -228,13 +218,8 @@ def test_a_bomb_is_not_unpacked() -> None:
 def test_a_blosc_block_that_lies(change: dict, message: str) -> None:
     stream = bytes([0x1F, 7, 1, 0, 44]) + bytes(20)
     told = {
-        "flags": 0x31,
-        "typesize": 4,
-        "nbytes": 64,
-        "blocksize": 64,
-        "cbytes": 24 + len(stream),
-        "start": 20,
-    } | change
+        "flags": 0x31, "typesize": 4, "nbytes": 64, "blocksize": 64, "cbytes": 24 + len(stream), "start": 20,
+    } | change  # fmt: skip
     head = struct.pack("<4B3I", 2, 1, *(told[k] for k in ("flags", "typesize", "nbytes", "blocksize", "cbytes")))
     data = head + struct.pack("<Ii", told["start"], len(stream)) + stream
     refused(DataError, message, codec.read_block, packed(data), 64, codec.BLOSC)
