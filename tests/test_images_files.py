@@ -73,7 +73,8 @@ def test_cut_or_foreign_files_are_data_errors(tmp_path, keep):
     for name, read in (("a.exr", read_exr), ("a.png", read_png)):
         path = tmp_path / name
         path.write_bytes(path.read_bytes()[:keep])
-        refused(DataError, name, read, path)
+        with pytest.raises(DataError, match=name):  # OpenEXR says it in two lines
+            read(path)
         refused(DataError, "no such file", read, tmp_path / ("none_" + name))
 
 
