@@ -290,8 +290,8 @@ def test_a_run_that_ends_among_its_scores_leaves_the_whole_file(vvgt, folder, tm
 
     monkeypatch.setattr(ViewingConditions, "run", end)
     how = SMALL[: 4 if more else 6]
-    more = ("--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name)
-    result = vvgt("convert", folder / "ball.raw", *RAW, *more)
+    words = ("--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name)
+    result = vvgt("convert", folder / "ball.raw", *RAW, *words)
     assert result.code == 130
     assert "complete; scoring next" in result.err
     assert os.listdir(tmp_path) == [name]
