@@ -1,12 +1,12 @@
 """MIP and X-ray of live files by the command and by their pages, beside the volume's own: docs/live.md.
 
-python benchmarks/grey.py SCENES.tsv DATA FUNCTIONS --pictures FOLDER -o grey.csv [--scene NAME] [--gaussians N]
+python benchmarks/grey.py SCENES.tsv DATA FUNCTIONS [--pictures FOLDER] -o grey.csv [--scene NAME] [--gaussians N]
     [--size PX] [--no-page]
 python benchmarks/grey.py --table grey.csv
 
-Needs Chromium, node and npm, as `make viewers` does. FOLDER keeps the files and every picture. "command" and "page" are
-PSNR in dB against `vvgt render VOLUME --rule mip` (or xray), first view of an orbit; "agreement" that of the two.
-WebGL in software takes minutes a page at 1080 px, and seconds at 400.
+Needs Chromium, node and npm, as `make viewers` does. FOLDER (out/grey) keeps the files and every picture. "command" and
+"page" are PSNR in dB against `vvgt render VOLUME --rule mip` (or xray), first view of an orbit; "agreement" that of the
+two. WebGL in software takes minutes a page at 1080 px, and seconds at 400.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ def drawn(out: Path, rule: str, size: int, *file: object) -> np.ndarray:
 @click.option("--gaussians", default=300_000)
 @click.option("--size", default=1080)
 @click.option("--page/--no-page", "paged", default=True)
-@click.option("--pictures", "folder", type=click.Path(path_type=Path))
+@click.option("--pictures", "folder", default="out/grey", type=click.Path(path_type=Path, resolve_path=True))
 @click.option("--table", "table")
 def main(
     paths: tuple[str, ...], output: str | None, names: tuple[str, ...], gaussians: int, size: int, paged: bool,
-    folder: Path | None, table: str | None,
+    folder: Path, table: str | None,
 ) -> None:  # fmt: skip
     """See the module."""
-    if table or folder is None:
-        print_table(table or "")
+    if table:
+        print_table(table)
         return
     folder.mkdir(parents=True, exist_ok=True)
     listing, data, functions = map(Path, paths)

@@ -34,7 +34,6 @@ from closed_form import read_options, scene_rows
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
-from vvgt_cli.commands.synth import TURNOVER, Solver, fields, flow_of, run
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -49,6 +48,7 @@ from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.volume.medical.nrrd import write_nrrd
 from vvgt_cli.volume.shapes import make_shape, volume_of
+from vvgt_cli.volume.turbulence import TURNOVER, Solver, advance, fields, flow_of
 
 GRID, SIZES = 64, (96, 128, 160)
 KINDS = ("shells", "tubes", "plates", "noise", "wells", "bodies", "bodies")  # the last twice, other seeds
@@ -80,7 +80,7 @@ def turbulence(folder: Path, kind: str, grid: int, seed: int, turnovers: list[fl
     solver = Solver(flow_of(kind, grid))
     state = solver.start(seed)
     for number, turnover in enumerate(turnovers):
-        state = run(solver, state, TURNOVER * turnover)
+        state = advance(solver, state, TURNOVER * turnover)
         Console().message(f"{kind} {seed}, snapshot {number}: E {solver.energy(state):.3f}, "
                     f"dissipation {solver.dissipation(state):.3f}")  # fmt: skip
         for field, values in fields(solver, state).items():

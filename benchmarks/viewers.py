@@ -40,6 +40,7 @@ VIEWERS = {  # page of tests/viewers: rule, options of the page, formats that it
     "spark": ("spark", "", (".ply", ".compressed.ply", ".spz", ".sog")),
     "three": ("three", "stored", (".ply", ".spz", ".glb")),
     "babylon": ("babylon", "", (".ply", ".compressed.ply", ".spz", ".sog", ".glb")),
+    "cesium": ("cesium", "", (".spz",)),
     "splats3d": ("viser", "", (".ply", ".compressed.ply")),
     "gsplatjs": ("viser", "", (".ply",)),
 }

@@ -71,7 +71,8 @@ gaussian = Gaussians(np.zeros((1, 3)), np.full((1, 3), -3.0), np.eye(1, 4), np.z
 camera = default_views("test", 1, size=16)[0]
 render(gaussian, camera)  # loads the kernels
 ready, rng, number = threading.Event(), random.Random(0), getattr(signal, sys.argv[1])
-main.COMMANDS["often"], sys.modules["often"] = "often", types.SimpleNamespace(command=command)
+main.COMMANDS.append("often")
+sys.modules["vvgt_cli.cli.often"] = types.SimpleNamespace(command=command)
 process._listen = lambda reader: None  # nothing but what is raised ends a run
 signal.signal(signal.SIGINT, signal.default_int_handler)
 process.end_on_signals()

@@ -277,7 +277,7 @@ def test_hidden_cells_are_dropped() -> None:
 def test_slab_transmittance(both: bool) -> None:
     """Homogeneous matter seen along z: layer [a, b] is seen with (exp(-k a) - exp(-k b)) / (k (b - a))."""
     n, k = 12, 1.5
-    scene = scene_of(shapes.constant((48, 48, n)), Ramp(k), 1.0)
+    scene = scene_of(shapes.volume_of(np.ones((n, 48, 48)), "constant"), Ramp(k), 1.0)
     step = scene.step[2]
     cameras = [far_view(2), far_view(2, -1.0)] if both else [far_view(2)]
     seen = visibility(scene, base_cells(scene, np.zeros(3, np.int64)), cameras)
@@ -372,7 +372,7 @@ def test_visibility_lookup() -> None:
 @pytest.mark.parametrize("dims", [(512, 512, 1), (1024, 700, 1), (3, 256, 256), (96, 96, 96)])
 def test_no_cell_is_lost_between_the_rays(dims: tuple[int, int, int]) -> None:
     """A faint volume is seen everywhere by the default views, however fine its voxels are."""
-    scene = scene_of(shapes.constant(dims), Ramp(0.05), 1.0)
+    scene = scene_of(shapes.volume_of(np.ones(dims[::-1]), "constant"), Ramp(0.05), 1.0)
     cells = base_cells(scene, np.zeros(3, np.int64))
     seen = visibility(scene, cells, default_views("train", size=200))
     assert (seen.largest > 0.5).mean() > 0.995

@@ -109,14 +109,14 @@ def test_a_volumes_mip_is_its_twins(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", values)
     source = load(SourceRequest(str(tmp_path / "a.npy"), tf="viridis"))
     scene, eye = source.scene(), camera()
-    origin, rays = reference.rays(eye, render.RAYS)
+    origin, rays = reference.rays(eye, render.MIP_RAYS)
     flat = rays.reshape(-1, 3)
     with np.errstate(divide="ignore"):
         near, far = (-scene.half - origin) / flat, (scene.half - origin) / flat
     first, last = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
     inside = last > np.maximum(first, 0)
     length = (last - first) * np.linalg.norm(flat / scene.step, axis=1)
-    count = np.where(inside, np.ceil(length / render.STEP), 0)
+    count = np.where(inside, np.ceil(length / render.MIP_STEP), 0)
     best = np.zeros(len(flat))
     for k in range(int(count.max())):
         t = first + (last - first) * (k + 0.5) / np.maximum(count, 1)

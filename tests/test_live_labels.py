@@ -12,7 +12,7 @@ from tests.live_stream import from_bytes
 from tests.refused import refused
 from tests.test_live import SMALL, cloud
 from tests.test_page_live import options, page_of
-from vvgt_cli.closed_form.labelled import assign_labels
+from vvgt_cli.closed_form.labelled import labels_and_gradients
 from vvgt_cli.conversion.live import label_fog
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
@@ -157,7 +157,7 @@ def test_labels_under_gaussians_and_the_way_they_end() -> None:
         at * step - half, np.full((5, 3), np.log(0.8 * step[0])), np.tile([1, 0, 0, 0], (5, 1)), np.zeros(5),
         np.zeros((5, 3)),
     )  # fmt: skip
-    owner, gradient = assign_labels(some, [(volume, [1, 2])], half, step)
+    owner, gradient = labels_and_gradients(some, [(volume, [1, 2])], half, step)
     np.testing.assert_array_equal(owner, [0, 1, 0, 1, -1])
     assert (gradient[2:4] == 0).all()
     assert abs(gradient[0] @ [1, 0, 0]) > 0.9

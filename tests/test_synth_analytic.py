@@ -9,10 +9,7 @@ from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume, shapes
 
-ALL = [
-    shapes.marschner_lobb, shapes.blob, shapes.slab, shapes.sphere, shapes.checkerboard, shapes.constant,
-    shapes.random_field,
-]  # fmt: skip
+ALL = [shapes.marschner_lobb, shapes.blob, shapes.slab, shapes.sphere, shapes.checkerboard, shapes.random_field]
 
 
 def centres(volume: Volume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,10 +72,6 @@ def test_checkerboard() -> None:
         assert np.all(np.diff(data, axis=axis) != 0)
     coarse = shapes.checkerboard(8, cells=2).data
     np.testing.assert_array_equal(coarse, np.kron(data[:2, :2, :2], np.ones((4, 4, 4))))
-
-
-def test_constant() -> None:
-    assert np.unique(shapes.constant(4, 2.5).data).tolist() == [2.5]
 
 
 def test_random_field_is_band_limited_and_seeded() -> None:

@@ -16,7 +16,9 @@ from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import project
 
 RULES = pytest.importorskip("vvgt_cli.gaussians.rules").RULES
-RULE = {"supersplat": "playcanvas", "spark": "spark", "three": "three", "babylon": "babylon"}  # page: rule
+PLAIN = {"supersplat": "playcanvas", "spark": "spark", "three": "three", "babylon": "babylon"}  # page: rule
+RULE = {**PLAIN, "cesium": "cesium"}
+ENDING = {"cesium": ".spz"}  # it reads no .ply
 OPTIONS = {"three": "stored"}  # of the page
 STEPS = {"supersplat": 255, "spark": 254}  # both keep a scale as one of so many over 21 e-folds from exp(-12)
 SIZE = 540
@@ -30,6 +32,14 @@ pytestmark = pytest.mark.long
 def front(size: int = SIZE) -> Camera:
     """From -y: x to the right, z up."""
     return look_at((0, -3, 0), width=size, height=size)
+
+
+def saved(gaussians: Gaussians, folder: Path, ending: str = ".ply") -> Path:
+    """A file of ``gaussians`` that no viewer turns."""
+    path = folder / f"saved{ending}"
+    known = format_of(path)
+    path.write_bytes(encoded(known, gaussians, PlyOptions(), path.name)) if known else write_ply(path, gaussians)
+    return path
 
 
 def lone_splats(camera: Camera, steps: int) -> Gaussians:
@@ -82,12 +92,11 @@ def lone_picture(gaussians: Gaussians, camera: Camera, rule_name: str) -> np.nda
     return out
 
 
-@pytest.mark.parametrize("viewer", RULE)
+@pytest.mark.parametrize("viewer", PLAIN)
 def test_lone_splats_are_drawn_by_the_rule(viewer: str, tmp_path: Path) -> None:
     camera = front()
     gaussians = lone_splats(camera, STEPS.get(viewer, 255))
-    write_ply(tmp_path / "lone.ply", gaussians)
-    shot = shoot(viewer, tmp_path / "lone.ply", [camera], SIZE, tmp_path, OPTIONS.get(viewer, ""))[0]
+    shot = shoot(viewer, saved(gaussians, tmp_path), [camera], SIZE, tmp_path, OPTIONS.get(viewer, ""))[0]
     formula = lone_picture(gaussians, camera, RULE[viewer])
     ours = render(gaussians, camera, rule=RULE[viewer])[..., :3]
     scores = {name: psnr(lone_picture(gaussians, camera, name), shot) for name in RULES}
@@ -120,11 +129,12 @@ def test_up_and_hand_in_supersplat(tmp_path: Path) -> None:
     assert np.linalg.det(shown) == pytest.approx(np.linalg.det(means), rel=1e-5)
 
 
-UPRIGHT = {"supersplat": (-1, -1), "playcanvas": (1, 1), "spark": (1, 1), "splats3d": (1, 1), "gsplatjs": (1, -1)}
+UPRIGHT = {"supersplat": (-1, -1), "gsplatjs": (1, -1)}
+UPRIGHT |= dict.fromkeys(("playcanvas", "spark", "splats3d", "cesium"), (1, 1))
 
 
 @pytest.mark.parametrize("viewer", UPRIGHT)
-def test_which_way_up_a_ply_is_shown(viewer: str, tmp_path: Path) -> None:
+def test_which_way_up_a_file_is_shown(viewer: str, tmp_path: Path) -> None:
     """Red, green and blue at +x, +y and +z of a file: each where the viewer's own camera sees it, none mirrored."""
     means = np.array([(0.5, 0.1, 0.05), (0.07, 0.5, 0), (-0.3, -0.35, 0.4)])  # on no axis: see docs/viewers.md
     rest = (
@@ -133,8 +143,9 @@ def test_which_way_up_a_ply_is_shown(viewer: str, tmp_path: Path) -> None:
         np.full(60, 4.0),
         np.repeat(np.eye(3), 20, axis=0),
     )
-    write_ply(tmp_path / "axes.ply", Gaussians(np.repeat(means, 20, axis=0), *rest))
-    places = np.argwhere(shoot(viewer, tmp_path / "axes.ply", [None], 400, tmp_path)[0] > 0.5)
+    file = saved(Gaussians(np.repeat(means, 20, axis=0), *rest), tmp_path, ENDING.get(viewer, ".ply"))
+    shot = shoot(viewer, file, [None], 400, tmp_path)[0]
+    places = np.argwhere(shot > 0.5)
     found = np.stack([places[places[:, 2] == k, :2].mean(axis=0) for k in range(3)])
     right, up = UPRIGHT[viewer]
     depth = 3 - right * up * means[:, 2]  # a camera at z = 3, or one that is turned by 180 degrees with y
@@ -155,15 +166,14 @@ def test_harmonics_are_seen_from_their_side(viewer: str, tmp_path: Path) -> None
         np.full((150, 3), 0.5),
         rng.normal(0, 0.3, (150, 15, 3)),
     )
-    write_ply(tmp_path / "glossy.ply", gaussians)
-    back, _ = read_ply(tmp_path / "glossy.ply")
     odd = np.repeat([-1, 1, -1], [3, 5, 7])[:, None].astype(np.float32)
-    behind, plain = replace(back, harmonics=back.harmonics * odd), replace(back, harmonics=None)
+    behind, plain = replace(gaussians, harmonics=gaussians.harmonics * odd), replace(gaussians, harmonics=None)
     cameras = [default_views("test", size=SIZE)[i] for i in (0, 4, 9)]
-    shots = shoot(viewer, tmp_path / "glossy.ply", cameras, SIZE, tmp_path, OPTIONS.get(viewer, ""))
+    file = saved(gaussians, tmp_path, ENDING.get(viewer, ".ply"))
+    shots = shoot(viewer, file, cameras, SIZE, tmp_path, OPTIONS.get(viewer, ""))
     for camera, shot in zip(cameras, shots, strict=True):
         ours, other, flat = (
-            psnr(np.clip(render(g, camera, rule=RULE[viewer])[..., :3], 0, 1), shot) for g in (back, behind, plain)
+            psnr(np.clip(render(g, camera, rule=RULE[viewer])[..., :3], 0, 1), shot) for g in (gaussians, behind, plain)
         )
         print(f"{viewer}, {camera.name}: {ours:.2f} dB, {other:.2f} from the other side, {flat:.2f} without")
         assert ours > 30
@@ -202,8 +212,10 @@ def fog(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 @pytest.mark.parametrize("viewer", RULE)
 def test_converted_volume_looks_as_scored(viewer: str, body: Shown, tmp_path: Path) -> None:
-    shot = shoot(viewer, body.file, [body.camera], 1080, tmp_path, OPTIONS.get(viewer, ""))[0]
-    ours = render(read_ply(body.file)[0], body.camera, rule=RULE[viewer])[..., :3]
+    gaussians = read_ply(body.file)[0]
+    file = saved(gaussians, tmp_path, ENDING.get(viewer, ".ply"))
+    shot = shoot(viewer, file, [body.camera], 1080, tmp_path, OPTIONS.get(viewer, ""))[0]
+    ours = render(gaussians, body.camera, rule=RULE[viewer])[..., :3]
     seen, said, same = psnr(body.volume, shot), psnr(body.volume, ours), psnr(ours, shot)
     print(f"{viewer}: {seen:.2f} dB against the volume, {said:.2f} by our drawing; {same:.2f} between the two")
     assert abs(seen - said) < 1
@@ -277,8 +289,7 @@ def blended(gaussians: Gaussians, camera: Camera, viewer: str, row: int, column:
 )
 def test_viewers_read_what_is_packed(ending: str, viewer: str, body: Shown, tmp_path: Path) -> None:
     """They decode by themselves: without gsply, which writes .spz for us."""
-    path = tmp_path / f"body{ending}"
-    path.write_bytes(encoded(format_of(path), read_ply(body.file)[0], PlyOptions(), path.name))
+    path = saved(read_ply(body.file)[0], tmp_path, ending)
     plain, packed = (shoot(viewer, file, [body.camera], SIZE, tmp_path)[0] for file in (body.file, path))
     print(f"{ending}: {psnr(plain, packed):.2f} dB from the .ply in {viewer}")
     assert psnr(plain, packed) > 40

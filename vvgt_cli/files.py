@@ -94,11 +94,7 @@ def _spool(path: str | os.PathLike[str]) -> IO[bytes]:
 
 
 def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
-    """Return the path as a `Path` if it can be written: a new file, a pipe or a device.
-
-    Raises:
-        UsageError: the file exists and ``overwrite`` is not set, is a folder, or its folder does not exist.
-    """
+    """Return the path as a `Path` if it can be written, a new file, a pipe or a device, or raise UsageError."""
     target = Path(path)
     if is_stream(target):
         return target
@@ -112,11 +108,7 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
 
 
 def check_disk_space(path: str | os.PathLike[str], need: int) -> None:
-    """Check that the disk of ``path`` has ``need`` bytes free.
-
-    Raises:
-        DataError: it has not; the message has the system's own words for a full disk.
-    """
+    """Raise DataError, in the system's own words for a full disk, unless that of ``path`` has ``need`` bytes free."""
     folder = Path(path).parent
     if is_stream(path) or not hasattr(os, "statvfs"):
         return

@@ -214,14 +214,7 @@ def _lens(entry: dict[str, Any], name: str, size: int | None) -> tuple[int, int,
     if fx is None or fy is None:
         raise DataError(f"{name}: no focal length; expected 'fl_x' in pixels, or 'camera_angle_x' in radians")
     cx, cy = _number(entry, "cx", name), _number(entry, "cy", name)
-    return (
-        round(width),
-        round(height),
-        fx,
-        fy,
-        width / 2 if cx is None else cx,
-        height / 2 if cy is None else cy,
-    )
+    return (round(width), round(height), fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
 
 
 PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy

@@ -61,12 +61,7 @@ def fibonacci_views(
 
 
 def default_views(
-    which: str,
-    count: int | None = None,
-    *,
-    size: int = SIZE,
-    radius: float = RADIUS,
-    fov: float = FIELD_OF_VIEW,
+    which: str, count: int | None = None, *, size: int = SIZE, radius: float = RADIUS, fov: float = FIELD_OF_VIEW
 ) -> list[Camera]:
     """Return the ``train`` (24), ``check`` (4) or ``test`` (10) set, which are disjoint."""
     return fibonacci_views(
@@ -75,12 +70,7 @@ def default_views(
 
 
 def orbit_views(
-    count: int,
-    *,
-    elevation: float = 20.0,
-    size: int = SIZE,
-    radius: float = RADIUS,
-    fov: float = FIELD_OF_VIEW,
+    count: int, *, elevation: float = 20.0, size: int = SIZE, radius: float = RADIUS, fov: float = FIELD_OF_VIEW
 ) -> list[Camera]:
     """Return ``count`` views on a circle around +z at ``elevation`` degrees."""
     height, ring = radius * math.sin(math.radians(elevation)), radius * math.cos(math.radians(elevation))

@@ -19,7 +19,7 @@ from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layers import Layer, grid_of
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, read_ply, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_ply, as_stored, read_ply
 from vvgt_cli.gaussians.formats.choose import FORMATS, Format, encoded
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import score_views
@@ -160,12 +160,7 @@ def compare_with_twin(
 ) -> Figure:
     """Measure the mean difference of a view from its float64 twin, relative to the twin's largest value.
 
-    Args:
-        scene: scene to draw.
-        camera: of the view.
-        twin_step: sampling step of the twin, in the smallest voxel edge.
-        limit: largest difference that passes.
-        empty: whether the view may be empty.
+    The twin samples at ``twin_step`` smallest voxel edges; ``limit`` is what passes; ``empty`` views may show nothing.
     """
     image = render_view(scene, camera, FINE)
     require_valid(image)
@@ -229,10 +224,7 @@ def convert_scene(scene: Scene) -> Figure:
     refitted, _ = backproject(start, cameras, views)
     options = OptimizeOptions(steps=STEPS, check_every=5)
     better, record = optimize(refitted, cameras, views, options, (judges, reference))
-    stream = io.BytesIO()
-    write_ply(stream, as_stored(better))
-    stream.seek(0)
-    gaussians, _ = read_ply(stream)
+    gaussians, _ = read_ply(io.BytesIO(as_ply(as_stored(better))))
     images = [render(gaussians, camera) for camera in judges]
     require(all(np.isfinite(image).all() for image in images), "a picture that is not finite")
     score = score_views(reference, images, perceptual=False)

@@ -54,12 +54,9 @@ def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:
 
 
 def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator[Case]:
-    """Yield cases of extreme sizes, opacities and colours.
+    """Yield cases of extreme sizes, opacities and colours, on a screen of ``size`` px.
 
-    Args:
-        gaussians: in the unit frame if a volume is given.
-        edge: longest edge of the volume; None: the extent of most of the centres.
-        size: pixels of the screen.
+    ``edge`` is the longest of the volume, in whose unit frame the Gaussians are; None: the extent of most centres.
     """
     sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
     length = edge or 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,12 +13,17 @@ if TYPE_CHECKING:
     from vvgt_cli.field.settings import BlockOptions
 
 
-def _size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
-    if value is None or value == "auto":
-        return value
-    if not (value.isascii() and value.isdecimal()):
-        raise click.BadParameter(f"{value!r}; expected auto, or a power of two from 16 on")
-    return int(value)
+def _number_or(word: str, number: str) -> Callable[[click.Context, click.Parameter, str | None], int | str | None]:
+    """Return the callback of an option that takes a ``word`` or a ``number``, so described in its error."""
+
+    def parse(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
+        if value is None or value == word:
+            return value
+        if not (value.isascii() and value.isdecimal()):
+            raise click.BadParameter(f"{value!r}; expected {word}, or {number}")
+        return int(value)
+
+    return parse
 
 
 def _shard(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -29,17 +35,9 @@ def _shard(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
     return int(index), int(count)
 
 
-def _level(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
-    if value is None or value == "full":
-        return value
-    if not (value.isascii() and value.isdecimal()):
-        raise click.BadParameter(f"{value!r}; expected full, or the number of a level (0, 1, ...)")
-    return int(value)
-
-
 _options = {
     "block_size": click.option(
-        "--blocks", "block_size", metavar="SIZE|auto", callback=_size,
+        "--blocks", "block_size", metavar="SIZE|auto", callback=_number_or("auto", "a power of two from 16 on"),
         help="Process the volume in blocks of SIZE voxels along an edge (a power of two); 'auto' chooses by memory. "
         "Default: blocks if the volume is larger than 1 GiB or does not fit in memory.",
     ),
@@ -54,7 +52,7 @@ _options = {
         "(tcp://...). Needs the extra 'cluster'.",
     ),
     "level": click.option(
-        "--level", metavar="full|N", callback=_level,
+        "--level", metavar="full|N", callback=_number_or("full", "the number of a level (0, 1, ...)"),
         help="Resolution level of an OME-Zarr, N5 or Imaris image in blocks, 0 the finest. Default: the coarsest "
         "sufficient for --size.",
     ),
@@ -70,11 +68,7 @@ shared_block_options = group("blocks", **_options, **_shard_option)
 
 
 def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
-    """Return the options of blocks, None to let the program choose.
-
-    Raises:
-        UsageError: options that do not fit together.
-    """
+    """Return the options of blocks, None to let the program choose; raise UsageError if they do not fit together."""
     from vvgt_cli.field.settings import BlockOptions
 
     if all(value is None for value in blocks.values()):

@@ -13,10 +13,11 @@ from vvgt_cli.cli.options import (
     common_options,
     device_option,
     light_options,
+    optics_options,
+    output_option,
     overwrite_option,
     placed_read_options,
     slices_option,
-    tfs_options,
     title_option,
 )
 from vvgt_cli.cli.sections import SectionedCommand
@@ -27,11 +28,8 @@ from vvgt_cli.progress import Console
 
 @click.command("convert", cls=SectionedCommand, short_help="Convert a volume to a .ply of Gaussians.")
 @click.argument("volume")
-@click.option(
-    "-o", "--output", required=True, metavar="OUT.ply",
-    help="Output file; its ending selects the format, - is standard output.",
-)  # fmt: skip
-@tfs_options
+@output_option
+@optics_options(" Repeatable: each function gets a file, named by {} in OUT.ply.", multiple=True)
 @target_option(
     "Device to make the file for: sets --max-gaussians, --max-size, --size and --rule where they are not given, and "
     "scores it as seen there, on a headset by both eyes."

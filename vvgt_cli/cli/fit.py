@@ -128,38 +128,14 @@ def source_request(
 
 
 def convert_request(
-    volume: str,
-    *,
-    output: str,
-    fit: dict[str, Any],
-    ply: dict[str, Any],
-    read: dict[str, Any],
-    optics: dict[str, Any],
-    light: dict[str, Any],
-    overwrite: bool,
-    report: str | None = None,
-    preview: str | None = None,
-    steps: int | None = None,
-    target: str | None = None,
-    model: str | None = None,
-    limits: dict[str, Any] | None = None,
-    checkpoint: str | None = None,
-    device: str = "cpu",
-) -> ConvertRequest:
-    """Return the request that the options of `convert` and `init` describe."""
+    volume: str, *, fit: dict[str, Any], ply: dict[str, Any], read: dict[str, Any], optics: dict[str, Any],
+    light: dict[str, Any], steps: int | None = None, target: str | None = None, model: str | None = None,
+    device: str = "cpu", limits: dict[str, Any] | None = None, **more: Any,
+) -> ConvertRequest:  # fmt: skip
+    """Return the request that the options of `convert` and `init` describe; ``more`` are fields of it."""
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
     from vvgt_cli.gaussians import PlyOptions
 
-    up = ply.pop("up")
-    return ConvertRequest(
-        source_request(volume, read, optics, light),
-        output,
-        FitOptions(**fit, steps=steps, model=model, device=device, target=target),
-        Limits(**(limits or {})),
-        PlyOptions(**ply),
-        up,
-        report,
-        preview,
-        overwrite,
-        checkpoint,
-    )
+    up, source = ply.pop("up"), source_request(volume, read, optics, light)
+    fitted = FitOptions(**fit, steps=steps, model=model, device=device, target=target)
+    return ConvertRequest(source, fit=fitted, limits=Limits(**(limits or {})), ply=PlyOptions(**ply), up=up, **more)

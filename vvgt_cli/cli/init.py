@@ -9,17 +9,21 @@ import click
 
 from vvgt_cli.cli.blocks import shared_block_options
 from vvgt_cli.cli.fit import fit_options, ply_options
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.options import (
+    common_options,
+    light_options,
+    output_option,
+    overwrite_option,
+    placed_read_options,
+    tf_options,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
 @click.command("init", cls=SectionedCommand, short_help="Compute the closed form only, without rendering.")
 @click.argument("volume")
-@click.option(
-    "-o", "--output", required=True, metavar="OUT.ply",
-    help="Output file; its ending selects the format, - is standard output.",
-)  # fmt: skip
+@output_option
 @tf_options
 @fit_options
 @light_options

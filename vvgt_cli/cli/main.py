@@ -17,33 +17,16 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
+from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
 from vvgt_cli.version import VERSION
 
-COMMANDS = {
-    "convert": "vvgt_cli.cli.convert",
-    "init": "vvgt_cli.cli.init",
-    "merge": "vvgt_cli.cli.merge",
-    "optimize": "vvgt_cli.cli.optimize",
-    "recolor": "vvgt_cli.cli.recolor",
-    "view": "vvgt_cli.cli.view",
-    "render": "vvgt_cli.cli.render",
-    "render-views": "vvgt_cli.cli.render_views",
-    "evaluate": "vvgt_cli.cli.evaluate",
-    "check": "vvgt_cli.cli.check",
-    "report": "vvgt_cli.cli.report",
-    "info": "vvgt_cli.cli.info",
-    "tf": "vvgt_cli.cli.tf",
-    "infer": "vvgt_cli.cli.infer",
-    "export": "vvgt_cli.cli.export",
-    "train": "vvgt_cli.cli.train",
-    "synth": "vvgt_cli.cli.synth",
-    "plugin": "vvgt_cli.cli.plugin",
-    "warmup": "vvgt_cli.cli.warmup",
-}
+COMMANDS = [  # modules of this room, with underscores
+    *("convert", "init", "merge", "optimize", "recolor", "view", "render", "render-views", "evaluate", "check"),
+    *("report", "info", "tf", "infer", "export", "train", "synth", "plugin", "warmup"),
+]
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 ALONE = 2.0  # seconds after which a process of a group of them tells of an error of its own
@@ -56,13 +39,13 @@ class LazyGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands."""
-        return list(COMMANDS)
+        return COMMANDS
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command, None if there is none of this name."""
         if cmd_name not in COMMANDS:
             return None
-        result: click.Command = importlib.import_module(COMMANDS[cmd_name]).command
+        result: click.Command = importlib.import_module(f"vvgt_cli.cli.{cmd_name.replace('-', '_')}").command
         return result
 
     def resolve_command(
@@ -107,22 +90,9 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _note(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: object = None,
-    line: object = None,
-) -> None:
+def _note(message: Warning | str, *_: object, **__: object) -> None:
     """Print a warning as one line (replaces `warnings.showwarning`)."""
     print(f"vvgt: note: {' '.join(str(message).split())}", file=sys.stderr)
-
-
-def _usage(error: click.ClickException) -> int:
-    context = getattr(error, "ctx", None)
-    hint = f" (see '{context.command_path} --help')" if context else ""
-    return _fail(error.format_message() + hint, error.exit_code)
 
 
 def _os_error(error: OSError) -> str:
@@ -176,7 +146,9 @@ def _status(error: BaseException) -> int:
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
     if isinstance(error, click.ClickException):
-        return _usage(error)
+        context = getattr(error, "ctx", None)
+        hint = f" (see '{context.command_path} --help')" if context else ""
+        return _fail(error.format_message() + hint, error.exit_code)
     if isinstance(error, VvgtError):
         return _fail(str(error), error.exit_code)
     if isinstance(error, BrokenPipeError):
@@ -190,7 +162,7 @@ def _status(error: BaseException) -> int:
         return _fail("interrupted", INTERRUPTED)
     if isinstance(error, SystemExit):
         code = error.code if isinstance(error.code, int) else 1
-        name = ended_by(code)
+        name = next((signal.Signals(number).name for number in ENDING if code == 128 + number), None)
         return _fail(f"ended by {name}", code) if name and first_of_group() else code
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
 

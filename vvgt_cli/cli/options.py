@@ -123,24 +123,24 @@ TF_HELP = (
     "Transfer function: a file, a preset such as ct-bone ('vvgt tf list' shows all), or the name of a matplotlib "
     "colour map. Default: made from the data."
 )
-tf_options = group(
-    "optics",
-    tf=click.option("--tf", metavar="TF", help=TF_HELP),
-    tf_range=tf_range_option,
-    opacity_unit_distance=unit_distance_option,
-    **LABELS,
-)
-tfs_options = group(
-    "optics",
-    tf=click.option(
-        "--tf", metavar="TF", multiple=True,
-        help=f"{TF_HELP} Repeatable: each function gets a file, named by {{}} in OUT.ply.",
-    ),
-    tf_range=tf_range_option,
-    opacity_unit_distance=unit_distance_option,
-    **LABELS,
-)  # fmt: skip
 
+
+def optics_options(more: str = "", multiple: bool = False) -> Decorator:
+    """Return the options of a look; ``--tf`` has ``more`` help, and several values if ``multiple``."""
+    return group(
+        "optics",
+        tf=click.option("--tf", metavar="TF", multiple=multiple, help=TF_HELP + more),
+        tf_range=tf_range_option,
+        opacity_unit_distance=unit_distance_option,
+        **LABELS,
+    )
+
+
+tf_options = optics_options()
+output_option = click.option(
+    "-o", "--output", required=True, metavar="OUT.ply",
+    help="Output file; its ending selects the format, - is standard output.",
+)  # fmt: skip
 _LIGHT = dict(
     lights=click.option(
         "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
@@ -190,11 +190,7 @@ class Measure(click.ParamType[float]):
         self.name, self.units = name, units
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number.
-
-        Raises:
-            click.BadParameter: not a number, or an unknown unit.
-        """
+        """Return the number, or raise click.BadParameter."""
         found, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
         with suppress(ValueError, TypeError, KeyError):
             number = float(found[1]) * self.units[found[2]]  # type: ignore[index]  # None: TypeError
@@ -265,20 +261,13 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--threads``, ``--memory`` and ``--quiet``; call the command with a ``console``."""
 
     @click.option(
-        "--threads",
-        type=click.IntRange(1, 1024),
-        metavar="N",
-        callback=_threads,
-        expose_value=False,
+        "--threads", type=click.IntRange(1, 1024), metavar="N", callback=_threads, expose_value=False,
         help="Number of threads. Default: NUMBA_NUM_THREADS, OMP_NUM_THREADS, SLURM_CPUS_PER_TASK or all CPUs.",
-    )
+    )  # fmt: skip
     @click.option(
-        "--memory",
-        metavar="SIZE",
-        callback=_memory,
-        expose_value=False,
+        "--memory", metavar="SIZE", callback=_memory, expose_value=False,
         help="Memory limit, such as 4G. Default: what the machine, cgroups and ulimit allow.",
-    )
+    )  # fmt: skip
     @click.option("-q", "--quiet", is_flag=True, help="Print only errors.")
     @functools.wraps(function)
     def wrapper(*args: Any, quiet: bool, **kwargs: Any) -> Any:

@@ -59,11 +59,6 @@ def end_on_signals() -> None:
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
 
 
-def ended_by(status: int) -> str | None:
-    """Return the name of the signal that an exit status stands for, None for other statuses."""
-    return next((signal.Signals(number).name for number in ENDING if status == 128 + number), None)
-
-
 @contextmanager
 def interruption(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     """Make the first interrupt (Ctrl-C) in the block only set the yielded function's result; a second one raises."""

@@ -9,6 +9,7 @@ import click
 from vvgt_cli.cli.options import (
     common_options,
     layer_looks_option,
+    output_option,
     overwrite_option,
     relight_options,
     tf_range_option,
@@ -23,10 +24,7 @@ from vvgt_cli.progress import Console
     "--tf", metavar="TF",
     help="Transfer function: a file or the name of a matplotlib colour map. Default: the file's own.",
 )  # fmt: skip
-@click.option(
-    "-o", "--output", required=True, metavar="OUT.ply",
-    help="Output file; its ending selects the format, - is standard output.",
-)  # fmt: skip
+@output_option
 @click.option(
     "--labels", metavar="TABLE|auto",
     help="Table of labels, for a file of a label map; opacity 0 hides a label. Default: the file's own.",

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
 @click.option("--camera", metavar="FILE", help="Camera poses from a transforms.json, in the unit frame.")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the up axis.")
 @click.option(
-    "--size",
-    type=click.IntRange(1, 16384),
-    metavar="PX",
+    "--size", type=click.IntRange(1, 16384), metavar="PX",
     help="Image height in pixels. Default: that of the camera file, else the size recorded in the .ply, or 400.",
-)
+)  # fmt: skip
 @click.option(
     "-o", "--output", required=True, metavar="DIR|FILE",
     help="One picture such as out.png, a directory for several, created if missing, or a movie such as turn.gif or "
@@ -33,12 +31,9 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
 @click.option(
-    "--background",
-    type=float,
-    nargs=3,
-    metavar="R G B",
+    "--background", type=float, nargs=3, metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
-)
+)  # fmt: skip
 @tf_options
 @light_options
 @rule_option(
@@ -51,21 +46,10 @@ if TYPE_CHECKING:
 @overwrite_option
 @common_options
 def command(
-    file: str,
-    camera: str | None,
-    orbit: int | None,
-    size: int | None,
-    rule: str | None,
-    output: str,
-    exr: bool,
-    background: tuple[float, float, float] | None,
-    optics: dict[str, Any],
-    light: dict[str, Any],
-    read: dict[str, Any],
-    blocks: dict[str, Any],
-    overwrite: bool,
-    console: Console,
-) -> None:
+    file: str, camera: str | None, orbit: int | None, size: int | None, rule: str | None, output: str, exr: bool,
+    background: tuple[float, float, float] | None, optics: dict[str, Any], light: dict[str, Any],
+    read: dict[str, Any], blocks: dict[str, Any], overwrite: bool, console: Console,
+) -> None:  # fmt: skip
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
     Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif

@@ -9,15 +9,12 @@ import click
 from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
-    LABELS,
-    TF_HELP,
     common_options,
     device_option,
     group,
     light_options,
+    optics_options,
     placed_read_options,
-    tf_range_option,
-    unit_distance_option,
 )
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
@@ -88,22 +85,11 @@ ray_options = group(
     ),
 )  # fmt: skip
 
-optics_options = group(
-    "optics",
-    tf=click.option(
-        "--tf", multiple=True, metavar="TF",
-        help=f"{TF_HELP} Repeatable: each function gets a folder.",
-    ),
-    tf_range=tf_range_option,
-    opacity_unit_distance=unit_distance_option,
-    **LABELS,
-)  # fmt: skip
-
 
 @click.command("render-views", cls=SectionedCommand, short_help="Render calibrated views of a volume, for trainers.")
 @click.argument("volume")
 @click.option("-o", "--output", required=True, metavar="DIR", help="Output directory, created if missing.")
-@optics_options
+@optics_options(" Repeatable: each function gets a folder.", multiple=True)
 @camera_options
 @light_options
 @image_options
@@ -115,20 +101,10 @@ optics_options = group(
 @device_option("views are drawn")
 @common_options
 def command(
-    volume: str,
-    output: str,
-    cameras: dict[str, Any],
-    layout: dict[str, Any],
-    rays: dict[str, Any],
-    optics: dict[str, Any],
-    light: dict[str, Any],
-    read: dict[str, Any],
-    blocks: dict[str, Any],
-    shard: str,
-    overwrite: bool,
-    device: str,
-    console: Console,
-) -> None:
+    volume: str, output: str, cameras: dict[str, Any], layout: dict[str, Any], rays: dict[str, Any],
+    optics: dict[str, Any], light: dict[str, Any], read: dict[str, Any], blocks: dict[str, Any], shard: str,
+    overwrite: bool, device: str, console: Console,
+) -> None:  # fmt: skip
     """Render views of VOLUME with known cameras, and the files that 3DGS trainers start from.
 
     DIR gets EXR and PNG images, transforms.json (nerfstudio), transforms_train.json and transforms_test.json

@@ -14,11 +14,9 @@ KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells
 @click.argument("kind", metavar="KIND", type=click.Choice(KINDS))
 @click.option("-o", "--output", required=True, metavar="FILE.nrrd", help="Output file: NRRD, float32.")
 @click.option(
-    "--size",
-    type=click.IntRange(8, 1024),
-    metavar="N",
+    "--size", type=click.IntRange(8, 1024), metavar="N",
     help="Voxels along each side. Default: 64 for turbulence, else 128.",
-)
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed.")
 @click.option(
     "--field", type=click.Choice(["speed", "vorticity", "temperature"]),

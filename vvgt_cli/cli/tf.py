@@ -80,14 +80,9 @@ def list_named(console: Console) -> None:
 @command.command("suggest", short_help="Suggest functions that each show one range of values.")
 @click.argument("volume")
 @click.option(
-    "-n",
-    "--number",
-    type=click.IntRange(1, 100),
-    default=10,
-    show_default=True,
-    metavar="N",
+    "-n", "--number", type=click.IntRange(1, 100), default=10, show_default=True, metavar="N",
     help="Number of functions.",
-)
+)  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="DIR", help="Output directory, created if missing.")
 @read_options
 @overwrite_option

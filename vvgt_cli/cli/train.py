@@ -10,11 +10,9 @@ from vvgt_cli.progress import Console
 
 @click.command("train", short_help="Train the network on volumes.")
 @click.option(
-    "--data",
-    required=True,
-    metavar="DIR",
+    "--data", required=True, metavar="DIR",
     help="Folder with volumes in DIR/train and DIR/held; scenes are cached in DIR/scenes.",
-)
+)  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run, created or resumed.")
 @click.option(
     "--config", "path", metavar="FILE.yaml", help="Settings that differ from the defaults, or a run's config.yaml."

@@ -29,13 +29,9 @@ from vvgt_cli.progress import Console
     "--port", type=click.IntRange(1, 65535), metavar="N", help="Port of the local server. Default: any free port."
 )
 @click.option(
-    "--no-browser",
-    "browser",
-    is_flag=True,
-    default=True,
-    flag_value=False,
+    "--no-browser", "browser", is_flag=True, default=True, flag_value=False,
     help="Print the address without opening a browser.",
-)
+)  # fmt: skip
 @click.option(
     "--no-live", "live", is_flag=True, default=True, flag_value=False,
     help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
@@ -48,19 +44,10 @@ from vvgt_cli.progress import Console
 @overwrite_option
 @common_options
 def command(
-    files: tuple[str, ...],
-    output: str | None,
-    port: int | None,
-    browser: bool,
-    live: bool,
-    slices: bool,
-    title: str | None,
-    read: dict[str, Any],
-    optics: dict[str, Any],
-    light: dict[str, Any],
-    overwrite: bool,
+    files: tuple[str, ...], output: str | None, port: int | None, browser: bool, live: bool, slices: bool,
+    title: str | None, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any], overwrite: bool,
     console: Console,
-) -> None:
+) -> None:  # fmt: skip
     """Show FILE in a browser: Gaussians in any supported format, or a volume.
 
     A volume appears within seconds. If its transfer function is changed in the page, the volume is converted for it in
@@ -96,4 +83,4 @@ def command(
         raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
     source = source_request(files[0], read, optics, light)
     request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, slices, title)
-    view(request, lambda url: click.echo(url), console)
+    view(request, click.echo, console)

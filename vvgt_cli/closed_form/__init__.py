@@ -44,11 +44,7 @@ class VbmOptions:
     values: bool = False
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            UsageError: an unknown method, or a number below 1.
-        """
+        """Check the options; raise UsageError for an unknown method, or a number below 1."""
         if self.method not in METHODS:
             raise UsageError(f"init {self.method!r}; expected one of {', '.join(METHODS)}")
         if self.max_gaussians < 1:
@@ -120,11 +116,7 @@ def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rul
 
 
 def backproject(
-    start: Start,
-    cameras: Sequence[Camera],
-    views: np.ndarray,
-    progress: Progress | None = None,
-    rule: Rule = INRIA,
+    start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None, rule: Rule = INRIA
 ) -> tuple[Gaussians, str]:
     """Improve by views what needs no gradient descent: which cells are split, the style of surfaces, and colours.
 

@@ -16,7 +16,7 @@ WIDE = 1.5  # standard deviations of the points that say where a label ends
 CHUNK = 1 << 14  # Gaussians whose points are looked up at once
 
 
-def assign_labels(
+def labels_and_gradients(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).

@@ -122,7 +122,7 @@ def region_cells(
     chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
     scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
     order = np.argsort(morton(np.argwhere(np.ones(cells[::-1]))[:, ::-1]))
-    moments, index = [np.empty((0, MOMENTS))], [np.empty((0, 3), np.int32)]
+    moments, index = np.empty((0, MOMENTS)), [np.empty((0, 3), np.int32)]
     for first in range(0, len(origins), chunk):
         part = origins[first : first + chunk]
         dense = scratch[: len(part)]
@@ -132,14 +132,14 @@ def region_cells(
         else:
             _integrate(region, at, points, cell, dense)
         counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
-        rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
-        compact(dense, order, np.cumsum(counts) - counts, rows, local)
-        moments.append(rows)
+        done, local = len(moments), np.empty((counts.sum(), 3), np.int32)
+        moments.resize((done + len(local), MOMENTS), refcheck=False)  # moves no bytes where the system can remap them
+        compact(dense, order, np.cumsum(counts) - counts, moments[done:], local)
         index.append(local + np.repeat(np.round(part / cell).astype(np.int32), counts, axis=0))
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    return in_order(np.concatenate(index), moments)
+    return in_order(np.concatenate(index), [moments])
 
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
@@ -179,8 +179,10 @@ def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return indices (n, 3) and the rows of ``parts`` in Morton order; parts are freed as they are copied."""
     codes = morton(index)
-    moments, done = np.empty((len(index), MOMENTS)), 0
     order = None if (codes[1:] > codes[:-1]).all() else np.argsort(codes, kind="stable")
+    if order is None and len(parts) == 1:
+        return index, parts[0]
+    moments, done = np.empty((len(index), MOMENTS)), 0
     place = np.empty_like(order) if order is not None else None
     if order is not None and place is not None:
         place[order] = np.arange(len(order))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
 import shutil
@@ -26,7 +25,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.layered import open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import write_ply
+from vvgt_cli.gaussians import as_ply
 from vvgt_cli.gaussians.formats import ready
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.look.labels import LabelTable
@@ -142,9 +141,7 @@ def _plain_file(conversion: Conversion) -> Converted:
 
 
 def _file(conversion: Conversion) -> bytes:
-    stream = io.BytesIO()
-    write_ply(stream, conversion.gaussians, conversion.ply, conversion.normals())
-    return stream.getvalue()
+    return as_ply(conversion.gaussians, conversion.ply, conversion.normals())
 
 
 def main() -> None:

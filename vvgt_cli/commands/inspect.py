@@ -18,7 +18,7 @@ from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, resol
 from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
-from vvgt_cli.gaussians import describe, read_ply, write_ply
+from vvgt_cli.gaussians import as_ply, describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
@@ -109,10 +109,8 @@ def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
     tf, options = resolve_look(file, header, function)
     found = apply_function(gaussians, header, tf, options)
-    stream = io.BytesIO()
-    write_ply(stream, found, options)
-    stream.seek(0)
-    return {"function": tf.name, "hidden": len(gaussians) - len(found), **describe(*read_ply(stream))}
+    written = read_ply(io.BytesIO(as_ply(found, options)))
+    return {"function": tf.name, "hidden": len(gaussians) - len(found), **describe(*written)}
 
 
 def _head_of_stdin() -> bytes:

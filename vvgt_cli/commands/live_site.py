@@ -18,7 +18,7 @@ from vvgt_cli.commands.converter import ConsoleLine, Converted, Converter, Faile
 from vvgt_cli.commands.server import Resource
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_ply, as_stored
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
@@ -42,9 +42,7 @@ NODES = 4096  # of a function that a page sends
 
 def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
     """Return a `.ply` as the page's viewer reads it."""
-    stream = io.BytesIO()
-    write_ply(stream, replace(gaussians, live=None), replace(upright(options), live=None))
-    return stream.getvalue()
+    return as_ply(replace(gaussians, live=None), replace(upright(options), live=None))
 
 
 @dataclass(frozen=True)
@@ -82,20 +80,10 @@ class Cloud:
             return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, name, extras))
         if self.ply is not None:
             return Resource(BYTES, lambda: self.ply or b"")
-        stream = io.BytesIO()
-        write_ply(stream, self.gaussians, self.options)
-        return Resource(BYTES, stream.getvalue)
+        return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
     def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
-        """Return the cloud under another function, which is on data values and has an opacity_unit_distance.
-
-        Args:
-            tf: the function.
-            light: as the page sends it; None: the file's own.
-
-        Raises:
-            DataError, UsageError: the light is not valid, or the Gaussians carry labels.
-        """
+        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's)."""
         facts = self._alone("a function")
         table, facts = self._function(facts, tf)
         distance = tf.opacity_unit_distance
@@ -176,11 +164,7 @@ class Cloud:
 
 
 def parse_labels(sent: Any) -> LabelTable:
-    """Return the labels of a page: a list of number, color (RGB in [0, 1]) and opacity.
-
-    Raises:
-        DataError: labels that are not valid.
-    """
+    """Return the labels of a page, a list of number, color (RGB in [0, 1]) and opacity, or raise DataError."""
     what = "the page's labels"
     if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
         raise DataError(f"{what}: expected a list of at most {MOST_LABELS} objects")
@@ -196,11 +180,7 @@ def parse_labels(sent: Any) -> LabelTable:
 
 
 def parse_function(sent: Any) -> TransferFunction:
-    """Return the function of a page.
-
-    Raises:
-        DataError: no function, or one without an opacity unit distance.
-    """
+    """Return the function of a page; raise DataError without one, or without an opacity unit distance."""
     what = "the page's function"
     if not isinstance(sent, dict) or not isinstance(sent.get("points"), list) or len(sent["points"]) > NODES:
         raise DataError(f"{what}: expected an object with a list of at most {NODES} points")
@@ -213,15 +193,9 @@ def parse_function(sent: Any) -> TransferFunction:
 
 
 def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
-    """Return the text of a page, named "", and the file that it loads.
+    """Return the text of a page, named "", and the file that it loads; raise DataError if a library is missing.
 
-    Args:
-        cloud: what it shows, live if possible.
-        converts: whether there is a volume, which can be converted for a function if it has a single layer.
-        sliced: whether the volume has slices.
-
-    Raises:
-        DataError: a library that pages of live Gaussians need is missing.
+    It ``converts`` a volume for functions if that has a single layer, and shows its slices if it is ``sliced``.
     """
     if not cloud.live:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"

@@ -118,11 +118,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
 
 
 def load_sets(folder: str) -> tuple[Views, Views, str]:
-    """Return training views, check views, and a remark if the check views were taken from the training views.
-
-    Raises:
-        DataError: not a folder of views.
-    """
+    """Return training views, check views, and a remark if they come from the training views, or raise DataError."""
     train = Views(*load_views(folder, "train"))
     if _has(folder, "check"):
         return train, Views(*load_views(folder, "check")), ""
@@ -152,11 +148,7 @@ def _mean(test: Views, gaussians: Gaussians, rule: Rule, perceptual: bool) -> Sc
 
 
 def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:
-    """Return the options of the budget: either steps or seconds.
-
-    Raises:
-        UsageError: both, or neither.
-    """
+    """Return the options of the budget, either steps or seconds; raise UsageError for both or neither."""
     if (steps is None) == (seconds is None):
         raise UsageError("give either --steps N or --time-budget SECONDS")
     return {"steps": steps, "time_budget": seconds}

@@ -35,11 +35,7 @@ class Peer:
 
     @classmethod
     def of(cls, text: str) -> Peer:
-        """Parse ``NAME=COMMAND``.
-
-        Raises:
-            UsageError: no name, or a command without a place for the views or the output.
-        """
+        """Parse ``NAME=COMMAND``; raise UsageError without a name, or a place in the command for views and output."""
         name, _, command = text.partition("=")
         try:
             words = tuple(shlex.split(command))

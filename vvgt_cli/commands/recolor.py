@@ -62,11 +62,7 @@ def function_of(
     light: Mapping[str, Any] | None = None,
     layers: Sequence[str] = (),
 ) -> FunctionRequest | None:
-    """Return the request that a command's options make, None if no option is given.
-
-    Raises:
-        UsageError: an invalid look of a layer.
-    """
+    """Return the request that options make, None without any; raise UsageError for an invalid look of a layer."""
     looks = tuple(map(parse_layer_look, layers))
     found = FunctionRequest(tf, tf_range, unit_distance, labels, LightOptions(**(light or {})), looks)
     return None if found == FunctionRequest() else found

@@ -44,6 +44,8 @@ from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
+Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
+MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
 
 
 @dataclass(frozen=True)
@@ -257,11 +259,7 @@ def _pictures(request: RenderRequest, console: Console, draw: Draw, cameras: lis
 
 
 def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
-    """Write one movie; return its name and what it holds.
-
-    Raises:
-        UsageError: views of several sizes.
-    """
+    """Write one movie, and return its name and what it holds; raise UsageError for views of several sizes."""
     from vvgt_cli.images import over
 
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
@@ -278,17 +276,8 @@ def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[C
     return f"{request.output}: {len(cameras) / RATE:.1f} s, {size / 1e6:.2f} MB"
 
 
-RAYS = 2  # along a pixel's edge
-STEP = 0.25  # voxels between samples
-Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
-
-
 def as_xray(source: Source) -> Source:
-    """Return a volume under the extinction of its X-ray, unlit.
-
-    Raises:
-        UsageError: labels, channels or layers.
-    """
+    """Return a volume under the extinction of its X-ray, unlit; raise UsageError for an optics grid."""
     source.require_scalar_field()
     layer = source.layers[0]
     assert isinstance(layer.tf, TransferFunction)
@@ -337,7 +326,7 @@ def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarr
     from vvgt_cli.dvr.render import Box as Frame
     from vvgt_cli.dvr.render import camera_arrays
 
-    n, frame, dims = RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
+    n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
     larger = replace(
         camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
         width=n * camera.width, height=n * camera.height,
@@ -346,7 +335,7 @@ def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarr
     out = np.zeros((larger.height, larger.width), np.float32)
     for box, lo, hi in parts:
         faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])
-        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, STEP, out)
+        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, MIP_STEP, out)
     mean: np.ndarray = out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
     return mean
 
@@ -365,11 +354,7 @@ _COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sam
 
 
 def movie_ready(path: str | Path) -> None:
-    """Check that a movie of this name can be written.
-
-    Raises:
-        DataError: a library that it needs is not installed.
-    """
+    """Check that a movie of this name can be written; raise DataError if a library that it needs is not installed."""
     if Path(path).suffix.lower() == ".mp4":
         _ffmpeg(str(path))
 

@@ -387,19 +387,9 @@ def fields_of(
     renderer: str,
     stack: ExitStack,
 ) -> list[Blocked] | None:
-    """Open a field in blocks for each function, None if the volume is read as a whole.
+    """Return a field in blocks by folder of each function, None if the volume is read whole; ``stack`` closes them.
 
-    Args:
-        run: reports to the console.
-        source: the volume; its ``tf`` is not used.
-        options: of blocks, None: automatic.
-        functions: by folder.
-        size: pixels of a view's height.
-        renderer: requested ray caster.
-        stack: closes the fields.
-
-    Raises:
-        UsageError: a renderer that needs the volume in memory.
+    ``options`` None: automatic. Raise UsageError for a ``renderer`` that needs the volume in memory.
     """
     options = options or automatic(source, run.console)
     if options is None:

@@ -71,18 +71,7 @@ class Site:
 
 @contextmanager
 def served(site: Site, port: int = 0) -> Iterator[str]:
-    """Serve a site within the block.
-
-    Args:
-        site: the page and its files.
-        port: 0 takes a free one.
-
-    Yields:
-        URL of the page.
-
-    Raises:
-        UsageError: the port is taken, or not allowed.
-    """
+    """Serve a site within the block, yielding the page's URL; raise UsageError if the port (0: a free one) is taken."""
     handler = type("Handler", (_Handler,), {"site": site})
     try:
         server = _Server((ADDRESS, port), handler)
@@ -183,11 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _parsed(content: bytes) -> Any:
-    """Parse JSON that was sent.
-
-    Raises:
-        DataError: not JSON.
-    """
+    """Parse JSON that was sent, or raise DataError."""
     try:
         return json.loads(content.decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:

@@ -199,11 +199,7 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def expanded(names: Sequence[str]) -> list[str]:
-    """Return the files that names and globs stand for; those of a glob sorted by the numbers in their names.
-
-    Raises:
-        UsageError: a glob that matches nothing.
-    """
+    """Return the files of names and globs, sorted by numbers in names; raise UsageError if a glob matches nothing."""
     files: list[str] = []
     for name in names:
         found = [] if os.path.exists(name) or not set(name) & set("*?[") else [str(path) for path in matching(name)]

@@ -85,13 +85,7 @@ class Layout:
         return sorted({name.rpartition("/")[0] for name in names} | ({"sparse/0"} if self.format != "exr" else set()))
 
     def write(self, folder: Path, view: View, image: np.ndarray) -> list[str]:
-        """Write a view's images, replacing existing ones, and return their relative paths.
-
-        Args:
-            folder: of the set.
-            view: camera and split.
-            image: (h, w, 4) float32 premultiplied RGBA.
-        """
+        """Write a view's image (h, w, 4) float32 premultiplied over existing files, and return their relative paths."""
         for name in (files := self.files(view)):
             if name.endswith(".exr"):
                 write_exr(folder / name, image, half=self.half, camera=view.camera, overwrite=True)
@@ -117,13 +111,7 @@ class Layout:
         return {name: text.encode() for name, text in files.items()}
 
     def models(self, views: Sequence[View], points: np.ndarray, colors: np.ndarray) -> dict[str, bytes]:
-        """Return the point cloud, and with PNG the COLMAP model of the training views, by relative path.
-
-        Args:
-            views: of both splits.
-            points: (n, 3); empty if the layout has no points.
-            colors: (n, 3).
-        """
+        """Return the point cloud (n, 3), and with PNG the COLMAP model of the training views, by relative path."""
         files = {POINTS_FILE: point_cloud_ply(points, colors)} if self.points else {}
         if self.format != "exr":
             train = [view.camera for view in views if view.split == "train"]
@@ -141,10 +129,6 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none if nothing is visible.
 
     Large volumes are subsampled along each axis: the points lie much farther apart than voxels.
-
-    Args:
-        scene: the volume under its function.
-        size: image height in pixels.
     """
     from vvgt_cli.closed_form.closed_form import closed_form
 

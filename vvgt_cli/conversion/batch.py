@@ -121,11 +121,7 @@ class Batch(ABC):
         self.facts: dict[str, Any] = {}
 
     def check_names(self) -> None:
-        """Check that no two items have one name, as far as they are known.
-
-        Raises:
-            UsageError: two have.
-        """
+        """Raise UsageError if two items have one name, as far as names are known."""
         if len(set(self.stems)) < len(self.stems):
             stated = ", ".join(dict.fromkeys(self.stems))
             raise UsageError(f"{len(self.stems)} {self.kind}, named {stated}: expected one name each; rename one")
@@ -198,11 +194,7 @@ def options_in(request: ConvertRequest) -> set[str]:
 
 
 def check_options(kind: str, used: Iterable[str]) -> None:
-    """Refuse options that a kind of batch or output does not take.
-
-    Raises:
-        UsageError: names the first of them, and a remedy.
-    """
+    """Raise UsageError, with a remedy, for the first option that a kind of batch or output does not take."""
     for option, why in CANNOT[kind].items():
         if option in used:
             raise UsageError(f"{option} with {kind}: {why}")

@@ -76,11 +76,7 @@ def convert_in_memory(
     request: ConvertRequest, console: Console | None = None, start: WarmStart | None = None,
     unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """Convert a volume without writing anything; see `run_conversion` for the arguments.
-
-    Raises:
-        DataError, UsageError: see `convert`.
-    """
+    """Convert a volume without writing anything; arguments as of `run_conversion`, errors as of `convert`."""
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
         field = stack.enter_context(open_field(run, request))
@@ -91,11 +87,7 @@ def convert_in_memory(
 
 
 def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Convert a volume to a file by the closed form alone, without rendering anything.
-
-    Raises:
-        UsageError, DataError: see `convert`.
-    """
+    """Convert a volume to a file by the closed form alone, without rendering; errors are those of `convert`."""
     run = Run(console or Console(), ConversionReport("init"))
     with claimed(request.outputs(), request.inputs(), request.overwrite), open_field(run, request, INIT) as field:
         work = Work(run, field, request.fit, degree=degree_of(request, field.source))
@@ -104,11 +96,7 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
 
 
 def plan_conversion(request: ConvertRequest, console: Console | None = None) -> Plan:
-    """Return the plan of `convert`: the volume is read and laid out, and a small view is timed.
-
-    Raises:
-        DataError, UsageError: see `convert`.
-    """
+    """Return the plan of `convert`, after reading the volume and timing a small view; errors are those of `convert`."""
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
     if by_regions(request) and (request.blocks or automatic(request.source, run.console)) is not None:
@@ -123,11 +111,7 @@ def plan_conversion(request: ConvertRequest, console: Console | None = None) -> 
 
 
 def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
-    """Return the Gaussians of a conversion in the box frame, neither scored nor written.
-
-    Raises:
-        DataError, UsageError: see `convert`.
-    """
+    """Return a conversion's Gaussians, box frame, neither scored nor written; errors are those of `convert`."""
     with open_field(run, request) as field:
         work, planner, plan = _planned(run, request, field)
         check_memory(plan)
@@ -243,11 +227,7 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
 
 
 def improve(work: Work, plan: Plan) -> None:
-    """Run the planned stages before the scores, until a target is reached.
-
-    Raises:
-        DataError, UsageError: as the stages.
-    """
+    """Run the planned stages before the scores, until a target is reached; errors are those of the stages."""
     ahead = [stage for stage in plan.stages if not stage.scores]
     listed = improved = False
     for n, stage in enumerate([*ahead, None]):

@@ -78,10 +78,9 @@ class Files:
         self._stack = ExitStack()
 
     def names(self, kind: str, stem: str) -> list[str]:
-        """Return the names of output, report and preview of an item.
+        """Return an item's names of output, report and preview.
 
-        Raises:
-            UsageError: a pattern without one place for the name.
+        Raise UsageError unless patterns have one place for it.
         """
         request = self._request
         patterns = {"-o": request.output, "--report": request.report, "--preview": request.preview}
@@ -317,11 +316,7 @@ def _convert_levels(request: ConvertRequest, console: Console) -> None:
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
-    """Convert a batch to one page, or one file with a node for each item.
-
-    Raises:
-        DataError: nothing is visible in any of it.
-    """
+    """Convert a batch to a page, or a file with a node an item; raise DataError if nothing is visible in any."""
     run = Run(console, ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite):
         clouds = _run(batch, Memory(), console)

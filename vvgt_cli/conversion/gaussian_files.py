@@ -38,11 +38,7 @@ STDIN = STDOUT
 
 
 def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
-    """Return the drawing rule: the requested one, else the file's, else the default.
-
-    Raises:
-        UsageError: the rule is unknown.
-    """
+    """Return the drawing rule: the requested one, else the file's, else the default; raise UsageError if unknown."""
     return rule_of(asked or header.rule or INRIA)
 
 

@@ -99,11 +99,7 @@ def is_index(path: str | Path) -> bool:
 
 
 def read_index(path: str | Path) -> dict[str, Any]:
-    """Read the document of an index.
-
-    Raises:
-        DataError: not an index, or one without files or with files outside its folder.
-    """
+    """Read the document of an index; raise DataError if it names no files, or some outside its folder."""
     try:
         index: dict[str, Any] = json.loads(read_text(Path(path)))
         names = [PurePosixPath(row["file"]) for row in index["files"]]
@@ -125,11 +121,7 @@ def shown_name(name: str, facts: Mapping[str, Any]) -> str:
 
 
 def files_of(path: str | Path) -> list[tuple[str, str]]:
-    """List the name on a page and the file of each cloud of an index.
-
-    Raises:
-        DataError: see `read_index`; a file is missing.
-    """
+    """List name on a page and file of each cloud of an index; raise DataError as `read_index`, or if one is missing."""
     folder = Path(path).parent
     found = [(shown_name(row["name"], row), folder / row["file"]) for row in read_index(path)["files"]]
     if gone := [file for _, file in found if not file.is_file()]:

@@ -84,8 +84,7 @@ class Labels(Batch):
     def prepare(self, run: Run) -> None:
         """Read the map and its table, and those of the layers.
 
-        Raises:
-            DataError: see `convert`; no label is visible.
+        Raise DataError as `convert`, or if no label is visible.
         """
         source = self.request.source
         with run.stage("volume") as stage:
@@ -129,11 +128,7 @@ def unused(name: str, used: Sequence[str]) -> str:
 
 
 def check_lengths(first: Volume, other: Volume) -> None:
-    """Refuse a layer whose lengths are in another unit than the first volume's, or in one that is not known.
-
-    Raises:
-        DataError: names both units.
-    """
+    """Raise DataError for a layer whose lengths are in another unit than the first volume's, or in an unknown one."""
     own, its = ("mm" if volume.space else volume.unit for volume in (first, other))
     if metres(own) != metres(its):
         raise DataError(

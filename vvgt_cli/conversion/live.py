@@ -6,7 +6,7 @@ look is baked in, for programs that ignore the values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from vvgt_cli.conversion.plan import report_target
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.result import Conversion
-from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import DataError, NoLiveForm, NothingVisible, UsageError
@@ -39,21 +39,25 @@ from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.recognise import background_bins
-from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.label_maps import extents_of
+from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import triple
+
+FOG_NAME = "fog"
+THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
+BETWEEN = 9  # places around a node where the function that is given may show something
+NODES = 129  # of a function over 256 bins
+HIDDEN_WEIGHT = 0.25  # how much a label of opacity 0 counts, which another table may show
+VOXELS_POWER = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
+GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
 
 
 def check_live(request: ConvertRequest) -> None:
-    """Check that a request has no option that live files do not take.
-
-    Raises:
-        NoLiveForm: names the options.
-    """
+    """Raise NoLiveForm, which names them, for options of a request that live files do not take."""
     fit, limits, light = request.fit, request.limits, request.source.light
     given = {
         "--target-psnr": limits.target_psnr is not None,
@@ -118,6 +122,9 @@ def convert_live(
         report_target(run, fit, request.megabytes)
     lighting, pixel = box_lighting(source), pixel_width(fit.size)
     check_layers(source)
+    axes = headset_axes(source.volume, ply_options(request, source).up)
+    scores = [TestViews(request.scored_whole), ViewingConditions(fit.target, axes)] if scored else []
+    field.views.expect([picture for stage in scores for picture in stage.views(fit)])
     if len(source.layers) > 1:
         gaussians, facts = _several_layers(run, request, field)
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
@@ -129,7 +136,7 @@ def convert_live(
     if unscored is not None:
         unscored(found)
     if scored:
-        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel))
+        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel), scores)
         found.ply = with_certificate(found.ply, run, field, fit, found.gaussians, request.command, psnr)
     return found
 
@@ -185,11 +192,7 @@ def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Ga
 
 
 def check_layers(source: Source) -> None:
-    """Check that all layers have values or labels.
-
-    Raises:
-        NoLiveForm: a layer has colours.
-    """
+    """Raise NoLiveForm if a layer has colours, neither values nor labels."""
     if any(layer.colors for layer in source.layers):
         raise NoLiveForm(
             f"{source.name}: has colours, which Gaussians cannot carry as one value; expected scalars or labels with "
@@ -197,8 +200,10 @@ def check_layers(source: Source) -> None:
         )
 
 
-def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> float:
-    """Score Gaussians as other viewers show the file, and return the PSNR (dB) as `vvgt recolor` shows it."""
+def _score(
+    run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians, scores: Sequence[Stage]
+) -> float:
+    """Return the PSNR (dB) of Gaussians as `vvgt recolor` shows them; ``scores`` are those of other viewers."""
     from vvgt_cli.dvr import RenderSettings
 
     fit, source = request.fit, field.source
@@ -209,10 +214,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
         )
         stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as other viewers show it"
     work = Work(run, field, fit, gaussians=gaussians)
-    for stage_of_scores in (
-        TestViews(request.scored_whole),
-        ViewingConditions(fit.target, headset_axes(source.volume, ply_options(request, source).up)),
-    ):
+    for stage_of_scores in scores:
         stage_of_scores.run(work)
     return live.psnr
 
@@ -244,11 +246,7 @@ def function_table(source: Source) -> Table:
 
 
 def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:
-    """Return the closed form of a fog.
-
-    Raises:
-        NothingVisible: the volume is only background.
-    """
+    """Return the closed form of a fog; raise NothingVisible if the volume is only background."""
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
@@ -283,11 +281,7 @@ def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
 
 
 def live_labels(source: Source) -> tuple[Label, ...]:
-    """Return the labels that Gaussians can belong to, invisible ones included, which other tables may show.
-
-    Raises:
-        DataError: there are more than `MOST_LABELS`.
-    """
+    """Return labels that Gaussians can belong to, invisible ones too; raise DataError for more than `MOST_LABELS`."""
     table = source.tf
     assert isinstance(table, LabelTable)
     found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
@@ -313,13 +307,13 @@ def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
 
 def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Return the Gaussians of the fog with the rows of their labels, without those outside all labels."""
-    from vvgt_cli.closed_form.labelled import assign_labels
+    from vvgt_cli.closed_form.labelled import labels_and_gradients
 
     assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source
     with run.stage("labels") as stage:
         maps = [(source.layers[0].volume, [label.number for label in labels])]
-        owner, gradient = assign_labels(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
+        owner, gradient = labels_and_gradients(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
         known = np.flatnonzero(owner >= 0)
         gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
         owner, gradient = owner[known], gradient[known]
@@ -330,16 +324,7 @@ def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...])
     return replace(gaussians, live=live, harmonics=None)
 
 
-NAME = "fog"
-THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
-BETWEEN = 9  # places around a node where the function that is given may show something
-NODES = 129  # of a function over 256 bins
-HIDDEN_WEIGHT = 0.25  # how much a label of opacity 0 counts, which another table may show
-SMALL = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
-GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
-
-
-def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> TransferFunction:
+def fog(statistics: Statistics, shown: TransferFunction | None = None) -> TransferFunction:
     """Return a function that is transparent only in the background, and denser the farther a value is from it.
 
     Args:
@@ -371,7 +356,11 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
     share = t[: len(x)]
     colors = np.stack([share, share**2, np.zeros(len(x))], axis=1)
     return TransferFunction(
-        NAME, PiecewiseOpacity(x, opacity), ColorMap(x, colors), opacity_unit_share=UNIT_SHARE, opacity_unit_label=NAME
+        FOG_NAME,
+        PiecewiseOpacity(x, opacity),
+        ColorMap(x, colors),
+        opacity_unit_share=UNIT_SHARE,
+        opacity_unit_label=FOG_NAME,
     )
 
 
@@ -383,7 +372,7 @@ def label_fog(table: LabelTable, voxels: Mapping[int, int]) -> LabelTable:
     """
     least, labels = max(min(voxels.values(), default=1), 1), []
     for number, label in enumerate(table.labels):
-        code, weight = (number * GOLDEN) % 1, (least / max(voxels.get(label.number, least), least)) ** SMALL
+        code, weight = (number * GOLDEN) % 1, (least / max(voxels.get(label.number, least), least)) ** VOXELS_POWER
         weight *= 1 if label.opacity > 0 else HIDDEN_WEIGHT
         labels.append(replace(label, color=(code, code**2, weight), opacity=THIN if label.number in voxels else 0.0))
-    return LabelTable(NAME, tuple(labels))
+    return LabelTable(FOG_NAME, tuple(labels))

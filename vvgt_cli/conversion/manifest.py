@@ -40,11 +40,7 @@ class Shard:
 
 
 def parse_shard(text: str) -> Shard:
-    """Parse ``I/N``, I from 1 to N.
-
-    Raises:
-        UsageError: the text is invalid.
-    """
+    """Parse ``I/N``, I from 1 to N, or raise UsageError."""
     match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise UsageError(f"--shard {text}: expected I/N with I from 1 to N, as 3/8")
@@ -154,10 +150,9 @@ class Manifest:
 
 
 def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
-    """Read the document of a manifest, for a folder of ``what`` (a key of `COMMANDS`).
+    """Read the manifest of a folder of ``what`` (a key of `COMMANDS`).
 
-    Raises:
-        DataError: not a manifest, or one with files outside its folder.
+    Raise DataError if it is none, or leads outside.
     """
     try:
         document = json.loads(read_text(path))

@@ -1,4 +1,4 @@
-"""The warm start of a frame from the previous one: only Gaussians where the two frames differ move."""
+"""Warm start of a frame from the previous one: where they agree, Gaussians stay and blocks of views are reused."""
 
 from __future__ import annotations
 

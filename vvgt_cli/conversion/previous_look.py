@@ -45,11 +45,7 @@ class PreviousLook(WarmStart):
         self.earlier = earlier
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Implement `WarmStart.try_start`.
-
-        Raises:
-            UsageError: the earlier conversion is of another volume.
-        """
+        """Implement `WarmStart.try_start`; raise UsageError if the earlier conversion is of another volume."""
         why = self._obstacle(work, request)
         if why is None:
             work.run.compile(LIVE, work.field.source.kernel_type())

@@ -79,11 +79,7 @@ Look = TransferFunction | LabelTable | SeveralLooks
 
 
 def parse_layer_look(text: str) -> LayerLook:
-    """Parse ``LAYER[,tf=TF][,labels=TABLE][,distance=D]``.
-
-    Raises:
-        UsageError: an unknown key, or no look.
-    """
+    """Parse ``LAYER[,tf=TF][,labels=TABLE][,distance=D]``; raise UsageError for an unknown key, or no look."""
     name, *rest = re.split(r",(?=[a-z]+=)", text)
     given = dict(entry.split("=", 1) for entry in rest if "=" in entry)
     if not name or not rest or set(given) - {"tf", "labels", "distance"} or not all(given.values()):
@@ -233,11 +229,7 @@ def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionReques
 
 
 def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
-    """Return the number of a layer given by number, name, or a part of its name.
-
-    Raises:
-        UsageError: no layer of that name, or several.
-    """
+    """Return the number of a layer given by number, name, or a part of its name; raise UsageError unless one fits."""
     if asked.isdecimal() and int(asked) < len(layers):
         return int(asked)
     exact = [k for k, layer in enumerate(layers) if layer.name == asked]
@@ -250,11 +242,7 @@ def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
 def layer_look(
     header: PlyHeader | PlyOptions, key: int | str, look: str | TransferFunction | LabelTable
 ) -> LayerLook:  # fmt: skip
-    """Return the look of a layer: a label table where it carries labels, and a function where it carries values.
-
-    Raises:
-        UsageError: no such layer.
-    """
+    """Return the look of a layer, a label table for labels and a function for values; raise UsageError for no layer."""
     layers = () if header.live is None else header.live.layers
     labels = bool(layers) and bool(layers[layer_number("result", layers, str(key))].labels)
     if isinstance(look, TransferFunction) or (isinstance(look, str) and not labels):
@@ -312,11 +300,7 @@ def light_of(asked: LightOptions, preset: Lighting | None, space: str | None) ->
 
 
 def grid_of(name: str, header: FileFacts) -> Volume:
-    """Return the grid of the volume that a file was made of, without values.
-
-    Raises:
-        DataError: the header does not place the grid.
-    """
+    """Return the grid of the volume of a file, without values; raise DataError if the header does not place it."""
     if header.live is None or header.affine is None or header.scale is None:
         raise DataError(f"{name}: its header does not describe the grid of the values; expected a file of 'vvgt'")
     affine = np.reshape(header.affine, (3, 4))

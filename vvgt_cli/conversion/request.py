@@ -93,10 +93,9 @@ class Limits:
             raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
 
     def gaussians(self, most: int, header: float, each: float) -> int:
-        """Return the number of Gaussians that budget and file size allow, of so many bytes each, after a header.
+        """Return how many Gaussians of ``each`` bytes budget and file size allow after a header.
 
-        Raises:
-            UsageError: not even one fits.
+        Raise UsageError if none.
         """
         if self.max_megabytes is None:
             return most

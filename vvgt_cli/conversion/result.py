@@ -117,11 +117,7 @@ class Result:
         self, frame: str | None = None, up: str | None = None, sh_degree: int | None = None,
         comments: bool | None = None,
     ) -> PlyOptions:  # fmt: skip
-        """Return the layout of a file; arguments as in `save`.
-
-        Raises:
-            UsageError: a value is invalid.
-        """
+        """Return the layout of a file; arguments as in `save`. Raise UsageError if a value is invalid."""
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
         frame = frame or old.frame
         return replace(

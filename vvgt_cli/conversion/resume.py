@@ -75,11 +75,7 @@ class Checkpoint:
         return gaussians, beside
 
     def save(self, name: str, gaussians: Gaussians, **beside: Any) -> None:
-        """Save the result of a stage.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
+        """Save the result of a stage, or raise DataError."""
         if self.folder is None:
             return
         arrays: dict[str, Any] = gaussians.arrays()
@@ -120,11 +116,7 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
 
 
 def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Limits) -> Checkpoint:
-    """Return the checkpoint of a conversion, with the key of everything that it depends on.
-
-    Raises:
-        DataError: the model of ``fit`` is unreadable.
-    """
+    """Return a conversion's checkpoint, keyed by all that it depends on; raise DataError if its model is unreadable."""
     if folder is None:
         return Checkpoint()
     source = field.source

@@ -33,15 +33,10 @@ class BlockStore:
     folder: Path
 
     def open(self, settings: dict[str, Any], ours: bool) -> bool:
-        """Create the folder, or reuse it after a run with the same settings; return whether it existed.
+        """Create the folder, or reuse it after a run with the same (plain) settings; return whether it existed.
 
-        Args:
-            settings: everything that the results depend on, plain values.
-            ours: the folder belongs to this program, which removes another run's results.
-
-        Raises:
-            UsageError: the folder holds another run's results, or something else.
-            DataError: the folder cannot be written.
+        A folder that is ``ours`` loses another run's results; else raise UsageError for these, DataError if it is
+        unwritable.
         """
         text = json.dumps(settings, sort_keys=True, indent=1)
         place = self.folder / RUN
@@ -79,11 +74,7 @@ class BlockStore:
         return edge if found == json.loads(json.dumps(settings)) else None
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings given to `open`.
-
-        Raises:
-            UsageError: this is not a folder of blocks.
-        """
+        """Return the settings given to `open`; raise UsageError if this is not a folder of blocks."""
         try:
             found = json.loads((self.folder / RUN).read_text("utf-8"))
         except (OSError, ValueError):
@@ -97,11 +88,7 @@ class BlockStore:
         return self.folder / kind / f"{number:06d}{suffix}"
 
     def prepare(self, kind: str) -> None:
-        """Create the folder of a pass.
-
-        Raises:
-            DataError: the folder cannot be written.
-        """
+        """Create the folder of a pass, or raise DataError."""
         try:
             (self.folder / kind).mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -126,20 +113,12 @@ class BlockStore:
     def load(
         self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of a result, by default all.
-
-        Raises:
-            DataError: the file is missing or damaged.
-        """
+        """Return the arrays of a result, by default all; raise DataError if the file is missing or damaged."""
         with self._opened(kind, number, suffix) as found:
             return {name: found[name] for name in (found.files if names is None else names)}
 
     def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
-        """Return the names of a result's arrays.
-
-        Raises:
-            DataError: the file is missing or damaged.
-        """
+        """Return the names of a result's arrays; raise DataError if the file is missing or damaged."""
         with self._opened(kind, number, suffix) as found:
             return frozenset(found.files)
 

@@ -246,11 +246,7 @@ class ExtinctionBlocks(Blockwise):
         self.store.save(self.kind, number, extinction=out)
 
     def gathered(self) -> np.ndarray:
-        """Return the cells of the whole volume, (cz, cy, cx) float32.
-
-        Raises:
-            DataError: a result is missing or damaged.
-        """
+        """Return the cells of the whole volume, (cz, cy, cx) float32; raise DataError if one is missing or damaged."""
         out = np.empty(tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.float32)
         for number in range(len(self)):
             x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])

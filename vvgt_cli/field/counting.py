@@ -6,6 +6,7 @@ figures are those of `stats.statistics`, to the bit, however the volume is cut.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -17,11 +18,12 @@ from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, Place
-from vvgt_cli.field.settings import counted_boxes, slices_at_once
+from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
+from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.label_maps import MOST
 from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
-from vvgt_cli.volume.stored import read_block, readable_in_blocks
+from vvgt_cli.volume.stored import read_block
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,7 @@ class CountBlocks:
         )
 
     def merged(self) -> Tally:
-        """Return the sum over all boxes.
-
-        Raises:
-            DataError: a result is missing or damaged.
-        """
+        """Return the sum over all boxes; raise DataError if a result is missing or damaged."""
         whole: Tally | None = None
         for number in range(len(self)):
             part = self.store.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
@@ -127,14 +125,7 @@ class BlockAccess:
     def __init__(
         self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
-        """Prepare for counting.
-
-        Args:
-            store: destination of the results.
-            edge: edge of blocks in voxels.
-            run: runs the missing blocks of a task.
-            histogram: whether a histogram is needed even for types that are not counted value by value.
-        """
+        """Prepare for counting; a ``histogram`` may be needed even for types that are not counted value by value."""
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
@@ -161,11 +152,7 @@ class BlockAccess:
         return self._places[id(volume)][1]
 
     def counts(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
-        """Return the counting task of a volume, its counts and its statistics.
-
-        Raises:
-            DataError: no voxel has a finite value.
-        """
+        """Return a volume's counting task, its counts and its statistics; raise DataError if no voxel is finite."""
         if id(volume) not in self._done:
             self._done[id(volume)] = self._counted(volume)
         return self._done[id(volume)]
@@ -173,17 +160,18 @@ class BlockAccess:
     def _counted(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
         suffix = str(self._count) if self._count else ""
         self._count += 1
-        if not readable_in_blocks(volume):
+        if isinstance(volume.data, Packed):
             raise UsageError(
                 f"{volume.name}: compressed as one stream, which cannot be read in blocks; decompress it (raw, .nhdr "
                 "and .nii files are mapped), or store it in chunks (Zarr, HDF5)"
             )
-        edge = self._edge
-        boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
+        shape, spacing = shape_of(volume, self._edge), sample_spacing(volume.dims)
+        x, y, z = (max(e, spacing) for e in shape)  # boxes are aligned to the lattice of samples
         labels = not counted(volume) and volume.data.dtype.kind in "iu"
         first = CountBlocks(
-            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._store, COUNTS + suffix, labels=labels
-        )
+            self.place(volume), Boxes(volume.dims, (x, y, z)), max(math.prod(shape) // (x * y), 1), self._store,
+            COUNTS + suffix, labels=labels,
+        )  # fmt: skip
         self._run(first)
         whole = with_limits(first.merged(), volume)
         histogram = None
@@ -198,11 +186,7 @@ class BlockAccess:
         return self.counts(volume)[2]
 
     def labels(self, volume: Volume) -> list[int]:
-        """Return the labels that a volume holds, ascending.
-
-        Raises:
-            DataError: data values are not integers, or there are too many distinct ones.
-        """
+        """Return a volume's labels, ascending; raise DataError for too many, or data that are not integers."""
         task, whole, _ = self.counts(volume)
         if counted(volume):
             kind = volume.data.dtype.newbyteorder("=")

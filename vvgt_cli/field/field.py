@@ -75,18 +75,10 @@ class Field(Protocol):
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """Return mean value, spread, axis of the normals and gradient under Gaussians of the box frame, (K, 8) float32.
-
-        Raises:
-            UsageError: the source is an optics grid, which has no scalar values.
-        """
+        """Return mean value, spread, normals' axis and gradient under Gaussians of the box frame, (K, 8) float32."""
 
     def with_look(self, source: Source) -> Field:
-        """Return the field of the same volume with another look.
-
-        Args:
-            source: a variant of ``self.source``; the statistics of a single layer are computed here.
-        """
+        """Return the field of the same volume with another look; statistics of a single layer are computed here."""
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """Return the mean gradient directions (K, 3) around Gaussians of the box frame; None without light."""

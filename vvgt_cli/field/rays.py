@@ -67,11 +67,7 @@ class RayFile:
 
     @classmethod
     def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
-        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
+        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``, or raise DataError."""
         arrays: dict[str, np.ndarray] = {}
         for k, bundle in enumerate(bundles):
             eye, basis, lens = camera_arrays(frame, bundle.camera)
@@ -87,11 +83,7 @@ class RayFile:
         return cls(str(path), name)
 
     def bundles(self) -> list[KernelBundle]:
-        """Return the bundles for the kernels, read once per process.
-
-        Raises:
-            DataError: the file is damaged or missing.
-        """
+        """Return the bundles for the kernels, read once per process; raise DataError if they are damaged or missing."""
         return _read(self.path)
 
 
@@ -130,15 +122,9 @@ def pieces_of(dims: tuple[int, int, int]) -> Boxes:
 
 
 def save_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, store: BlockStore) -> None:
-    """Cast all rays through the pieces of a block, and save what they see.
+    """Cast all rays through the pieces of block ``number`` of ``blocks``, and save what they see.
 
-    Args:
-        rays: the rays.
-        block: voxels of the block, with `HALO` or, under light, `LIT_HALO` voxels around it.
-        number: number of the block.
-        blocks: all blocks, each of whole pieces.
-        light: lighting, None for none.
-        store: destination of the result.
+    ``block`` has `HALO` or, under light, `LIT_HALO` voxels around it.
     """
     pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
     lo, hi = blocks.at(number)

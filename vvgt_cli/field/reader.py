@@ -120,11 +120,7 @@ class Scalars:
         return self.rule.dtype.itemsize + 8
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
-        """Read the voxels ``lo`` to ``hi`` (3,), x first.
-
-        Raises:
-            DataError: the file ends early, or a chunk is damaged.
-        """
+        """Read the voxels ``lo`` to ``hi`` (3,), x first; raise DataError if the file or a chunk is damaged."""
         stored = read_block(self.place.volume(), lo, hi)
         if self.rule.half_width is None and stored.dtype == self.rule.dtype:
             values = stored

@@ -128,11 +128,7 @@ class Processes:
             self._pool = None
 
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Process the blocks ``numbers``.
-
-        Raises:
-            DataError: workers are killed repeatedly without finishing a block.
-        """
+        """Process the blocks ``numbers``; raise DataError if workers are killed repeatedly without finishing one."""
         from concurrent.futures import ProcessPoolExecutor, as_completed
         from concurrent.futures.process import BrokenProcessPool
 
@@ -172,11 +168,7 @@ WAIT = "15s"  # for a scheduler to answer
 
 
 def _need(name: str) -> Any:
-    """Import a package of the extra `cluster`.
-
-    Raises:
-        DataError: the package is not installed.
-    """
+    """Import a package of the extra `cluster`; raise DataError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:

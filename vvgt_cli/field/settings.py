@@ -53,12 +53,6 @@ def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: in
     """Return the number of processes: as many as threads where there is much to do and memory for each.
 
     Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md).
-
-    Args:
-        options: the user's choice.
-        voxels: number of voxels to process.
-        gaussians: budget of Gaussians.
-        threads: threads that the process may use.
     """
     if options.workers is not None or options.scheduler is not None or options.shard is not None:
         return options.workers or 1
@@ -110,18 +104,6 @@ def shape_of(volume: Volume, edge: int) -> Triple:
         return edge, edge, edge
     across = 1 << max(math.ceil(math.log2(max(volume.dims[0], 2))), 4)
     return max(across, edge), edge, edge
-
-
-def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
-    """Return the boxes in which values are counted, aligned to the lattice of samples."""
-    x, y, z = (max(e, spacing) for e in shape_of(volume, edge))
-    return Boxes(volume.dims, (x, y, z))
-
-
-def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
-    """Return how many slices of a box hold as many voxels as a block of ``edge``."""
-    x, y, _ = boxes.edge
-    return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
 
 
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least: int = 1) -> CellGrid:

@@ -57,11 +57,7 @@ class SourceRequest:
 
     @property
     def path(self) -> str:
-        """Path of the volume's file.
-
-        Raises:
-            UsageError: the volume is already in memory.
-        """
+        """Path of the volume's file; UsageError if the volume is already in memory."""
         if not isinstance(self.volume, str):
             raise UsageError(f"{content_of(self.volume).volumes[0].name}: a volume in memory; expected a path here")
         return self.volume
@@ -74,11 +70,7 @@ class SourceRequest:
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
-    """Parse a layer, ``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
-
-    Raises:
-        UsageError: there is no file, or an unknown key.
-    """
+    """Parse a layer, ``FILE[,tf=TF][,labels=TABLE][,component=N]...``, or raise UsageError."""
     path, *rest = re.split(r",(?=[a-z]+=)", text)
     given: dict[str, Any] = {}
     for part in rest:
@@ -192,11 +184,7 @@ class Source:
         return slices_of([None if layer.colors else (layer.volume, layer.tf) for layer in self.layers], room)
 
     def with_function(self, tf: TransferFunction) -> Source:
-        """Return the same volume under another function on data values, unlit.
-
-        Raises:
-            UsageError: the source is an optics grid.
-        """
+        """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""
         from vvgt_cli.look import unit_distance
 
         self.require_scalar_field()

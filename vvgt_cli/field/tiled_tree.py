@@ -14,16 +14,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.moments import Cells, morton
-from vvgt_cli.closed_form.tree import (
-    Leaves,
-    Tree,
-    build_tree,
-    cap_by_ancestors,
-    leaves_of,
-    pyramid,
-    shown,
-    split_score,
-)
+from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, cap_by_ancestors, leaves_of, pyramid, shown, split_score
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
@@ -117,11 +108,7 @@ class Coarse:
 
     @classmethod
     def load(cls, store: BlockStore) -> Coarse:
-        """Read what `gathered` saved.
-
-        Raises:
-            DataError: the file is missing or damaged.
-        """
+        """Read what `gathered` saved; raise DataError if the file is missing or damaged."""
         part = store.load(COARSE, 0)
         tiles = [Tile((x, y, z), block, offset, cells) for x, y, z, block, offset, cells in part["tiles"].tolist()]
         seen = Visibility(part["mean"], part["largest"], part["edge"])
@@ -156,11 +143,7 @@ class TileTrees:
         return None if len(self.coarse.tiles) == 1 else self.grid.bits
 
     def tree(self, tile: Tile) -> Tree:
-        """Return the tree of a tile.
-
-        Raises:
-            DataError: its block is damaged.
-        """
+        """Return the tree of a tile; raise DataError if its block is damaged."""
         return build_tree(self._cells(tile), self.coarse.seen, np.array(self.grid.step), self.levels)
 
     def shaded(self, tile: Tile, tree: Tree, nodes: np.ndarray) -> np.ndarray:
@@ -204,11 +187,7 @@ class TileTrees:
         return Cells(index, moments, self.grid.cell_edge, np.array(self.grid.exponent, np.int64))
 
     def _normals(self, tile: Tile) -> np.ndarray:
-        """Return the normals (n, 3) of the base cells of a tile's tree.
-
-        Raises:
-            DataError: the file is truncated.
-        """
+        """Return the normals (n, 3) of the base cells of a tile's tree; raise DataError if the file is truncated."""
         path = self.store.path(CELLS, tile.block, NORMALS)
         try:
             whole = np.load(path, mmap_mode="r")[tile.offset : tile.offset + tile.cells]

@@ -1,4 +1,4 @@
-"""The header of a 3DGS `.ply`, which is parsed and checked before any data is read."""
+"""The header of a 3DGS `.ply`, checked before any data is read; its facts, legends and certificates."""
 
 from __future__ import annotations
 
@@ -163,15 +163,7 @@ def rest_names(degree: int) -> list[str]:
 
 
 def parse_header(content: bytes, name: str) -> PlyHeader:
-    """Parse the header of a file.
-
-    Args:
-        content: the beginning of the file, with the whole header.
-        name: name of the file for errors.
-
-    Raises:
-        DataError: the magic, format, elements, properties or types are not those of a 3DGS `.ply`.
-    """
+    """Parse the header at the beginning of a file; raise DataError if it is not that of a 3DGS `.ply`."""
     lines, size = header_lines(content, name)
     formats, count, comments = [], None, []
     fields: dict[str, str] = {}
@@ -229,11 +221,7 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
 
 
 def _one_comment(word: str, text: str) -> dict[str, Any]:
-    """Return the facts of a comment ``vvgt WORD TEXT``.
-
-    Raises:
-        ValueError, IndexError, UsageError: the comment is not one that `comment_lines` writes.
-    """
+    """Return the facts of a comment ``vvgt WORD TEXT``; raise ValueError, IndexError or UsageError for others."""
     words = text.split()
     if word == "frame":
         if words[0] not in ("unit", "world"):
@@ -279,11 +267,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
 
 
 def camera_of(words: Sequence[str]) -> tuple[float, ...]:
-    """Return the seven numbers of a camera: eye, target, vertical field of view in degrees.
-
-    Raises:
-        ValueError: another count, no numbers, eye and target at one place, or no field of view.
-    """
+    """Return the seven numbers of a camera (eye, target, vertical field of view in degrees), or raise ValueError."""
     numbers = _finite(list(words))
     if len(numbers) != 7 or numbers[:3] == numbers[3:6] or not 0 < numbers[6] < 180:
         raise ValueError(words)
@@ -375,11 +359,7 @@ def _hex(rgb: Any) -> str:
 
 
 def checked(text: str) -> str:
-    """Check that a text is a legend, and return it.
-
-    Raises:
-        ValueError: the text is not a legend.
-    """
+    """Check that a text is a legend, and return it; raise ValueError for others."""
     found = json.loads(text)
     if not isinstance(found, dict) or not ("nodes" in found or "labels" in found):
         raise ValueError(text)
@@ -433,11 +413,7 @@ class Certificate:
 
     @classmethod
     def of(cls, text: str) -> Certificate:
-        """Parse the JSON that `line` writes after its keyword.
-
-        Raises:
-            ValueError: the text is something else.
-        """
+        """Parse the JSON that `line` writes after its keyword, or raise ValueError."""
         found = json.loads(text)
         if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):
             raise ValueError(text)

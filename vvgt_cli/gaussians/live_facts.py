@@ -90,11 +90,7 @@ class LiveFacts:
         return dict(json.loads(self.function)) if self.function else {}
 
     def tf(self, name: str) -> TransferFunction:
-        """Return the file's own function on data values.
-
-        Raises:
-            DataError: the file ``name`` has no function.
-        """
+        """Return the file's own function on data values; raise DataError if the file ``name`` has none."""
         if not self.function:
             raise DataError(f"{name}: no function in its header; expected one: pass --tf")
         return read(self.baked(), f"the function of {name}")
@@ -144,11 +140,7 @@ def label_text(label: Label) -> str:
 
 
 def one_comment(text: str) -> dict[str, Any]:
-    """Return the facts of a comment, given the text after ``vvgt live``.
-
-    Raises:
-        ValueError, IndexError: the comment is not one that `LiveFacts.lines` writes.
-    """
+    """Return the facts of a comment, from the text after ``vvgt live``; raise ValueError or IndexError for others."""
     word, text = text.split(None, 1)
     words = text.split()
     if word == "values":
@@ -181,11 +173,7 @@ def one_comment(text: str) -> dict[str, Any]:
 
 
 def _quoted(text: str) -> str:
-    """Return the text that a JSON string holds.
-
-    Raises:
-        ValueError: the text is not a JSON string.
-    """
+    """Return the text that a JSON string holds, or raise ValueError."""
     found = json.loads(text)
     if not isinstance(found, str):
         raise ValueError(text)

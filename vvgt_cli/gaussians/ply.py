@@ -111,12 +111,15 @@ def write_ply(
     return len(header) + rows.nbytes
 
 
-def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None = None) -> np.ndarray:
-    """Return the rows of a file, (K, properties) float32 little-endian, as written by `write_ply`.
+def as_ply(gaussians: Gaussians, options: PlyOptions | None = None, normals: np.ndarray | None = None) -> bytes:
+    """Return the file that `write_ply` would write, with its errors."""
+    stream = io.BytesIO()
+    write_ply(stream, gaussians, options, normals)
+    return stream.getvalue()
 
-    Raises:
-        DataError, UsageError: see `write_ply`.
-    """
+
+def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None = None) -> np.ndarray:
+    """Return the rows of a file, (K, properties) float32 little-endian, as `write_ply` writes them, with its errors."""
     _check_rotations(gaussians, "Gaussians to write")
     placed = turn(gaussians if options.sh_degree is None else gaussians.of_degree(options.sh_degree), options.up)
     if options.frame == "world":
@@ -267,11 +270,7 @@ def _harmonics(rest: np.ndarray) -> np.ndarray | None:
 
 
 def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray | None:
-    """Return `Gaussians.live` from the columns of a file, None if it has none.
-
-    Raises:
-        DataError: a length, spread, layer or label is out of range.
-    """
+    """Return `Gaussians.live` from columns, None if there are none; raise DataError if a value is out of its range."""
     if header.live is None:
         return None
     facts, numbers = header.live, _numbers(header.live)

@@ -88,11 +88,7 @@ VIEWERS = ("inria", "compensated", "spark", "playcanvas", "viser")  # of program
 
 
 def rule_of(rule: str | Rule) -> Rule:
-    """Return a rule by its name.
-
-    Raises:
-        UsageError: there is no such rule.
-    """
+    """Return a rule by its name; raise UsageError if there is none."""
     if isinstance(rule, Rule):
         return rule
     if rule not in RULES:

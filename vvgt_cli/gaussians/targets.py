@@ -54,22 +54,14 @@ TARGETS = {
 
 
 def target_of(name: str | None) -> Target | None:
-    """Return a target by its name; None for none.
-
-    Raises:
-        UsageError: there is no such target.
-    """
+    """Return a target by its name, None for none; raise UsageError if it is unknown."""
     if name is not None and name not in TARGETS:
         raise UsageError(f"target {name!r}; expected one of {', '.join(TARGETS)}")
     return None if name is None else TARGETS[name]
 
 
 def check_opened(path: str, name: str | None) -> None:
-    """Refuse a file that no program of a target opens; ``name`` is None for none.
-
-    Raises:
-        UsageError: names the ending that most of them open.
-    """
+    """Raise UsageError for a file that no program of a target opens; ``name`` is None for none."""
     target = target_of(name)
     if target is not None and path.lower().endswith(target.unread):
         raise UsageError(f"-o {path} with --for {name}: no program there opens it; expected {target.best}")

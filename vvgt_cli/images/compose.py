@@ -13,18 +13,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 
 def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BLACK) -> np.ndarray:
-    """Composite premultiplied RGBA over a background.
-
-    Args:
-        rgba: (..., 4).
-        background: a colour, a grey or an image (..., 3).
-
-    Returns:
-        (..., 3) float32, not clipped.
-
-    Raises:
-        DataError: the image does not have four channels.
-    """
+    """Composite premultiplied RGBA (..., 4) over a colour, grey or image (..., 3); return float32, not clipped."""
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.shape[-1:] != (4,):
         raise DataError(f"image of shape {rgba.shape}; expected four channels, premultiplied RGBA")
@@ -44,13 +33,7 @@ def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
 def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> np.ndarray:
     """Join reference, ours and their absolute difference times ``gain``, (h, 3 w, 3) float32 in [0, 1].
 
-    Args:
-        reference: (h, w, 3) RGB, or (h, w, 4) premultiplied RGBA, which is composited over black.
-        ours: an image of the same size.
-        gain: factor of the difference.
-
-    Raises:
-        DataError: the sizes differ, or the arrays are not images.
+    Images are (h, w, 3) RGB, or (h, w, 4) premultiplied, over black. Raise DataError for others, or other sizes.
     """
     left, right = _rgb(reference, BLACK), _rgb(ours, BLACK)
     if left.shape != right.shape:
@@ -61,16 +44,10 @@ def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> 
 def contact_sheet(
     images: Sequence[np.ndarray], columns: int | None = None, gap: int = 4, background: Sequence[float] = BLACK
 ) -> np.ndarray:
-    """Lay images of one size out in rows, ``gap`` pixels apart, (H, W, 3) float32 in [0, 1].
+    """Lay images of one size out in rows, ``gap`` pixels apart, over ``background``, (H, W, 3) float32 in [0, 1].
 
-    Args:
-        images: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA each; at least one.
-        columns: images per row, by default the square root of their number, rounded up.
-        gap: pixels between images.
-        background: colour behind RGBA images, in gaps and in empty cells.
-
-    Raises:
-        DataError: there are no images, their sizes differ, or ``columns`` is below 1.
+    Images are (h, w, 3) RGB or (h, w, 4) premultiplied; ``columns`` is by default the square root of their number,
+    rounded up. Raise DataError for none, for other sizes, or ``columns`` below 1.
     """
     tiles = [_rgb(image, background) for image in images]
     if not tiles or len({tile.shape for tile in tiles}) != 1:

@@ -58,11 +58,7 @@ def load_views(directory: str | PathLike[str], split: str = "train") -> tuple[li
 
 
 def read_view(path: str | PathLike[str]) -> np.ndarray:
-    """Read the image at ``path`` (with or without a suffix), EXR or else PNG: (h, w, 4) float32 premultiplied.
-
-    Raises:
-        DataError: the image is missing or damaged.
-    """
+    """Read the image at ``path`` (any suffix), EXR or else PNG: (h, w, 4) float32 premultiplied, or raise DataError."""
     stem = Path(path)
     if stem.suffix in SUFFIXES:
         stem = stem.with_suffix("")

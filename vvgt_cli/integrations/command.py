@@ -16,11 +16,7 @@ ENDED = "vvgt: ended: "  # a status, as vvgt_cli/cli/main.py says of each of sev
 
 
 def command() -> list[str]:
-    """Return the words that start ``vvgt``: those of the environment variable VVGT, else its place in PATH.
-
-    Raises:
-        RuntimeError: there is none.
-    """
+    """Return the words that start ``vvgt``, of the variable VVGT or its place in PATH, or raise RuntimeError."""
     given = os.environ.get("VVGT")
     whole = shutil.which(given or "vvgt")  # a path may hold spaces and backslashes
     found = [whole] if whole else shlex.split(given or "")
@@ -33,12 +29,7 @@ def command() -> list[str]:
 def run(arguments: Sequence[str], say: Callable[[str], object] = print) -> None:
     """Run a command of ``vvgt``, such as ``["convert", "a.vti", "-o", "a.html"]``.
 
-    Args:
-        arguments: words behind ``vvgt``.
-        say: takes each line of its messages as it comes.
-
-    Raises:
-        RuntimeError: it is not found, or it failed: its error.
+    ``say`` takes each line of its messages as it comes. Raise RuntimeError with its error if it fails, or is not found.
     """
     with _start(arguments, subprocess.DEVNULL) as process:
         _listen(process, say)

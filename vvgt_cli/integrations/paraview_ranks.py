@@ -34,11 +34,7 @@ class Ranks:
             self.controller.Barrier()
 
     def meet(self, error: str = "") -> None:
-        """Wait for all ranks.
-
-        Raises:
-            RuntimeError: one of them has an ``error``; this rank's own comes first.
-        """
+        """Wait for all ranks; raise RuntimeError if one has an ``error``, this rank's own first."""
         from vtkmodules.vtkCommonCore import vtkIntArray
         from vtkmodules.vtkParallelCore import vtkCommunicator
 

@@ -39,11 +39,7 @@ class Plugin:
 
 
 def plugin(name: str) -> Plugin:
-    """Return an adapter of `PLUGINS`, by its docstring: the file itself is not imported, as its program may be missing.
-
-    Raises:
-        KeyError: none of this name.
-    """
+    """Return an adapter, by the docstring of its file (its program may be missing); raise KeyError if there is none."""
     path = FOLDER / PLUGINS[name]
     lines = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()
     tried = next(line.removeprefix("Tried:").strip() for line in lines if line.startswith("Tried:"))

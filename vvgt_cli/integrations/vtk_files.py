@@ -9,11 +9,7 @@ from typing import Any
 
 
 def write(data: Any, stem: str) -> str:
-    """Write a dataset or a composite one as VTK's XML, and return the file: ``stem`` and the ending of its type.
-
-    Raises:
-        RuntimeError: VTK has no writer for it, or cannot write.
-    """
+    """Write a dataset as VTK's XML, and return the file, ``stem`` and its type's ending, or raise RuntimeError."""
     from vtkmodules import vtkIOXML
 
     writer: Any

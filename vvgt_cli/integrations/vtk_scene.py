@@ -48,12 +48,7 @@ def _array(mapper: Any, data: Any) -> tuple[Any, bool]:
 
 
 def drawn(volume: Any, data: Any = None) -> Drawn:
-    """Return a vtkVolume as it is drawn.
-
-    Args:
-        volume: vtkVolume.
-        data: vtkDataSet to take in place of the mapper's (another time step, a file's copy).
-    """
+    """Return a vtkVolume as it is drawn, with ``data`` in place of the mapper's (another step, a file's copy)."""
     mapper = volume.GetMapper()
     data = mapper.GetInputDataObject(0, 0) if data is None else data
     array, cells = _array(mapper, data)

@@ -1,4 +1,4 @@
-"""Conversion of the arguments of the Python API to requests."""
+"""Arguments of the Python API: their types, the requests that they stand for, and volumes made of arrays."""
 
 from __future__ import annotations
 
@@ -226,11 +226,7 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Content:
-    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`.
-
-    Raises:
-        DataError, UsageError: see `volume_of`.
-    """
+    """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`."""
     if isinstance(volume, str | os.PathLike):
         return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
@@ -242,11 +238,7 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
 
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:
-    """Return the reading options of a caller.
-
-    Raises:
-        UsageError: an option is unknown.
-    """
+    """Return the reading options of a caller; raise UsageError if one is unknown."""
     import numpy as np
 
     given = dict(reading)
@@ -268,11 +260,7 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
 
 
 def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
-    """Return the function of a caller: a path or name as it is, or a mapping read as a JSON file.
-
-    Raises:
-        DataError: the mapping is not a function.
-    """
+    """Return a caller's function: a path or name as it is, or a mapping read as a JSON file, or raise DataError."""
     from vvgt_cli.look import read_transfer_function
 
     if isinstance(tf, Mapping):
@@ -281,11 +269,7 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
 
 
 def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceRequest:
-    """Return the request for a volume under a look.
-
-    Raises:
-        DataError, UsageError: see `volume_of` and `function_of`.
-    """
+    """Return the request for a volume under a look; errors are those of `volume_of` and `function_of`."""
     if isinstance(volume, str | os.PathLike):  # the source opens it: colours and channels are several volumes
         source = SourceRequest(os.fspath(volume), _options(reading))
     else:
@@ -294,11 +278,7 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
-    """Return the request for a source's volume under a look.
-
-    Raises:
-        DataError, UsageError: see `function_of`.
-    """
+    """Return the request for a source's volume under a look; errors are those of `function_of`."""
     return replace(
         source,
         tf=function_of(look.function),
@@ -306,24 +286,15 @@ def with_look(source: SourceRequest, look: Look) -> SourceRequest:
         unit_distance=None if look.unit_distance is None else str(look.unit_distance),
         light=light_of(look.light),
         labels=labels_of(look.labels),
-        layers=tuple(layer_of(layer) for layer in look.layers),
+        layers=tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x)) for x in look.layers),
     )
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
-    """Return the label table of a caller: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file.
-
-    Raises:
-        DataError: the mapping is not a table.
-    """
+    """Return a caller's label table: a path, ``auto`` or ``none`` as it is, or a mapping read as a JSON file."""
     if isinstance(labels, Mapping):
         return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels
-
-
-def layer_of(layer: LayerLike) -> SourceRequest:
-    """Return a layer as it is, or parsed from a value of ``--layer``."""
-    return layer if isinstance(layer, SourceRequest) else parse_layer(os.fspath(layer))
 
 
 def light_of(light: LightLike) -> LightOptions:
@@ -341,12 +312,9 @@ def light_of(light: LightLike) -> LightOptions:
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:
     """Return the path of a ``.ply``, or a result as a stream of its file."""
     if isinstance(ply, Result):
-        from vvgt_cli.gaussians import write_ply
+        from vvgt_cli.gaussians import as_ply
 
-        stream = io.BytesIO()
-        write_ply(stream, ply.gaussians, replace(ply.ply, frame="unit", up="none"))
-        stream.seek(0)
-        return stream
+        return io.BytesIO(as_ply(ply.gaussians, replace(ply.ply, frame="unit", up="none")))
     return os.fspath(ply)
 
 
@@ -356,12 +324,7 @@ def console_of(progress: bool) -> Console:
 
 
 def volume_in_memory(
-    data: Any,
-    options: ReadOptions,
-    *,
-    origin: Sequence[float] | None = None,
-    affine: Any = None,
-    name: str = "array",
+    data: Any, options: ReadOptions, *, origin: Sequence[float] | None = None, affine: Any = None, name: str = "array"
 ) -> Volume:
     """Make a volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
 

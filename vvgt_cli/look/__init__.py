@@ -6,14 +6,5 @@ from vvgt_cli.look.readers import read_transfer_function
 from vvgt_cli.look.resolve import check_visible, resolve, unit_distance
 from vvgt_cli.look.show import draw
 
-__all__ = [
-    "ColorMap",
-    "PiecewiseOpacity",
-    "TransferFunction",
-    "check_visible",
-    "draw",
-    "from_histogram",
-    "read_transfer_function",
-    "resolve",
-    "unit_distance",
-]
+__all__ = ["ColorMap", "PiecewiseOpacity", "TransferFunction", "check_visible", "draw", "from_histogram"]
+__all__ += ["read_transfer_function", "resolve", "unit_distance"]

@@ -14,11 +14,7 @@ from vvgt_cli.look.resolve import BY
 
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
-    """Return the function on data values, its nodes stretched to ``limits`` if given.
-
-    Raises:
-        UsageError: fractions of a range without limits, or limits for percentiles.
-    """
+    """Return the function on data values, stretched to ``limits``; raise UsageError where they do not suit it."""
     if tf.domain in BY:
         if limits is not None:
             raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
@@ -34,15 +30,7 @@ def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> Transfer
 
 
 def to_text(tf: TransferFunction, form: str) -> str:
-    """Return the JSON text of a function on data values or percentiles.
-
-    Args:
-        tf: as `placed` returns it.
-        form: "minimal" or "paraview".
-
-    Raises:
-        DataError: a feature that the format cannot store.
-    """
+    """Return a placed function's JSON in a ``form``, minimal or paraview; raise DataError if it cannot store it."""
     body = _minimal(tf) if form == "minimal" else _paraview(tf)
     return json.dumps(body, indent=1, allow_nan=False) + "\n"
 

@@ -11,7 +11,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.names import named_function
 from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
-from vvgt_cli.look.resolve import StatisticsLike, resolve
+from vvgt_cli.look.resolve import resolve
+from vvgt_cli.volume.stats import Statistics
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"
@@ -27,16 +28,9 @@ LABELS = 0.25  # share of the bins up to which those that are filled are values 
 OPAQUE = 0.5  # most opacity per unit distance
 FAINT = 0.01  # opacity of data of a single value
 # Lightness rises from 25 to 97 (CIE L*), from brown over flesh to ivory; below an ambient value from blue to white
-COLORS = np.array(
-    [
-        [0.36, 0.17, 0.12],
-        [0.60, 0.30, 0.20],
-        [0.80, 0.49, 0.33],
-        [0.91, 0.70, 0.50],
-        [0.97, 0.87, 0.72],
-        [1, 0.98, 0.93],
-    ]
-)
+COLORS = np.array([
+    [0.36, 0.17, 0.12], [0.60, 0.30, 0.20], [0.80, 0.49, 0.33], [0.91, 0.70, 0.50], [0.97, 0.87, 0.72], [1, 0.98, 0.93],
+])  # fmt: skip
 COLD = COLORS[:, ::-1]
 # HU, opacity per unit distance, colour: air; skin, lungs' and bowels' walls; fat; organs; vessels with contrast; bone
 TISSUES = (
@@ -54,7 +48,7 @@ TISSUES = (
 )
 
 
-def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density: bool = False) -> TransferFunction:
+def from_histogram(statistics: Statistics, hounsfield: bool = False, density: bool = False) -> TransferFunction:
     """Return a transfer function chosen from the histogram; deterministic.
 
     Densities get contours at standard deviations above the mean, and below it if they reach nearly as far down

@@ -144,11 +144,7 @@ def _lines(text: str, path: Path) -> list[Label]:
 
 
 def _separated(text: str, path: Path) -> list[Label]:
-    """Read labels from a CSV or TSV table; without a row of names its columns are `NAMELESS`.
-
-    Raises:
-        DataError: a row without a label, or a colour that is not numeric.
-    """
+    """Read labels from a CSV or TSV table, with the columns `NAMELESS` without a row of names, or raise DataError."""
     lines = [line for line in text.splitlines(keepends=True) if line.strip() and not line.startswith("#")] or [""]
     comma, rows, head = max("\t,;", key=lines[0].count), list[Row](), list[str]()
     try:
@@ -249,25 +245,15 @@ def _dicom(source: str) -> list[Label]:
     """Read the segments of a DICOM segmentation; 0 is the background."""
     found = dicom_segments(source)
     colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
-    return [
-        _label(
-            source,
-            one.number,
-            one.name,
-            list(one.color or colors[one.number]),
-            SOLID if one.number else 0.0,
-            codes=codes_of(one.terms),
-        )
-        for one in found
-    ]
+    labels = []
+    for one in found:
+        color, opacity = list(one.color or colors[one.number]), SOLID if one.number else 0.0
+        labels.append(_label(source, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
+    return labels
 
 
 def table_of(parsed: Any, what: str) -> LabelTable:
-    """Return the table in a parsed JSON file.
-
-    Raises:
-        DataError: no table, or a faulty one.
-    """
+    """Return the table in a parsed JSON file, or raise DataError."""
     if not isinstance(parsed, dict):
         raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
     found = []

@@ -154,21 +154,13 @@ class LabelTable:
 
 
 def check_labels(looks: Sequence[Named]) -> None:
-    """Refuse looks that hide everything; one of several layers may hide all its labels.
-
-    Raises:
-        DataError: all labels are transparent.
-    """
+    """Raise DataError for looks that hide everything; one of several layers may hide all its labels."""
     if all(isinstance(look, LabelTable) and not any(e.opacity > 0 for e in look.labels) for look in looks):
         raise DataError(f"{looks[0].name}: none of its labels is visible; expected opacity above 0: try --labels auto")
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:
-    """Return solid labels in distinct colours, which depend on the label's number alone and repeat above 78.
-
-    Args:
-        numbers: of the labels, ascending; 0 is transparent.
-    """
+    """Return solid labels (``numbers`` ascending, 0 transparent) in colours by their number, which repeat above 78."""
     from matplotlib import colormaps
 
     colors = [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]

@@ -78,11 +78,7 @@ class Lighting:
 
 
 def parse_lighting(text: str) -> Lighting:
-    """Parse a line of `Lighting.text`.
-
-    Raises:
-        ValueError, UsageError: another text.
-    """
+    """Parse a line of `Lighting.text`; raise ValueError or UsageError for another text."""
     words = text.split()
     numbers: list[Any] = [float(word) for word in words[:4]]
     rest = words[4:]
@@ -115,15 +111,7 @@ class LightOptions:
     occlusion: float | None = None
 
     def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
-        """Return the light of a scene, None if it is not lit.
-
-        Args:
-            preset: light of the function's file.
-            space: anatomical space of the world, None if it has none.
-
-        Raises:
-            UsageError: invalid lights, or other options without a light.
-        """
+        """Return a scene's light, None if unlit; ``preset`` is the function file's. Raise UsageError if invalid."""
         given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}
         given |= {"occlusion": self.occlusion} if self.occlusion is not None else {}
         given |= {"shadows": True} if self.shadows else {}
@@ -173,11 +161,7 @@ def _direction(light: str, space: str | None) -> Direction:
 
 
 def preset_lighting(what: str, shade: bool, fields: dict[str, Any]) -> Lighting | None:
-    """Return the light of a volume property: a headlight if it is shaded, else None.
-
-    Raises:
-        DataError: coefficients out of range.
-    """
+    """Return a volume property's light, a headlight if shaded, else None; raise DataError for invalid coefficients."""
     if not shade:
         return None
     try:

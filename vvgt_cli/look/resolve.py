@@ -5,45 +5,21 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import PER_VOXEL, TransferFunction
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
+from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import Volume
 
 BY = {"percentile": "percentiles", "foreground": "percentiles of the foreground", "sigma": "standard deviations"}
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
-class StatisticsLike(Protocol):
-    """Statistics of the data that this room needs."""
-
-    @property
-    def lo(self) -> float:
-        """Return the smallest finite data value."""
-
-    @property
-    def hi(self) -> float:
-        """Return the largest finite data value."""
-
-    @property
-    def histogram(self) -> np.ndarray:
-        """Return (bins,) counts of finite voxels, equal bins over [lo, hi]."""
-
-    @property
-    def edges(self) -> np.ndarray:
-        """Return (bins + 1,) bin edges, data values."""
-
-
 def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]:
-    """Return ``data``, ``rescale`` or two ascending numbers.
-
-    Raises:
-        UsageError: anything else.
-    """
+    """Return ``data``, ``rescale`` or two ascending numbers; raise UsageError for anything else."""
     if spec in ("data", "rescale"):
         return spec
     try:
@@ -57,7 +33,7 @@ def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]
 
 def resolve(
     tf: TransferFunction,
-    statistics: StatisticsLike,
+    statistics: Statistics,
     tf_range: str | tuple[float, float] = "data",
     hounsfield: bool = False,
 ) -> TransferFunction:
@@ -115,12 +91,12 @@ def unit_of_values(volume: Volume, tf: TransferFunction | None) -> str:
     return volume.values_in or ("HU" if tf is not None and tf.otherwise is not None else "")
 
 
-def _in_hounsfield(statistics: StatisticsLike) -> bool:
+def _in_hounsfield(statistics: Statistics) -> bool:
     counts = np.asarray(statistics.histogram, dtype=np.float64)
     return bool(counts.any()) and in_hounsfield(counts, np.asarray(statistics.edges, dtype=np.float64))
 
 
-def _positions(tf: TransferFunction, statistics: StatisticsLike) -> np.ndarray:
+def _positions(tf: TransferFunction, statistics: Statistics) -> np.ndarray:
     """Return data values of the breakpoints (m,) of a function on percentiles or standard deviations."""
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if tf.domain == "sigma" and counts.any():
@@ -130,7 +106,7 @@ def _positions(tf: TransferFunction, statistics: StatisticsLike) -> np.ndarray:
     return _quantiles(front, edges, tf.breakpoints())
 
 
-def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:
+def percentiles(statistics: Statistics, fraction: np.ndarray) -> np.ndarray:
     """Return data values below which ``fraction`` (n,) in [0, 1] of the voxels lie, linear within bins, (n,)."""
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     return _quantiles(counts, edges, fraction)
@@ -187,7 +163,7 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
     return distance, "given"
 
 
-def check_visible(tf: TransferFunction, statistics: StatisticsLike) -> None:
+def check_visible(tf: TransferFunction, statistics: Statistics) -> None:
     """Raise DataError if the function (on data values) makes every value of the data transparent."""
     lo, hi = _data_range(statistics)
     if tf.support(lo, hi):
@@ -200,7 +176,7 @@ def check_visible(tf: TransferFunction, statistics: StatisticsLike) -> None:
     )
 
 
-def _data_range(statistics: StatisticsLike) -> tuple[float, float]:
+def _data_range(statistics: Statistics) -> tuple[float, float]:
     lo, hi = float(statistics.lo), float(statistics.hi)
     if not (math.isfinite(lo) and math.isfinite(hi) and lo <= hi):
         raise DataError("the data have no finite voxel; expected some to colour")

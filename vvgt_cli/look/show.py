@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.files import atomic_write
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.resolve import StatisticsLike
+from vvgt_cli.volume.stats import Statistics
 
 SAMPLES = 1024
 X_LABEL = {
@@ -22,24 +22,20 @@ X_LABEL = {
 
 
 def draw(
-    tf: TransferFunction, statistics: StatisticsLike | None, path: str | PathLike[str], overwrite: bool = False
+    tf: TransferFunction, statistics: Statistics | None, path: str | PathLike[str], overwrite: bool = False
 ) -> None:
     """Write a PNG: the opacity curve, filled with the function's colours, over the histogram (log counts).
 
-    Args:
-        tf: the function; drawn over the data range with ``statistics`` (then on data values), else over its nodes.
-        statistics: of the data, or None.
-        path: the PNG.
-        overwrite: replace an existing file.
-
-    Raises:
-        UsageError: the file exists and ``overwrite`` is not set.
+    Without ``statistics`` the nodes are the range. Raise UsageError if the file exists and ``overwrite`` is not set.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    lo, hi = _limits(tf, statistics)
+    lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
+    if lo == hi:
+        margin = abs(lo) * 0.5 or 0.5
+        lo, hi = lo - margin, hi + margin
     if statistics is not None:
         _draw_histogram(axes, statistics)
     x = np.unique(np.concatenate([np.linspace(lo, hi, SAMPLES), np.clip(tf.breakpoints(), lo, hi)]))
@@ -48,15 +44,6 @@ def draw(
     axes.set_title(tf.name, parse_math=False)
     with atomic_write(path, overwrite) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})
-
-
-def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[float, float]:
-    """Return the ends of the horizontal axis: the data's range, or the nodes'."""
-    lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
-    if lo == hi:
-        margin = abs(lo) * 0.5 or 0.5
-        return lo - margin, hi + margin
-    return lo, hi
 
 
 def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
@@ -76,7 +63,7 @@ def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
     axes.tick_params(axis="x", pad=10)
 
 
-def _draw_histogram(axes: Any, statistics: StatisticsLike) -> None:
+def _draw_histogram(axes: Any, statistics: Statistics) -> None:
     behind = axes.twinx()
     counts, edges = np.asarray(statistics.histogram), np.asarray(statistics.edges)
     behind.stairs(counts, edges, fill=True, color="0.85")

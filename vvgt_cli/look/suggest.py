@@ -1,7 +1,8 @@
-"""Transfer functions that highlight one range of values each, from the histogram alone (`vvgt tf suggest`).
+"""Choice of transfer functions by a volume's data: one for each band of values, or a named one that fits.
 
-The VVGT paper (Experiment Setup, Datasets) uses about ten functions per volume, "to highlight different scalar value
-ranges and internal structures".
+`suggest` (`vvgt tf suggest`) uses the histogram alone; the VVGT paper (Experiment Setup, Datasets) has about ten
+functions per volume, "to highlight different scalar value ranges and internal structures". `fitting` also looks at the
+voxels.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.histogram import contours
 from vvgt_cli.look.recognise import AIR, air_and_tissue, background_bins, foreground, in_hounsfield
-from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.volume.bodies import largest
+from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
 
@@ -29,6 +30,15 @@ OPTICAL_DEPTH = 1.5  # wanted along a ray through the whole volume, on average
 PEAK = (1e-3, 0.5)  # opacity per voxel at a band's plateau: rare values cannot be more than opaque
 LIGHTNESS, CHROMA = (45.0, 70.0, 92.0), (45.0, 60.0, 25.0)  # CIE LCh at a band's low end, middle and high end
 FIRST_HUE, HUES = 275.0, 235.0  # degrees in CIE Lab: from blue for low values over green to red for high ones
+LUNG, BODY, BONE = (-950.0, -550.0), (-500.0, np.inf), (300.0, np.inf)  # HU
+COARSE = 96  # voxels along the longest edge of the copy in which lungs are looked for
+MUCH_LUNG, SOME_BONE = 0.1, 0.005  # of the voxels of body and lungs
+OVER_BONE = 2.5  # times as many voxels as bone has are lungs in a chest; a skull has more bone than that
+HEAD_MM = (100.0, 320.0)  # edges of the box of an image of a head
+HEAD_SHARE = (0.1, 0.75)  # of the voxels of such an image that the head fills
+PEAK_WIDTH, PEAK_SHARE = 0.04, 0.35  # MR has no such share of its foreground within that share of its range
+LONG_CT = 1200.0  # span of values from which CT with another zero is possible, and how much it may lie higher
+LOW = 0.25  # of the range of values, up to which the background of MR lies
 
 Bins = tuple[int, int]  # [first, last)
 
@@ -63,7 +73,7 @@ class Suggestion:
         return json.dumps(document, indent=1) + "\n"
 
 
-def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: float) -> list[Suggestion]:
+def suggest(statistics: Statistics, count: int, voxels: float, spacing: float) -> list[Suggestion]:
     """Return functions for ``count`` bands of the foreground's values, low values first; deterministic.
 
     A band is a trapezoid: transparent outside, constant in its middle half and up to the ends of the data. Its height
@@ -86,16 +96,11 @@ def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: floa
         raise DataError("the data have no finite voxel; expected some to choose transfer functions from")
     if lo == hi:
         raise DataError(f"every value of the data is {lo:g}; expected some that differ to choose ranges from")
-    background = _background(counts)
+    first, last = background_bins(counts)  # which no function shows, unless it is all or wide
+    alone = counts[first:last].sum() == counts.sum()
+    background = (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
     data, grid = (counts, edges, background), (voxels, spacing)
     return [_suggestion(band, data, (k, count), grid) for k, band in enumerate(_bands(counts, background, count))]
-
-
-def _background(counts: np.ndarray) -> Bins:
-    """Return the bins [first, last) that no function shows; (0, 0) for none."""
-    first, last = background_bins(counts)
-    alone = counts[first:last].sum() == counts.sum()
-    return (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
 
 
 def _bands(counts: np.ndarray, background: Bins, count: int) -> list[Bins]:
@@ -155,18 +160,7 @@ def _rgb(lab: np.ndarray) -> np.ndarray:
     return found.clip(0, 1)
 
 
-LUNG, BODY, BONE = (-950.0, -550.0), (-500.0, np.inf), (300.0, np.inf)  # HU
-COARSE = 96  # voxels along the longest edge of the copy in which lungs are looked for
-MUCH_LUNG, SOME_BONE = 0.1, 0.005  # of the voxels of body and lungs
-OVER_BONE = 2.5  # times as many voxels as bone has are lungs in a chest; a skull has more bone than that
-HEAD_MM = (100.0, 320.0)  # edges of the box of an image of a head
-HEAD_SHARE = (0.1, 0.75)  # of the voxels of such an image that the head fills
-PEAK_WIDTH, PEAK_SHARE = 0.04, 0.35  # MR has no such share of its foreground within that share of its range
-LONG_CT = 1200.0  # span of values from which CT with another zero is possible, and how much it may lie higher
-LOW = 0.25  # of the range of values, up to which the background of MR lies
-
-
-def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
+def fitting(statistics: Statistics, volume: Volume) -> str | None:
     """Return the name of a function that shows something of a volume, None if none is made for such data.
 
     Densities get contours. Hounsfield units get the lungs if there are some, else bone if there is any, else soft

@@ -71,11 +71,7 @@ def graph_record(path: Path, inputs: list[str], outputs: list[str]) -> dict[str,
 
 
 def find_model(name: str) -> Path:
-    """Return the folder of a model: a path, or the name of a shipped one.
-
-    Raises:
-        UsageError: no such model.
-    """
+    """Return the folder of a model, a path or the name of a shipped one, or raise UsageError."""
     places = [MODELS, Path(sysconfig.get_path("data")) / INSTALLED]
     for folder in (Path(name), *(place / name for place in places)):
         if (folder / CARD).is_file():
@@ -88,11 +84,7 @@ def find_model(name: str) -> Path:
 
 
 def read_card(folder: Path) -> ModelCard:
-    """Read a card and check the graphs beside it.
-
-    Raises:
-        DataError: not a card, another schema, or a graph that is missing or differs from the card.
-    """
+    """Read a card and check the graphs beside it; raise DataError for another schema, or a graph that differs."""
     path = folder / CARD
     try:
         document = json.loads(read_text(path))
@@ -120,11 +112,7 @@ def read_card(folder: Path) -> ModelCard:
 
 
 def check_graph(folder: Path, record: dict[str, Any]) -> None:
-    """Check that a graph's file exists, complete and as exported.
-
-    Raises:
-        DataError: it does not.
-    """
+    """Check that a graph's file exists, complete and as exported; raise DataError otherwise."""
     path = folder / str(record["file"])
     if path.parent != folder or not path.is_file():
         raise DataError(f"{path}: no such file, but the model's card names it; fetch or export the model again")

@@ -91,11 +91,7 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
-    """Load weights, every name and shape checked.
-
-    Raises:
-        DataError: a weight that is missing, unknown, of another shape, or not finite.
-    """
+    """Load weights; raise DataError if a name or shape is missing, unknown or other, or a number is not finite."""
     own = module.state_dict()
     missing, unknown = sorted(set(own) - set(state)), sorted(set(state) - set(own))
     if missing or unknown:

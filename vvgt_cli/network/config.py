@@ -173,11 +173,7 @@ class NetworkConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkConfig:
-        """Return the configuration of the values of `to_dict`.
-
-        Raises:
-            DataError: a missing or unknown field, or an invalid value.
-        """
+        """Return the configuration of the values of `to_dict`; raise DataError for missing, unknown or invalid ones."""
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
             known = {name: _exactly(side, values[name]) for name, side in sides.items()}
@@ -216,14 +212,9 @@ NAMED = {
         name="base",
         image=ImageConfig(views=16, width=384, heads=6, encoder=8, alternating=8, taps=(1, 3, 5, 7), map_width=128),
         geometry=GeometryConfig(
-            widths=(32, 64, 128, 192, 256),
-            depths=(2, 2, 2, 2, 2),
-            heads=(2, 4, 8, 12, 16),
-            decoder_widths=(64, 64, 128, 192),
-            decoder_depths=(2, 2, 2, 2),
-            decoder_heads=(4, 4, 8, 12),
-            window=256,
-            epipolar_width=128,
+            widths=(32, 64, 128, 192, 256), depths=(2, 2, 2, 2, 2), heads=(2, 4, 8, 12, 16),
+            decoder_widths=(64, 64, 128, 192), decoder_depths=(2, 2, 2, 2), decoder_heads=(4, 4, 8, 12),
+            window=256, epipolar_width=128,
         ),
     ),
     # not the paper's: the 3D side alone, fed with the slopes of the image error, which it makes a step of
@@ -231,14 +222,9 @@ NAMED = {
         name="lean",
         image=ImageConfig(views=10),  # twice: of 24 views four are left to judge
         geometry=GeometryConfig(
-            widths=(48, 48, 48, 48, 48),
-            depths=(0, 0, 0, 0, 0),  # pooling alone tells a Gaussian of those around it
-            heads=(4, 4, 4, 4, 4),
-            decoder_widths=(48, 48, 48, 48),
-            decoder_depths=(0, 0, 0, 0),
-            decoder_heads=(4, 4, 4, 4),
-            head="step",
-            gradients=True,
+            widths=(48, 48, 48, 48, 48), depths=(0, 0, 0, 0, 0),  # pooling alone tells a Gaussian of those around it
+            heads=(4, 4, 4, 4, 4), decoder_widths=(48, 48, 48, 48), decoder_depths=(0, 0, 0, 0),
+            decoder_heads=(4, 4, 4, 4), head="step", gradients=True,
         ),
         variant="wo_vgf",
         rounds=2,
@@ -250,14 +236,9 @@ NAMED = {
             size=518, views=24, width=1024, heads=16, encoder=24, alternating=24, taps=(4, 11, 17, 23), map_width=256
         ),
         geometry=GeometryConfig(
-            widths=(32, 64, 128, 256, 512),
-            depths=(2, 2, 2, 6, 2),
-            heads=(2, 4, 8, 16, 32),
-            decoder_widths=(64, 64, 128, 256),
-            decoder_depths=(2, 2, 2, 2),
-            decoder_heads=(4, 4, 8, 16),
-            window=1024,
-            epipolar_width=128,
+            widths=(32, 64, 128, 256, 512), depths=(2, 2, 2, 6, 2), heads=(2, 4, 8, 16, 32),
+            decoder_widths=(64, 64, 128, 256), decoder_depths=(2, 2, 2, 2), decoder_heads=(4, 4, 8, 16),
+            window=1024, epipolar_width=128,
         ),
     ),
-}
+}  # fmt: skip

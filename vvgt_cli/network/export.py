@@ -193,11 +193,7 @@ def write_model(folder: Path, protos: Mapping[str, Any], card: ModelCard, storag
 
 
 def check_folder(target: Path, overwrite: bool) -> None:
-    """Refuse an existing folder that may not be replaced.
-
-    Raises:
-        UsageError: it exists, or its parent does not.
-    """
+    """Raise UsageError for an existing folder that may not be replaced, or one whose parent does not exist."""
     if not target.parent.is_dir():
         raise UsageError(f"-o {target}: the folder {target.parent} does not exist; make it first")
     if not target.exists():

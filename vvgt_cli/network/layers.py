@@ -1,4 +1,4 @@
-"""Layers of both transformers: attention, MLP, pre-norm block; names as in DINOv2's checkpoints."""
+"""Layers of both transformers, named as in DINOv2's checkpoints, and attention of tokens to views (Eq. 7)."""
 
 from __future__ import annotations
 
@@ -120,14 +120,9 @@ OUTSIDE = -1e4  # bias of a view that does not see the point: exp of it is 0 in 
 
 
 def project(points: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points (m, 3) into views.
+    """Project points (m, 3) by matrices (n, 3, 4) to (u w, v w, w), u and v in [0, 1] across the image, w the depth.
 
-    Args:
-        points: world positions.
-        matrices: (n, 3, 4), to (u w, v w, w) with u, v in [0, 1] across the image and w the depth.
-
-    Returns:
-        (n, m, 2) u and v, clamped to the image, and (n, m) bool: in front of the camera and within the image.
+    Return (n, m, 2) u and v, clamped to the image, and (n, m) bool: in front of the camera and within the image.
     """
     p = points @ matrices[:, :, :3].transpose(1, 2) + matrices[:, None, :, 3]  # (n, m, 3)
     depth = p[..., 2:]

@@ -70,11 +70,7 @@ class Prepared:
 
 
 def pack(gaussians: Gaussians) -> np.ndarray:
-    """Return (K, 14) float32; quaternions of norm 1 with the first non-zero component positive (q and -q are equal).
-
-    Raises:
-        DataError: Gaussians with harmonics, which a network does not support.
-    """
+    """Return (K, 14) float32, unit quaternions with their first non-zero component positive, or raise DataError."""
     if gaussians.harmonics is not None:
         raise DataError(
             f"spherical harmonics of degree {gaussians.degree}: a network supports only colours that do not "
@@ -226,13 +222,9 @@ FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: 
 def own_axes_gradients(
     quaternions: np.ndarray, axes: np.ndarray, scales: np.ndarray, gradients: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in their order.
+    """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in order.
 
-    Args:
-        quaternions: (K, 4) of norm 1.
-        axes: (K, 3, 3) their rotations.
-        scales: (K, 3) standard deviations.
-        gradients: by means, log-scales, quaternions, logits and colours.
+    ``quaternions`` (K, 4) have norm 1 and rotations ``axes`` (K, 3, 3); ``scales`` (K, 3) are standard deviations.
     """
     means, log_scales, turns, logits, colors = gradients
     along = np.einsum("kij,ki->kj", axes, means) * scales
@@ -290,13 +282,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
 
 
 def halved(cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> tuple[list[Camera], np.ndarray, Rule]:
-    """Average views 2 x 2 where their sides are even; return them and the rule that stands for the standard one.
-
-    Args:
-        cameras: of the views.
-        images: (n, h, w, c) float32.
-        rule: by which these are drawn.
-    """
+    """Return views (n, h, w, c) averaged 2 x 2 where their sides are even, and the rule that stands for theirs."""
     h, w = images.shape[1:3]
     if h % 2 or w % 2:
         return list(cameras), images, rule

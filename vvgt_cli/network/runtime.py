@@ -153,11 +153,7 @@ def _session(path: Path, threads: int, provider: str) -> Any:
 
 
 def _check_names(path: Path, session: Any, record: dict[str, Any], config: NetworkConfig) -> None:
-    """Check that a graph's names match the card, and that this version knows its inputs and outputs.
-
-    Raises:
-        DataError: they do not.
-    """
+    """Raise DataError unless a graph's names match the card, and this version knows its inputs and outputs."""
     image = path.stem == "image"
     made = {*IMAGE_INPUTS} if image else {"gaussians", "gradients", "matrices", "eyes", *MAPS}
     if not image:

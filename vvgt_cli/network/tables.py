@@ -51,12 +51,9 @@ def quantise(means: np.ndarray) -> np.ndarray:
 
 
 def canonical_order(rows: np.ndarray) -> np.ndarray:
-    """Return the permutation (K,) that sorts Gaussians along the Z-order; ties by all parameters, in full precision.
+    """Return the permutation (K,) that sorts rows (K, n), mean first, along the Z-order; ties by all parameters.
 
     The result does not depend on the order of the rows (exact duplicates aside).
-
-    Args:
-        rows: (K, n) float32, mean first.
     """
     codes = interleave(quantise(rows[:, :3]))
     order = np.argsort(codes, kind="stable")

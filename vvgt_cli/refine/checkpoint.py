@@ -46,11 +46,7 @@ def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> 
 
 
 def save(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord, walk: dict[str, Any]) -> None:
-    """Replace the file at ``path``; ``walk`` is plain values.
-
-    Raises:
-        DataError: the operating system refuses.
-    """
+    """Replace the file at ``path``, or raise DataError; ``walk`` is plain values."""
     arrays: dict[str, Any] = {f"state_{name}": array for name, array in state.saved().items()}
     arrays |= {f"best_{i}": array for i, array in enumerate(judge.kept or ())}
     about = {"key": key, "walk": walk, "best": judge.best, "idle": judge.idle, "record": asdict(record)}
@@ -105,11 +101,7 @@ def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _check_like(saved: dict[str, np.ndarray], own: dict[str, np.ndarray]) -> None:
-    """Check that arrays are those of a state of any number of Gaussians: kernels do not check.
-
-    Raises:
-        ValueError: other names, types or shapes.
-    """
+    """Raise ValueError unless arrays are those of a state of any number of Gaussians: kernels do not check."""
     if set(saved) != set(own):
         raise ValueError("other arrays")
     for name, array in own.items():

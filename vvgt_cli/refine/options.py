@@ -71,11 +71,7 @@ class OptimizeOptions:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            UsageError: an unknown method, or a number out of its range.
-        """
+        """Raise UsageError for an unknown method, or a number out of its range."""
         if self.method not in METHODS:
             raise UsageError(f"method {self.method!r}; expected one of {', '.join(METHODS)}")
         if self.steps is None and self.time_budget is None:

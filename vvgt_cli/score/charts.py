@@ -92,11 +92,7 @@ def draw(series: Sequence[Series]) -> list[Chart]:
 
 
 def write_plots(folder: Path, charts: Sequence[Chart], overwrite: bool) -> None:
-    """Write the charts as PNG.
-
-    Raises:
-        UsageError: a file exists and ``overwrite`` is not set.
-    """
+    """Write the charts as PNG; raise UsageError if a file exists and ``overwrite`` is not set."""
     for chart in charts:
         with atomic_write(folder / chart.file, overwrite) as temporary:
             chart.figure.savefig(temporary, format="png", dpi=200, metadata={"Software": None})

@@ -118,18 +118,8 @@ def table(runs: Sequence[Run]) -> str:
     stages = stage_names(runs)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    heads = [
-        "name",
-        "kind",
-        "seconds",
-        "gaussians",
-        "bytes",
-        *SCORES,
-        "worst_condition",
-        "pareto",
-        *(f"seconds: {s}" for s in stages),
-    ]
-    writer.writerow(heads)
+    heads = ("name", "kind", "seconds", "gaussians", "bytes", *SCORES, "worst_condition", "pareto")
+    writer.writerow([*heads, *(f"seconds: {s}" for s in stages)])
     best = {id(run) for run in pareto(runs)}
     for run in runs:
         scores = run.get("scores") or {}
@@ -157,11 +147,7 @@ def _seconds(run: Run) -> dict[str, float]:
 
 
 def read_series(path: str) -> Series:
-    """Read the runs of a `report.json`, or the one run of a `--report` of convert.
-
-    Raises:
-        DataError: the file is neither, or has no runs with scores.
-    """
+    """Read the runs of a `report.json`, or the one run of a `--report` of convert, or raise DataError without any."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
         kind = document["format"]

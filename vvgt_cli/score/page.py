@@ -30,14 +30,7 @@ class Pictures:
 
 
 def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures: Pictures | None = None) -> str:
-    """Return the page of one report, or of several over each other.
-
-    Args:
-        series: the reports.
-        charts: charts of their runs.
-        title: the heading.
-        pictures: pictures to compare, for one report.
-    """
+    """Return the page of one report, with pictures to compare, or of several over each other."""
     notes = dict.fromkeys([chart.title for chart in charts], "") | {charts[0].title: FRONT_NOTE}
     drawn = [f"<section><h2>{one.title}</h2>{one.svg()}{notes[one.title]}</section>" for one in charts]
     parts = [_head(series, title), _facts(series), f'<div class="grid2">{"".join(drawn)}{_unit_costs(series)}</div>']

@@ -152,14 +152,7 @@ def condition_views(
     settings: RenderSettings | None = None,
     progress: ProgressCallback | None = None,
 ) -> Iterator[ConditionView]:
-    """Render the references of pictures, one at a time.
-
-    Args:
-        scene: the volume.
-        pictures: of `condition_pictures` and `eye_pictures`.
-        settings: settings of the reference; the renderer's default without.
-        progress: called after each picture.
-    """
+    """Render the references of `condition_pictures` and `eye_pictures`, one at a time."""
     from vvgt_cli.dvr import render_view
 
     for done, (place, camera, blocks) in enumerate(pictures, 1):
@@ -178,17 +171,7 @@ def score_texture(
     progress: ProgressCallback | None = None,
     cameras: Sequence[Camera] | None = None,
 ) -> Texture:
-    """Measure texture on smooth areas, by ``cameras``.
-
-    Args:
-        scene: the volume.
-        gaussians: Gaussians to compare with it.
-        size: pixels along a picture's edge.
-        rule: drawing rule of the Gaussians.
-        settings: settings of the reference; the renderer's default without.
-        progress: called after each view.
-        cameras: cameras; None: `near_cameras`.
-    """
+    """Measure texture on smooth areas in pictures of ``size`` px, by ``cameras`` (None: `near_cameras`)."""
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images.metrics import texture
     from vvgt_cli.splat import render
@@ -233,14 +216,7 @@ def texture_note(found: Texture) -> str:
 def score_conditions(
     gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES), own: str = INRIA.name
 ) -> list[ViewingCondition]:
-    """Score every rule at every place, on blocks of the test views; worst first.
-
-    Args:
-        gaussians: Gaussians to draw.
-        seen: references of `condition_views`.
-        rules: names of drawing rules.
-        own: name of the rule of a headset's programs.
-    """
+    """Score every rule at every place, on the blocks of `condition_views`; worst first. ``own`` is a headset's rule."""
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 

@@ -1,4 +1,4 @@
-"""Scores of Gaussians against the volume on the test views, with one view in memory at a time."""
+"""Scores of Gaussians on the test views, one view in memory at a time, and the check views."""
 
 from __future__ import annotations
 

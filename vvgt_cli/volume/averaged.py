@@ -27,15 +27,7 @@ def coarser(volume: Volume, most: int) -> tuple[int, int, int]:
 
 
 def averaged(volume: Volume, dims: tuple[int, int, int]) -> np.ndarray:
-    """Return the mean of the finite data values within each cell, weighted by volume.
-
-    Args:
-        volume: the volume.
-        dims: cells along (x, y, z) of its box.
-
-    Returns:
-        (nz, ny, nx) float64, NaN where a cell has no finite value.
-    """
+    """Return means of the finite data values in ``dims`` cells (x, y, z), (nz, ny, nx) float64, NaN for none."""
     sums, shares = np.zeros((2, *dims[::-1]))
     for lo, part in _parts(volume):
         values = volume.slope * part.astype(np.float64) + volume.intercept

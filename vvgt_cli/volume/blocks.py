@@ -77,11 +77,7 @@ _OPENERS: dict[str, Callable[[IO[bytes]], Any]] = {
 
 
 def read_head(path: Path, size: int) -> tuple[bytes, str]:
-    """Read the first bytes of a file, decompressed, and tell how it is compressed: ``raw``, ``gzip`` or ``bzip2``.
-
-    Raises:
-        DataError: damaged compressed data.
-    """
+    """Return the first bytes of a file, decompressed, and ``raw``, ``gzip`` or ``bzip2``, or raise DataError."""
     with open(path, "rb") as file:
         head = file.read(size)
         encoding = "gzip" if head[:2] == b"\x1f\x8b" else "bzip2" if head[:3] == b"BZh" else "raw"
@@ -197,11 +193,7 @@ class Packed:
         self._next = 0  # slice
 
     def __getitem__(self, key: slice) -> np.ndarray:
-        """Read slices ``first:last``, (k, ny, nx).
-
-        Raises:
-            DataError: the file ends early, or is damaged.
-        """
+        """Read slices ``first:last``, (k, ny, nx); raise DataError if the file ends early, or is damaged."""
         first, last, _ = key.indices(self.shape[0])
         slice_bytes = count(self.shape[1:]) * self.dtype.itemsize
         need = (last - first) * slice_bytes
@@ -259,13 +251,9 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
 
 
 def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
-    """Split ``n`` white-space separated words from ``text``, from ``start`` on, in windows.
+    """Yield ``n`` words of ``text`` from ``start`` on, in windows, with the position behind each.
 
-    Yields:
-        (words, position behind them).
-
-    Raises:
-        DataError: too few words.
+    Raise DataError if there are fewer.
     """
     missing, position = n, start
     while missing:
@@ -286,11 +274,7 @@ def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[t
 
 
 def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
-    """Parse ``n`` numbers of white-space separated text from ``start`` on, (n,) in native byte order.
-
-    Raises:
-        DataError: too few numbers, something that is no number, or one that the type cannot hold; too little memory.
-    """
+    """Parse ``n`` numbers of text from ``start`` on, (n,) native; raise DataError if there are fewer, or others."""
     native = dtype.newbyteorder("=")
     check_memory(n * native.itemsize, name, AS_NUMBERS)
     values, filled = np.empty(n, native), 0

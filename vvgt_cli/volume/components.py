@@ -143,21 +143,13 @@ def select_component(
 
 
 def select_from_array(values: np.ndarray, info: ArrayInfo, component: int | str | None, source: str) -> np.ndarray:
-    """Select one scalar field (nz, ny, nx) of a named array's values (nz, ny, nx, c); bytes may be colours.
-
-    Raises:
-        UsageError: as `select_component`.
-    """
+    """Select a scalar field (nz, ny, nx) of an array (nz, ny, nx, c) as `select_component`; bytes may be colours."""
     label, color = f"array {info.name!r}", values.dtype == np.uint8
     return select_component(values, component, source, label=label, color=color)[0]
 
 
 def selected_dtype(info: ArrayInfo, component: int | str | None, source: str) -> np.dtype:
-    """Return the type of the scalar field that is selected of an array, before the array is read.
-
-    Raises:
-        UsageError: as `select_component`.
-    """
+    """Return the type that `select_from_array` will return, before the array is read, with its errors."""
     return select_from_array(np.zeros((1, 1, 1, info.components), info.dtype), info, component, source).dtype
 
 
@@ -167,16 +159,7 @@ def contiguous(field: np.ndarray) -> np.ndarray:
 
 
 def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Take the Euclidean norm of data values over the last axis, slice by slice.
-
-    Args:
-        values: (nz, ny, nx, c) stored values.
-        slope: of the data value ``slope * stored + intercept``.
-        intercept: of the data value.
-
-    Returns:
-        (nz, ny, nx) float32.
-    """
+    """Return the Euclidean norms (nz, ny, nx) float32 of data values ``slope * stored + intercept``, slice by slice."""
     out = np.empty(values.shape[:3], np.float32)
     for z, plane in enumerate(values):
         total = np.zeros(plane.shape[:2])

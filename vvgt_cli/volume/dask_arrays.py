@@ -26,11 +26,7 @@ def is_dask(data: Any) -> bool:
 
 
 def lazy(data: Any, name: str) -> Stored:
-    """Wrap a Dask array (nz, ny, nx) whose blocks are computed when they are read.
-
-    Raises:
-        DataError: another number of axes, or chunks of unknown size.
-    """
+    """Wrap a Dask array (nz, ny, nx), computed when read; raise DataError for other axes, or unknown chunk sizes."""
     read = Chunks(data, name)
     if data.ndim != 3:
         raise DataError(f"{name}: array of shape {data.shape}; expected three axes (z, y, x), none empty")
@@ -45,11 +41,7 @@ class Chunks:
     """
 
     def __init__(self, array: Any, name: str) -> None:
-        """Take a Dask array; ``name`` is for messages.
-
-        Raises:
-            DataError: chunks of unknown size.
-        """
+        """Take a Dask array; ``name`` is for messages. Raise DataError for chunks of unknown size."""
         if any(math.isnan(n) for n in array.shape):
             raise DataError(
                 f"{name}: a Dask array of unknown shape {array.shape}; call its compute_chunk_sizes() first"

@@ -21,11 +21,7 @@ _SIZE = re.compile(r"(\d{1,6})(?:x(\d{1,6})x(\d{1,6}))?")
 
 
 def open_example(text: str, options: ReadOptions) -> Volume:
-    """Open ``NAME`` or ``NAME:rest``.
-
-    Raises:
-        UsageError: unknown name (the error lists those that exist), or options that an example does not take.
-    """
+    """Open ``NAME`` or ``NAME:rest``; raise UsageError for unknown names, or options that an example does not take."""
     name, _, rest = text.partition(":")
     if name not in EXAMPLES:
         raise UsageError(f"example:{name}: no such example; expected one of {', '.join(sorted(EXAMPLES))}")

@@ -30,11 +30,7 @@ class Fields(dict[str, str]):
         self.name = name
 
     def need(self, *keys: str) -> str:
-        """Return the first of these fields that is there.
-
-        Raises:
-            DataError: none is.
-        """
+        """Return the first of these fields that is there, or raise DataError."""
         for key in keys:
             if self.get(key):
                 return self[key]
@@ -61,11 +57,7 @@ class Fields(dict[str, str]):
         return values[:n]
 
     def sizes(self, key: str, text: str) -> list[int]:
-        """Return the positive whole numbers of a field.
-
-        Raises:
-            DataError: anything else.
-        """
+        """Return the positive whole numbers of a field, or raise DataError."""
         try:
             values = [int(t) for t in text.split()]
         except ValueError:
@@ -85,11 +77,7 @@ class Fields(dict[str, str]):
             raise DataError(f"{self.name}: {key} is {text!r}; expected a whole number") from None
 
     def dtype(self, key: str, text: str, own: Mapping[str, str] | None = None) -> np.dtype:
-        """Return the type of values that a field names, as C or as numpy does (see `type_of`).
-
-        Raises:
-            DataError: an unknown type.
-        """
+        """Return the type of values that a field names, as C or numpy does (see `type_of`), or raise DataError."""
         found = type_of(text, own)
         if found is None:
             raise DataError(

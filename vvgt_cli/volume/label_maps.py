@@ -23,11 +23,7 @@ SORTED = 1 << 16  # span of a plane's values above which they are sorted, not co
 
 
 def labels_in(volume: Volume) -> list[int]:
-    """List the labels of a volume, ascending; voxels that are NaN have none.
-
-    Raises:
-        DataError: data values that are no whole numbers, or more than `MOST` of them.
-    """
+    """List a volume's labels, ascending, without NaN; raise DataError for fractions, or more than `MOST`."""
     kind = volume.data.dtype
     if kind.kind in "iu" and kind.itemsize <= 2 and (volume.slope, volume.intercept) == (1, 0):
         counts, first = count_integers(volume)

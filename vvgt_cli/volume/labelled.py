@@ -400,11 +400,7 @@ def _left(
 
 
 def _descends(a: Axis, source: str) -> bool:
-    """Tell whether an axis runs downwards.
-
-    Raises:
-        DataError: it does neither run up nor down.
-    """
+    """Tell whether an axis runs downwards; raise DataError if it runs neither up nor down."""
     if a.centres is None or a.size < 2:
         return False
     steps = np.diff(a.centres)
@@ -427,11 +423,7 @@ def _steps(a: Axis) -> str:
 
 
 def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
-    """Return the coordinates of the axes, lengths in the unit of the last axis.
-
-    Raises:
-        UsageError: units that do not compare.
-    """
+    """Return the coordinates of the axes, lengths in the unit of the last; raise UsageError if units do not compare."""
     units = [_unit(a) for a in axes if a.size > 1]
     if len(set(units)) <= 1:
         return [a.centres for a in axes]

@@ -14,11 +14,7 @@ from vvgt_cli.errors import DataError, VvgtError
 
 
 def need(module: str, extra: str, source: str, what: str) -> Any:
-    """Import a module that an extra installs.
-
-    Raises:
-        DataError: it is not installed; the error names the extra.
-    """
+    """Import a module that an extra installs; raise DataError, which names the extra, if it is missing."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

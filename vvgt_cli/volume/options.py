@@ -1,4 +1,4 @@
-"""`ReadOptions`: how to read a volume, where its file does not say or a caller wants something else."""
+"""Options of reading a volume, where its file does not say or a caller wants something else; crop and mask."""
 
 from __future__ import annotations
 
@@ -123,11 +123,7 @@ class ReadOptions:
 
 
 def parse_dtype(name: str, byte_order: str | None = None) -> np.dtype:
-    """Return the numpy type for a name of `DTYPES`, or for its name in C; little-endian by default.
-
-    Raises:
-        UsageError: unknown name.
-    """
+    """Return the type of a name of `DTYPES` or of C, by default little-endian; raise UsageError for others."""
     found = type_of(name)
     if found is None:
         raise UsageError(f"--dtype {name}: expected one of {', '.join(DTYPES)}")
@@ -138,11 +134,7 @@ Box = tuple[tuple[int | None, int | None], ...]
 
 
 def parse_crop(text: str) -> Box:
-    """Parse ``x0:x1,y0:y1,z0:z1`` in voxels; omitted ends are open, the last voxel is excluded.
-
-    Raises:
-        UsageError: anything else.
-    """
+    """Parse ``x0:x1,y0:y1,z0:z1`` in voxels, the last one excluded, omitted ends open; raise UsageError for others."""
     parts = [re.fullmatch(r"\s*(\d*)\s*:\s*(\d*)\s*", part) for part in text.split(",")]
     if len(parts) != 3 or None in parts:
         raise UsageError(f"--crop {text}: expected x0:x1,y0:y1,z0:z1 in voxels, as 10:200,:,:64")
@@ -153,11 +145,7 @@ def parse_crop(text: str) -> Box:
 
 
 def crop(volume: Volume, box: Box) -> Volume:
-    """Cut the voxels in a box (x, y, z) out; its ends may lie beyond the volume's last voxel.
-
-    Raises:
-        UsageError: no voxel of the volume is in it.
-    """
+    """Cut out the voxels of a box (x, y, z), which may reach beyond the volume; raise UsageError if there are none."""
     first = [a or 0 for a, _ in box]
     if any(a >= n for a, n in zip(first, volume.dims, strict=True)):
         dims = " x ".join(map(str, volume.dims))

@@ -18,6 +18,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
 HEAD_BYTES = 4096
+HDF5 = b"\x89HDF\r\n\x1a\n"  # which files of several formats begin with
 
 
 def lazy(name: str, *first: Any) -> Callable[..., Any]:
@@ -43,7 +44,9 @@ class Reader:
         name: for messages.
         suffixes: lower-case endings of file names, with the dot; one that ends in ``gz`` means that compressed files of
             the format are read.
-        read: path and options to volume.
+        read: path and options to volume. Raises a `DataError` where a library is not installed, or the file is damaged,
+            of another kind, larger than memory, or names files outside of its folder; a `UsageError` for a choice (of
+            array, component or time step) that is missing or does not exist, and options that do not suit.
         sniff: tells whether a file with these first `HEAD_BYTES`, decompressed, has the format; None where files begin
             in no certain way, so that the name decides.
         takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order`` and ``header_bytes`` it

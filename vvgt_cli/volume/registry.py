@@ -105,11 +105,7 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
 
 
 def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | None]:
-    """List time and unit of each step of a source where ``options`` choose none; None where the source states no times.
-
-    Raises:
-        DataError, UsageError: as `read_volume`.
-    """
+    """List time and unit of each step where ``options`` choose none, None without times; errors are `read_volume`'s."""
     try:
         read_volume(source, options)
     except SeveralSteps as error:
@@ -120,11 +116,7 @@ def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | No
 
 
 def contents(source: str, options: ReadOptions) -> dict[str, Any]:
-    """List steps, arrays and blocks of a file, rows with the option that chooses each; empty for most formats.
-
-    Raises:
-        DataError: no such file, or a damaged one.
-    """
+    """List a file's steps, arrays and blocks with the option of each, for some formats only, or raise DataError."""
     path, options = _inner(source, options)
     if not os.path.isfile(path):
         return {}
@@ -133,11 +125,7 @@ def contents(source: str, options: ReadOptions) -> dict[str, Any]:
 
 
 def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of a source's resolutions, slowest axis first and finest first; empty for most formats.
-
-    Raises:
-        DataError, UsageError: as `read_volume`, of an address on a server.
-    """
+    """List shapes of a source's resolutions, slowest axis and finest first, for some formats; as `read_volume`."""
     if source.partition(":")[0] in STEPPED:
         from vvgt_cli.volume.arrays.remote import level_shapes as remote
 
@@ -323,13 +311,7 @@ ROWS = (
 
 
 def way_out(path: Path, head: bytes, by_name: bool) -> str | None:
-    """Return what a file is and what to do with it, None where that is not known.
-
-    Args:
-        path: the file.
-        head: its first bytes.
-        by_name: its name may decide, too.
-    """
+    """Return what a file is and what to do with it, by its first bytes or, ``by_name``, its name; None if unknown."""
     for begins, ends, what, way in ROWS:
         if not re.match(begins, head) or not (begins or by_name) or not re.search(f"(?:{ends})$", path.name, re.I):
             continue

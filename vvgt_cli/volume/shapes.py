@@ -157,11 +157,7 @@ SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
 
 
 def make_shape(kind: str, size: int = 128, seed: int = 0) -> Volume:
-    """Return a volume of one of `SHAPES`, ``size`` voxels per side.
-
-    Raises:
-        UsageError: the size is below `SMALLEST`, or does not fit in memory.
-    """
+    """Return one of `SHAPES`, ``size`` voxels per side; raise UsageError below `SMALLEST`, or beyond memory."""
     if size < SMALLEST:
         raise UsageError(f"{kind} of {size} voxels per side: expected at least {SMALLEST}")
     check_memory(size**3 * BYTES, f"{kind} of {size} x {size} x {size} voxels")
@@ -250,12 +246,6 @@ def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
     edge = max(1, max(nx, ny, nz) // max(1, cells))
     x, y, z = (np.arange(n) // edge for n in (nx, ny, nz))
     return volume_of((x[None, None, :] + y[None, :, None] + z[:, None, None]) % 2, "checkerboard")
-
-
-def constant(size: Size = 16, value: float = 1.0) -> Volume:
-    """Return a volume with the same value everywhere."""
-    nx, ny, nz = _dims(size)
-    return volume_of(np.full((nz, ny, nx), value, np.float32), "constant")
 
 
 def random_field(size: Size = 64, cycles: float = 8.0, seed: int = 0) -> Volume:

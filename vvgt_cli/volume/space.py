@@ -31,14 +31,7 @@ _LENGTHS = {name: metres for metres, names in METRES.items() for name in names}
 
 
 def unit_rows(vectors: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Split three axis vectors into lengths and directions.
-
-    Args:
-        vectors: (3, 3) numbers, one axis a row.
-
-    Returns:
-        The lengths, and the row-major matrix whose columns are the unit vectors.
-    """
+    """Return the lengths of three axes (3, 3), one a row, and the row-major matrix with unit axes as columns."""
     rows = np.asarray(vectors).tolist()
     lengths = tuple(math.hypot(*row) for row in rows)
     unit = [[c / n if n > 0 else float(i == k) for k, c in enumerate(row)]
@@ -63,14 +56,9 @@ def placed(field: Any, steps: Any, origin: Any, options: ReadOptions, name: str,
 
 
 def in_space(volume: Volume, wanted: str | None) -> Volume:
-    """Bring direction and origin of a volume to an anatomical space; leave them where its file states none.
+    """Bring direction and origin to a space (of `SPACES`; None: RAS); leave them where the file states no space.
 
-    Args:
-        volume: in the space that its format is in.
-        wanted: one of `SPACES`; None: RAS where the volume has a space.
-
-    Raises:
-        UsageError: a space is wanted of a volume that has none.
+    Raise UsageError if one is ``wanted`` then.
     """
     if volume.space is None:
         if wanted is not None:
@@ -156,11 +144,8 @@ def axis_facts(affine: np.ndarray, space: str | None) -> dict[str, object]:
 def axis_words(axes: np.ndarray, space: str | None) -> list[str]:
     """Describe where index axes i, j, k run: "L-R" is from left to right, "-y" against world y.
 
-    An axis that is more than half a degree off the world axis nearest to it says by how many degrees.
-
-    Args:
-        axes: (3, 3) world directions of the index axes, unit vectors as columns.
-        space: one of `SPACES`; anything else: the space is not anatomical.
+    ``axes`` (3, 3) are unit vectors in columns. One more than half a degree off the nearest world axis says by how
+    many.
     """
     found = []
     for column in axes.T:

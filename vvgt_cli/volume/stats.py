@@ -48,11 +48,7 @@ def slabs(volume: Volume, max_voxels: int = SLAB_VOXELS) -> Iterator[tuple[int, 
 
 
 def statistics(volume: Volume) -> Statistics:
-    """Compute statistics of a volume's data values; memory stays within a few slabs.
-
-    Raises:
-        DataError: no voxel has a finite value, or the scaling makes values infinite.
-    """
+    """Compute statistics slab by slab; raise DataError without finite values, or if scaling makes them infinite."""
     if volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2:
         return integer_statistics(_byte_counts(volume), volume)
     lo, hi, nan_count, inf_count = _range(volume)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.volume.blocks import IN_BLOCKS, Packed, check_memory
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.types import Volume
 
 Slices = tuple[slice, ...]
@@ -53,11 +53,7 @@ class Stored:
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """Read the block of one to three slices.
-
-        Raises:
-            DataError: a chunk that cannot be read, with its index.
-        """
+        """Read the block of one to three slices; raise DataError with the index of a chunk that cannot be read."""
         keys = key if isinstance(key, tuple) else (key,)
         whole = [*keys, *[slice(None)] * (3 - len(keys))]
         slices = tuple(slice(*k.indices(n)) for k, n in zip(whole, self.shape, strict=True))
@@ -96,15 +92,24 @@ class Stored:
         return DataError(f"{self.source}: cannot be read ({error}); try again")
 
 
+def slice_by_slice(read: Callable[[int], np.ndarray], dtype: np.dtype, shape: tuple[int, ...], source: str) -> Stored:
+    """Return a `Stored` of which ``read`` returns slice z as (ny, nx)."""
+
+    def part(slices: Slices) -> np.ndarray:
+        z, y, x = slices
+        out = np.empty([s.stop - s.start for s in slices], dtype)
+        for k in range(z.start, z.stop):
+            out[k - z.start] = read(k)[y, x]
+        return out
+
+    return Stored(part, dtype, shape, (1, *shape[1:]), source)
+
+
 def stored_or_held(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
     stored: bool,
 ) -> Any:  # fmt: skip
-    """Return a `Stored`, or its values in memory where ``stored`` is False; other arguments as `Stored`.
-
-    Raises:
-        DataError: the values do not fit in memory.
-    """
+    """Return a `Stored`, or its values if ``stored`` is False; raise DataError if they do not fit in memory."""
     found = Stored(read, dtype, tuple(shape), chunks, source)
     if stored:
         return found
@@ -123,17 +128,8 @@ def put_overlap(out: np.ndarray, first: Sequence[int], block: np.ndarray, at: Se
         out[there] = block[here]
 
 
-def readable_in_blocks(volume: Volume) -> bool:
-    """Tell whether parts of a volume's array can be read without the rest: mapped, `Stored`, bricks, or in memory."""
-    return not isinstance(volume.data, Packed)
-
-
 def held(volume: Volume) -> Volume:
-    """Load the values of a volume into memory.
-
-    Raises:
-        DataError: they do not fit.
-    """
+    """Load the values of a volume into memory; raise DataError if they do not fit."""
     if not isinstance(volume.data, Stored):
         return volume
     check_memory(volume.data.nbytes, volume.name, IN_BLOCKS)

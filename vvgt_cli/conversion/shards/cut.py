@@ -1,4 +1,4 @@
-"""Cuts of a tiled pyramid by thresholds, as Gaussians region by region."""
+"""The plan of a conversion by blocks, and cuts of its tiled pyramid, as Gaussians region by region."""
 
 from __future__ import annotations
 
@@ -296,11 +296,7 @@ class Plan:
 
     @classmethod
     def load(cls, store: BlockStore) -> Plan:
-        """Read the plan beside blocks.
-
-        Raises:
-            DataError: the plan is missing or damaged.
-        """
+        """Read the plan beside blocks; raise DataError if it is missing or damaged."""
         path = store.folder / PLAN
         try:
             found = json.loads(path.read_text("utf-8"))
@@ -321,11 +317,7 @@ class Plan:
 
 
 def load_light(store: BlockStore, plan: Plan) -> Light | None:
-    """Read the light beside a plan, None for none.
-
-    Raises:
-        DataError: the file beside the plan is missing or damaged.
-    """
+    """Read the light beside a plan, None for none; raise DataError if the file is missing or damaged."""
     if plan.ply.light is None:
         return None
     path = store.folder / LIGHT

@@ -22,6 +22,9 @@ MOST_LEVELS = 6
 LEAST_PRICE, HALVINGS = 1e-12, 60  # price of a Gaussian in squared error, and steps of its bisection
 FIELDS = ("counts", "squares", "energies", "pixels")
 FEWEST = 4  # mean Gaussians of a node below which no further level is made
+SEEN_FROM = ((0.62, 0.54, 0.57), (-0.59, 0.71, -0.38), (0.46, -0.33, -0.82))  # directions along no axis
+VIEW_PIXELS = 96  # along an edge of the views by which cuts are compared, more than the cells of a tile
+AWAY, MARGIN = 30.0, 1.1  # distance of the camera, and half the field of view, in radii of the node
 
 
 @dataclass(frozen=True)
@@ -135,11 +138,7 @@ class ErrorRegions:
 
 
 def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
-    """Make and draw `CUTS` cuts of every node; results of an interrupted run are reused.
-
-    Raises:
-        DataError: a result is damaged.
-    """
+    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's; raise DataError if one is damaged."""
     tree, store = cut.tiled_tree, cut.store
     finest = tree.threshold(cut.plan.budget)
     second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
@@ -148,11 +147,6 @@ def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
     run_pass(task, "errors")
     parts = [store.load(task.kind, number) for number in range(len(task))]
     return CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
-
-
-SEEN_FROM = ((0.62, 0.54, 0.57), (-0.59, 0.71, -0.38), (0.46, -0.33, -0.82))  # directions along no axis
-SIZE = 96  # pixels along an edge, more than the cells of a tile
-AWAY, MARGIN = 30.0, 1.1  # distance of the camera, and half the field of view, in radii of the node
 
 
 def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
@@ -173,7 +167,7 @@ def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
     squares, covered, differences = 0.0, 0, np.zeros(len(cuts))
     for direction in SEEN_FROM:
         eye = middle + AWAY * radius * np.array(direction) / np.linalg.norm(direction)
-        camera = look_at(eye, target=tuple(middle), width=SIZE, height=SIZE, fov=field)
+        camera = look_at(eye, target=tuple(middle), width=VIEW_PIXELS, height=VIEW_PIXELS, fov=field)
         drawn = [render(cut, camera).astype(np.float64) for cut in cuts]
         covered += int((drawn[0][..., 3] > 1 / 255).sum())
         squares += float((drawn[0] ** 2).sum())

@@ -226,11 +226,7 @@ class Made:
     ends: tuple[int, ...]
 
     def level(self, k: int, begin: int, end: int) -> Iterator[Gaussians]:
-        """Yield the Gaussians of level ``k`` of the nodes from ``begin`` to ``end``.
-
-        Raises:
-            DataError: a region's file is missing or damaged.
-        """
+        """Yield the Gaussians of level ``k`` of nodes ``begin`` to ``end``; raise DataError if a region is damaged."""
         for number in range(int(np.searchsorted(self.ends, begin, "right")), len(self.ends)):
             first = self.ends[number - 1] if number else 0
             if first >= end:

@@ -1,4 +1,4 @@
-"""Conversion to a file in blocks and regions: count, integrate, cut, refine, write; or by shards."""
+"""Conversion to a file in blocks and regions, or by shards: count, integrate, cut, refine, write, score."""
 
 from __future__ import annotations
 
@@ -59,6 +59,9 @@ if TYPE_CHECKING:
 
 DERIVED = ("coarse", "trees", "closed-", "errors-", "written-")  # what a merge adds to a folder of blocks
 A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
+BLOCKS_A_VIEW = 64  # of 16 x 16 px, by which test views are scored
+RAYS_A_PIXEL = 2  # along its edge
+A_GAUSSIAN = 400  # bytes to draw a Gaussian
 
 
 def writes_streaming(request: ConvertRequest) -> bool:
@@ -117,11 +120,7 @@ def convert_in_batches(request: ConvertRequest, console: Console | None = None) 
 
 
 def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> Gaussians:
-    """Return the Gaussians of a volume, box frame, refined region by region.
-
-    Raises:
-        NothingVisible, DataError: see `write_merged`.
-    """
+    """Return a volume's Gaussians, box frame, refined region by region; errors are those of `write_merged`."""
     budget = request.budget(degree_of(request, field.source))
     request = replace(request, fit=replace(request.fit, max_gaussians=budget))
     run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
@@ -230,11 +229,7 @@ def _opened(
 
 
 def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
-    """Make all blocks, reusing existing ones, and the plan of the file.
-
-    Raises:
-        MissingBlocks: other shards' blocks are missing.
-    """
+    """Make all blocks, or reuse them, and the file's plan; raise MissingBlocks if other shards' are missing."""
     budget, size, store = request.fit.max_gaussians, request.fit.size, field.run_pass.store
     source, ply = field.source, ply_options(request, field.source)
     for line in placement_warnings(source.volume, ply):
@@ -256,11 +251,7 @@ def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
 
 
 def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree: int) -> None:
-    """Report the bytes that the blocks will take on disk.
-
-    Raises:
-        DataError: the disk is too small.
-    """
+    """Report the bytes that the blocks will take on disk; raise DataError if it is too small."""
     assert cells.rays is not None
     rays = sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
     store = cells.store
@@ -372,26 +363,17 @@ def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]
                 shutil.copyfileobj(sink, stream)
 
 
-FEW = 64  # blocks of 16 x 16 px of each test view
-RAYS = 2  # rays along a pixel's edge
-A_GAUSSIAN = 400  # bytes to draw a Gaussian
-
-
 def scored_views(size: int) -> list[Picture]:
     """List the blocks of three test views of ``size`` px."""
     from vvgt_cli.dvr import RenderSettings
 
     cameras = default_views("test", size=size)
-    settings = RenderSettings(samples=RAYS)
-    return [Picture(cameras[i], settings, spread_blocks(size, size, i, FEW)) for i in PREVIEW_VIEWS]
+    settings = RenderSettings(samples=RAYS_A_PIXEL)
+    return [Picture(cameras[i], settings, spread_blocks(size, size, i, BLOCKS_A_VIEW)) for i in PREVIEW_VIEWS]
 
 
 def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
-    """Score Gaussians (box frame), drawn by a rule, against the stored views of the volume.
-
-    Raises:
-        DataError: a block is missing or damaged.
-    """
+    """Score Gaussians (box frame), drawn by a rule, against the volume's stored views; DataError for damaged blocks."""
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render
 

@@ -47,11 +47,7 @@ class ClosedFormStage(Stage):
         return Cost(workload.pace * seconds, MEMORY[0] * workload.cells + MEMORY[1] * workload.gaussians)
 
     def run(self, work: Work) -> None:
-        """Make the Gaussians, or load them from the checkpoint, without the pyramid.
-
-        Raises:
-            NothingVisible: nothing is visible from any view.
-        """
+        """Make the Gaussians, or load them from the checkpoint, without the pyramid; raise NothingVisible for none."""
         from vvgt_cli.closed_form import Start, VbmOptions
         from vvgt_cli.closed_form.closed_form import bound
 

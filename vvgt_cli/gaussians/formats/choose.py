@@ -76,11 +76,7 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
 
 
 def ready(path: str | Path) -> None:
-    """Check that the format of a file name can be written.
-
-    Raises:
-        DataError: a library that it needs is not installed; the error names it.
-    """
+    """Check that the format of a file name can be written; raise DataError, which names a missing library."""
     known = format_of(path)
     if known is not None:
         known.needs(str(path))

@@ -124,11 +124,7 @@ def _harmonic(m: int) -> str:
 
 
 def read_glb(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.glb` as written by `glb` or `glb_of_nodes`: float32, all nodes together.
-
-    Raises:
-        DataError: the file is not such a `.glb`.
-    """
+    """Read the columns of a `.glb` that `glb` or `glb_of_nodes` wrote, all nodes together, or raise DataError."""
     try:
         return _read(content, name)
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error) as error:

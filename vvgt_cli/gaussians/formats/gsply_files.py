@@ -36,11 +36,7 @@ _FRONT = struct.Struct("<2sBBIBB")  # magic, method, flags, time, extra flags, s
 
 
 def gsply(source: str) -> Any:
-    """Return the library.
-
-    Raises:
-        DataError: the library is not installed.
-    """
+    """Return the library; raise DataError if it is not installed."""
     return need("gsply", EXTRA, source, "this format")
 
 
@@ -59,11 +55,7 @@ def compressed_ply(splats: Splats, name: str, order: np.ndarray | None = None) -
 
 
 def read_compressed_ply(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.compressed.ply`.
-
-    Raises:
-        DataError: gsply cannot read it, or is not installed.
-    """
+    """Read the columns of a `.compressed.ply`; raise DataError if gsply cannot, or is not installed."""
     library = gsply(name)
     lines, size = header_lines(content[: 1 << 18], name)
     with library_errors(name, "a compressed .ply"):
@@ -108,11 +100,7 @@ def spz_4(splats: Splats, name: str) -> bytes:
 
 
 def zstandard(source: str) -> None:
-    """Check the libraries of `spz_4`.
-
-    Raises:
-        DataError: gsply or numcodecs is not installed.
-    """
+    """Check the libraries of `spz_4`; raise DataError if gsply or numcodecs is not installed."""
     gsply(source)
     library(source)
 
@@ -144,11 +132,7 @@ def _packed(content: bytes, comments: tuple[str, ...]) -> bytes:
 
 
 def read_spz(content: bytes, name: str) -> Splats:
-    """Read the columns of an `.spz` of version 1 to 4.
-
-    Raises:
-        DataError: gsply cannot read it, or is not installed.
-    """
+    """Read the columns of an `.spz` of version 1 to 4; raise DataError if gsply cannot, or is not installed."""
     library = gsply(name)
     comments = _comments(content)
     if content.startswith(MAGIC):
@@ -186,11 +170,7 @@ _LEVEL = 12  # of Zstandard
 
 
 def library(source: str) -> Any:
-    """Return the module `numcodecs.zstd`.
-
-    Raises:
-        DataError: the module is not installed.
-    """
+    """Return the module `numcodecs.zstd`; raise DataError if it is not installed."""
     return need("numcodecs.zstd", "share", source, ".spz of version 4")
 
 
@@ -252,11 +232,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
 
 
 def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
-    """Decompress a stream.
-
-    Raises:
-        DataError: it has fewer bytes than ``length``, detected by the end of the buffer, which stays unchanged.
-    """
+    """Decompress a stream; raise DataError below ``length`` bytes, seen by the unchanged end of the buffer."""
     for before in (b"\0", b"\xff"):
         found = bytes(zstd.decompress(part, bytearray(before * length)))
         if found[-1:] != before:

@@ -110,10 +110,7 @@ class StreamedLevels:
             self._read(file, list(some))
         whole, smaller = joined([self._cached[key] for key in keys]), np.float32(self.scale)
         return replace(
-            whole,
-            means=whole.means / smaller,
-            log_scales=whole.log_scales - np.log(smaller),
-            comments=self._comments,
+            whole, means=whole.means / smaller, log_scales=whole.log_scales - np.log(smaller), comments=self._comments
         )
 
     def _read(self, file: int, keys: list[tuple[int, int, int]]) -> None:

@@ -76,13 +76,7 @@ def _first_rows(layers: Sequence[LiveFacts]) -> list[int]:
 
 
 def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Sequence[float]) -> dict[str, Any]:
-    """Return the facts that accompany the bytes, as plain values.
-
-    Args:
-        clouds: the Gaussians.
-        facts: facts about their values.
-        unit_distances: per layer, the unit-frame length that its opacity refers to.
-    """
+    """Return the facts beside the bytes, as plain values; ``unit_distances`` are per layer, in the unit frame."""
     rows = zip(facts.layers, _first_rows(facts.layers), unit_distances, strict=True)
     return {
         "layers": [_layer_json(*row) for row in rows],

@@ -41,11 +41,7 @@ class Placed:
 
 
 def placed(comments: tuple[str, ...], name: str) -> Placed:
-    """Return the placement that a file's comments state.
-
-    Raises:
-        DataError: the comments are not valid.
-    """
+    """Return the placement that a file's comments state; raise DataError if they are not valid."""
     facts = facts_in(list(comments), name)
     space = facts.get("space") or "none"
     unit = "mm" if space != "none" else facts.get("length_unit") or ""
@@ -62,16 +58,10 @@ def placed(comments: tuple[str, ...], name: str) -> Placed:
 
 
 def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], name: str) -> np.ndarray:
-    """Return how far a node is moved (3,) in the frame of the data, below a root that is where vvgt puts it.
+    """Return how far a node is moved (3,) in the frame of the data, below a ``root`` that is where vvgt puts it.
 
-    Args:
-        root: (4, 4) matrix from the root's data to the scene.
-        place: (4, 4) matrix from the node's data to the scene.
-        comments: comments of the file.
-        name: name of the file for errors.
-
-    Raises:
-        DataError: see `same_place`; the node is turned or scaled.
+    ``root`` and ``place`` are (4, 4) matrices from data to scene. Raise DataError as `same_place`, or for a turn or
+    scale.
     """
     for one in (root, np.column_stack([place[:, :3], root[:, 3]])):
         same_place(one, comments, name)
@@ -82,16 +72,7 @@ def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], na
 
 
 def same_place(found: np.ndarray, comments: tuple[str, ...], name: str) -> None:
-    """Check that a file places its Gaussians as vvgt wrote it, or by the half turn alone.
-
-    Args:
-        found: (4, 4) matrix from data to scene.
-        comments: comments of the file.
-        name: name of the file for errors.
-
-    Raises:
-        DataError: another program moved the Gaussians, so that the comments are no longer true.
-    """
+    """Raise DataError unless ``found`` (4, 4), data to scene, is where vvgt puts a file, or half a turn from it."""
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
     if not any(np.allclose(found, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(

@@ -178,12 +178,7 @@ def _text(title: str, scene: Mapping[str, Any], elements: str) -> str:
 
 
 def policy(text: str, source: str = "") -> str:
-    """Return the content security policy that a page needs, with the hashes of its scripts and style.
-
-    Args:
-        text: the page.
-        source: where it loads further files from, such as "'self'"; "" for a page in a file.
-    """
+    """Return the content security policy of a page, with hashes of scripts and style; ``source`` of other files."""
     scripts = [found.encode("utf-8") for found in _SCRIPTS.findall(text)]
     if 'id="program"' in text:
         scripts.append(gzip.decompress(asset(PROGRAM)))

@@ -152,9 +152,7 @@ def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     return first if len(looks) == 1 else None
 
 
-def live_page_data(
-    clouds: Sequence[tuple[Gaussians, PlyOptions]],
-) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
+def live_page_data(clouds: Sequence[tuple[Gaussians, PlyOptions]]) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
     """Return the data of a page of Gaussians (unit frame) that carry values, for one or several clouds.
 
     Returns:
@@ -232,11 +230,7 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
 
 
 def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
-    """Parse the JSON of a light sent by the page of a file with these options, in the format of `_light`.
-
-    Raises:
-        DataError, UsageError: the light is not valid.
-    """
+    """Parse the JSON of a light that a page of these options sends (as `_light` writes), or raise an error."""
     numbers = ("ambient", "diffuse", "specular", "power")
     if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
         raise DataError("the page's light: expected an object of kind none, headlight or direction")

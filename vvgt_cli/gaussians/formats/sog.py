@@ -114,16 +114,7 @@ def webp(image: np.ndarray) -> bytes:
 
 
 def splats_in(meta: Any, read: Callable[[str], bytes], name: str) -> Splats:
-    """Decode the columns that `meta.json` describes, without comments.
-
-    Args:
-        meta: the parsed JSON.
-        read: returns the bytes of an image, given its name.
-        name: name of the file for errors.
-
-    Raises:
-        DataError: the metadata or an image is not valid.
-    """
+    """Decode the columns that ``meta``, the parsed `meta.json`, describes, without comments, or raise DataError."""
     if not isinstance(meta, dict) or meta.get("version") != 2:
         found = meta.get("version") if isinstance(meta, dict) else None
         raise DataError(f"{name}: {META} has version {found!r:.40}; expected SOG of version 2")
@@ -254,14 +245,9 @@ _AT_ONCE = 1 << 16  # Gaussians
 
 
 def nearest_turn(quaternions: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same ellipsoids with the smallest rotations (largest w), whose numbers are more alike.
+    """Return the same ellipsoids with the smallest rotations (largest w), float64, whose numbers are more alike.
 
-    Args:
-        quaternions: (K, 4), (w, x, y, z), of norm 1.
-        log_scales: (K, 3).
-
-    Returns:
-        quaternions, float64; log-scales in the type of ``log_scales``.
+    ``quaternions`` (K, 4), (w, x, y, z), have norm 1; log-scales (K, 3) keep their type.
     """
     turned, scaled = np.empty((len(quaternions), 4)), np.empty_like(log_scales)
     for start in range(0, len(quaternions), _AT_ONCE):
@@ -339,11 +325,7 @@ _LARGEST_TEXT = 1 << 20
 
 
 def sog(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.sog`, along the Morton curve.
-
-    Raises:
-        DataError: there are more Gaussians than a file can hold.
-    """
+    """Encode columns as a `.sog`, along the Morton curve; raise DataError for more Gaussians than a file can hold."""
     if len(splats) > MOST:
         raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
     images, meta = images_of(splats.take(morton_order(splats.means)))
@@ -359,11 +341,7 @@ def sog(splats: Splats, name: str) -> bytes:
 
 
 def read_sog(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.sog` of version 2.
-
-    Raises:
-        DataError: the file is not valid.
-    """
+    """Read the columns of a `.sog` of version 2, or raise DataError."""
     with library_errors(name, "a .sog"), zipfile.ZipFile(io.BytesIO(content)) as archive:
 
         def read(file: str, largest: int = _LARGEST) -> bytes:

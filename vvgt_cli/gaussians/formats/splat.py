@@ -18,11 +18,7 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("r
 
 
 def read_splat(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.splat`; scales of 0 become -inf, rotations of 0 NaN.
-
-    Raises:
-        DataError: the size is not a multiple of 32 bytes.
-    """
+    """Read the columns of a `.splat`, or raise DataError; scales of 0 become -inf, rotations of 0 NaN."""
     if not content or len(content) % _ROW.itemsize:
         raise DataError(f"{name}: {len(content)} bytes; expected a .splat of 32 bytes a Gaussian")
     rows = np.frombuffer(content, _ROW)

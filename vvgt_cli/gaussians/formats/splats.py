@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_ply, read_ply
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
 
@@ -56,11 +56,7 @@ class Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Concatenate columns, with the comments of the first.
-
-    Raises:
-        DataError: the degrees of harmonics differ.
-    """
+    """Concatenate columns, with the comments of the first; raise DataError if the degrees of harmonics differ."""
     degrees = sorted({DEGREES[part.f_rest.shape[1]] for part in parts})
     if len(degrees) > 1:
         raise DataError(f"Gaussians with harmonics of degrees {degrees}; expected one")
@@ -69,22 +65,12 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
 
 def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
-    """Return the columns that `write_ply` would write.
-
-    Raises:
-        DataError, UsageError: see `write_ply`.
-    """
-    stream = io.BytesIO()
-    write_ply(stream, gaussians, options)
-    return columns_of(stream.getvalue(), "Gaussians")
+    """Return the columns that `write_ply` would write, with its errors."""
+    return columns_of(as_ply(gaussians, options), "Gaussians")
 
 
 def columns_of(content: bytes, name: str) -> Splats:
-    """Return the columns of a standard `.ply`.
-
-    Raises:
-        DataError: the content is not a standard `.ply`.
-    """
+    """Return the columns of a standard `.ply`, or raise DataError."""
     header = parse_header(content[: 1 << 16], name)
     rows = np.frombuffer(content, header.dtype, header.count, header.size)
 
@@ -120,11 +106,7 @@ def ply_bytes(splats: Splats) -> bytes:
 
 
 def gaussians_of(splats: Splats, name: str) -> tuple[Gaussians, PlyHeader]:
-    """Return Gaussians and header as `read_ply` would read them from a file of these columns.
-
-    Raises:
-        DataError: values are not finite, or comments are not valid.
-    """
+    """Return Gaussians and header as `read_ply` would read them from a file of these columns, with its errors."""
     stream = io.BytesIO(ply_bytes(splats))
     stream.name = name
     return read_ply(stream)

@@ -24,11 +24,7 @@ def is_streamed(path: str | Path | None) -> bool:
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:
-    """Read a manifest and check the entries that the engine needs: levels, files, and nodes in the tree.
-
-    Raises:
-        DataError: the file is not a manifest, or damaged.
-    """
+    """Read a manifest with what the engine needs (levels, files, nodes in the tree), or raise DataError."""
     path = Path(path)
     try:
         if path.stat().st_size > _LARGEST:
@@ -60,11 +56,7 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
 
 
 def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]:
-    """Return the nodes that have levels, in the order of the tree.
-
-    Raises:
-        DataError: the tree is not valid.
-    """
+    """Return the nodes that have levels, in the order of the tree; raise DataError if it is not valid."""
     found, waiting = [], [manifest.get("tree")]
     while waiting:
         node = waiting.pop()
@@ -78,11 +70,7 @@ def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]
 
 
 def facts_of(path: str | Path) -> dict[str, Any]:
-    """Return the summary for `vvgt info`: Gaussians and nodes per level, and bytes and errors if vvgt wrote them.
-
-    Raises:
-        DataError: see `read_manifest`.
-    """
+    """Return the summary for `vvgt info`: Gaussians and nodes per level, and bytes and errors if vvgt wrote them."""
     manifest = read_manifest(path)
     nodes, ours = nodes_of(manifest, path), manifest.get("vvgt")
     facts = ours.get("levels") if isinstance(ours, dict) else None

@@ -30,11 +30,7 @@ _ZIP_HEADER, _ALIGNED, _PADDING = 30, 64, 0x1986  # bytes of a local header, of 
 
 
 def library(source: str) -> Any:
-    """Return the module `pxr.Usd`.
-
-    Raises:
-        DataError: the module is not installed, or too old for Gaussians.
-    """
+    """Return the module `pxr.Usd`; raise DataError if it is not installed, or too old for Gaussians."""
     usd = need("pxr.Usd", "share", source, ".usdc")
     if usd.GetVersion() < _SINCE:
         version = ".".join(map(str, usd.GetVersion()[1:]))
@@ -169,11 +165,7 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
-    """Read the columns of a `.usdc` as written by `usdc` or `usdc_of_nodes`: all prims together.
-
-    Raises:
-        DataError: the file is not such a stage, or OpenUSD is not installed.
-    """
+    """Read the columns of a `.usdc` as `usdc` or `usdc_of_nodes` writes, all prims together, or raise DataError."""
     usd = library(name)
     from pxr import UsdGeom
 

@@ -65,11 +65,7 @@ def _elements(text: str, path: Path) -> Elements:
 
 
 def text_of(path: Path, what: str = "a transfer function") -> str:
-    """Return the text of a UTF-8 file of at most 16 MiB; ``what`` is expected there.
-
-    Raises:
-        DataError: too large, not readable, not UTF-8.
-    """
+    """Return the text of a UTF-8 file of at most 16 MiB, else raise DataError; ``what`` is expected there."""
     try:
         kept = seekable(path)
         size = kept.stat().st_size
@@ -88,11 +84,7 @@ def text_of(path: Path, what: str = "a transfer function") -> str:
 
 
 def json_of(text: str, path: Path, what: str = "a ParaView preset or a minimal transfer function") -> Any:
-    """Return the content of a JSON text; ``what`` is expected there.
-
-    Raises:
-        DataError: not JSON.
-    """
+    """Return the content of a JSON text, else raise DataError; ``what`` is expected there."""
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
@@ -136,11 +128,7 @@ def attribute(what: str, attributes: dict[str, str], key: str) -> float:
 
 
 def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:
-    """Return a flat list of numbers as rows of ``width``, (n, width) float64, n >= 1.
-
-    Raises:
-        DataError: not a list, empty, a length that ``width`` does not divide, an entry that is no finite number.
-    """
+    """Return a flat list of finite numbers as rows of ``width``, (n, width) float64, n >= 1, or raise DataError."""
     if not isinstance(value, list) or not value or len(value) % width:
         found = f"a list of {len(value)}" if isinstance(value, list) else _shown(value)
         raise DataError(f"{what}: {found}; expected a flat list of {columns}, {width} numbers a node")

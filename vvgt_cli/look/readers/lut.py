@@ -27,11 +27,7 @@ SIZE = 256  # colours of a map of ImageJ's
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Return a ``.clut`` or ``.lut`` file in niivue's form.
-
-    Raises:
-        DataError: another file, or a damaged one.
-    """
+    """Return a ``.clut`` or ``.lut`` file in niivue's form, or raise DataError."""
     if path.suffix.lower() == ".clut":
         return _clut(text_of(path), path)
     with open(seekable(path), "rb") as stream:

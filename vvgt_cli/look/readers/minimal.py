@@ -44,11 +44,7 @@ def matches(parsed: Any) -> bool:
 
 
 def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
-    """Return the function that the object describes.
-
-    Raises:
-        DataError: an unknown key, an invalid field, ``pick`` of a preset by name.
-    """
+    """Return the function that the object describes; raise DataError for a ``pick``, unknown keys or invalid fields."""
     if pick:
         raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     unknown = sorted(set(parsed) - KEYS)

@@ -38,20 +38,12 @@ def names() -> dict[str, str]:
 
 
 def named_function(name: str) -> TransferFunction:
-    """Return one of our functions; its opacity is per a share of the box's longest edge.
-
-    Raises:
-        KeyError: no function has that name.
-    """
+    """Return one of our functions, per a share of the box's longest edge; raise KeyError for an unknown name."""
     return minimal.read(_entries()[name]["function"], name)
 
 
 def read(source: str) -> TransferFunction:
-    """Return the function of a name: one of ours, or a colour map on fractions of the data range.
-
-    Raises:
-        UsageError: not a colour map of matplotlib's, or not a ramp.
-    """
+    """Return the function of a name: ours, or a colour map on fractions of the data range, or raise UsageError."""
     if source in names():
         return named_function(source)
     name, *rest = source.split(":")

@@ -43,12 +43,7 @@ def matches(parsed: Any) -> bool:
 
 
 def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
-    """Return the function of a volume property.
-
-    Raises:
-        DataError: too few lines, a count that is not that of the numbers, an invalid field, several presets and no
-            ``pick``, or ``pick`` where there are none.
-    """
+    """Return the function of a volume property, of several the preset ``pick``, or raise DataError."""
     several = isinstance(parsed, list | Elements) or "colorTransfer" in getattr(parsed, "keys", dict)()
     if pick and not several:
         raise DataError(f"{what}: holds one function, no presets; omit #{pick}")

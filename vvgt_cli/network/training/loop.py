@@ -1,4 +1,4 @@
-"""Training loop: AdamW along a cosine, checkpoints, and runs that resume with bitwise identical results."""
+"""Training loop: AdamW along a cosine; checkpoints that resume with the same bits; processes; records of a run."""
 
 from __future__ import annotations
 

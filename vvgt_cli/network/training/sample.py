@@ -1,4 +1,4 @@
-"""One scene through the network: its loss with gradients, and its gain for the record."""
+"""One scene through the network: its loss with gradients, its gain for the record, and splatters for autograd."""
 
 from __future__ import annotations
 
@@ -139,14 +139,9 @@ TINY = 1e-10  # squared error of 100 dB
 def view_loss(
     picture: Tensor, target: Tensor, before: Tensor | None, config: LossConfig, lpips: Lpips | None = None
 ) -> Tensor:
-    """Return the weighted sum of the terms.
+    """Return the weighted sum of the terms for a picture (h, w, 4), premultiplied; a term of weight 0 is not computed.
 
-    Args:
-        picture: (h, w, 4) premultiplied RGBA.
-        target: of the same shape.
-        before: picture of the Gaussians that the network was given; for ``decibel``.
-        config: weights; a term of weight 0 is not computed.
-        lpips: network of the ``lpips`` term.
+    ``before`` is the picture of the network's input, for ``decibel``.
     """
     total = picture.new_zeros(())
     if config.l1:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from vvgt_cli.volume.readers import Reader, lazy
+from vvgt_cli.volume.readers import HDF5, Reader, lazy
 
-MAGIC = b"\x89HDF\r\n\x1a\n"
 MAX_CHUNK = 1 << 31  # bytes of one chunk, decompressed
 _OTHERS = (b"VTKHDF", b"_NCProperties", b"minc-2.0")  # what tells formats that are HDF5 files, too
 _ALL = ("array", "time", "dims")
@@ -12,13 +11,13 @@ _ALL = ("array", "time", "dims")
 
 def is_hdf5(head: bytes) -> bool:
     """Tell whether a file begins as HDF5 does, and as no other format that is HDF5."""
-    return MAGIC in (head[:8], head[512:520]) and not any(other in head for other in _OTHERS)
+    return HDF5 in (head[:8], head[512:520]) and not any(other in head for other in _OTHERS)
 
 
 def is_netcdf(head: bytes) -> bool:
     """Tell whether a file begins as NetCDF does, classic or version 4, and is no Exodus file."""
     classic = head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") and b"floating_point_word_size" not in head
-    return classic or (head.startswith(MAGIC) and b"_NCProperties" in head)
+    return classic or (head.startswith(HDF5) and b"_NCProperties" in head)
 
 
 def is_zipped_zarr(head: bytes) -> bool:

@@ -32,18 +32,9 @@ def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, str]]:
 
 
 def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:
-    """Find the axes of a dataset without dimension scales.
+    """Return a dataset's axes without dimension scales, slowest first, and CF attributes of its scaling.
 
-    Args:
-        file: the open h5py.File.
-        dataset: h5py.Dataset.
-        source: for messages.
-
-    Returns:
-        Its axes, slowest first, and CF attributes for the scaling of its values; None where no convention is followed.
-
-    Raises:
-        DataError: a geometry that is stated and cannot be read.
+    Return None where no convention is followed; raise DataError for a geometry that is stated and cannot be read.
     """
     group, sizes = dataset.parent, dataset.attrs.get("element_size_um", ())  # z, y, x
     if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):

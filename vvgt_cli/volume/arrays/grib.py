@@ -25,12 +25,7 @@ _UNITS = {"isobaricInhPa": "hPa", "isobaricInPa": "Pa", "hybrid": "level"}
 
 
 def grib_volume(path: Path, options: ReadOptions) -> Volume:
-    """Read one variable at one time; levels are z, upwards, members of an ensemble are variables of their own.
-
-    Raises:
-        DataError: ecCodes is not installed, a damaged file, or values that are not on a grid of latitude and longitude.
-        UsageError: several variables or times and none chosen, or axes of different units.
-    """
+    """Read one variable at one time; levels are z, upwards, members of an ensemble are variables of their own."""
     codes, source = need("eccodes", "grib", str(path), "GRIB"), str(path)
     found: dict[str, dict[tuple[Any, ...], dict[float, int]]] = {}  # variable, time, level, byte
     with library_errors(source, "GRIB"), open(path, "rb") as file:

@@ -38,12 +38,7 @@ MOST_VISITED = 100_000
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> Volume:
-    """Read one dataset of an HDF5 file.
-
-    Raises:
-        DataError: h5py is not installed, no dataset of numbers, a damaged file, values in files elsewhere.
-        UsageError: several datasets and none chosen, or choices that `labelled_volume` asks for.
-    """
+    """Read one dataset of an HDF5 file."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         if is_imaris(file):

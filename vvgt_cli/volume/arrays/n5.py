@@ -86,11 +86,7 @@ class N5Array:
 
 
 def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> bytes:
-    """Unpack ``data`` to at most ``size`` bytes.
-
-    Raises:
-        DataError: a compression that is not known, numcodecs missing, data that would be longer.
-    """
+    """Unpack ``data`` to at most ``size`` bytes; raise DataError for unknown or longer data, or without numcodecs."""
     kind = compression.get("type", "raw")
     if kind == "raw":
         return data[:size]
@@ -144,12 +140,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def read_n5(path: Path, options: ReadOptions) -> Volume:
-    """Read one array of an N5 store, of a pyramid its finest or ``options.level``.
-
-    Raises:
-        DataError: no array of numbers, a damaged store, a compression that is not known.
-        UsageError: several arrays and none chosen, or choices that `labelled_volume` asks for.
-    """
+    """Read one array of an N5 store, of a pyramid its finest or ``options.level``."""
     with library_errors(str(path), "N5"):
         place = _choose(path, options)
         array = _array(place)

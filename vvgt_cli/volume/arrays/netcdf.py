@@ -34,10 +34,6 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
     """Read one variable of a NetCDF file, on the axes that its coordinate variables describe.
 
     With ``options.stored`` its values stay in the file, and are read box by box.
-
-    Raises:
-        DataError: netCDF4 is not installed, no variable of numbers, a damaged file.
-        UsageError: several variables and none chosen, or choices that `labelled_volume` asks for.
     """
     library = need("netCDF4", "netcdf", str(path), "NetCDF")
     with open(path, "rb") as stream:
@@ -234,11 +230,7 @@ def _plain(data: bytes) -> str:
 
 
 def check_header(path: Path) -> dict[str, Variable]:
-    """Check that a classic file's header and the values it declares lie in the file; return its variables by name.
-
-    Raises:
-        DataError: they do not.
-    """
+    """Return a classic file's variables by name; raise DataError unless header and declared values lie in the file."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         header = _Header(data, path)
         records = header.number(header.wide)

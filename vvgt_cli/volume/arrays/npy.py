@@ -51,12 +51,7 @@ def _volume(
 
 
 def read_npy(path: Path, options: ReadOptions) -> Volume:
-    """Read a ``.npy`` file.
-
-    Raises:
-        DataError: a header that does not fit the file, objects, or another number of axes.
-        UsageError: a component is needed, or options that do nothing here.
-    """
+    """Read a ``.npy`` file."""
     with open(path, "rb") as file:
         shape, fortran, dtype = _header(file, str(path))
         start = file.tell()
@@ -65,12 +60,7 @@ def read_npy(path: Path, options: ReadOptions) -> Volume:
 
 
 def read_npz(path: Path, options: ReadOptions) -> Volume:
-    """Read one array of a ``.npz`` file; one that is stored plainly is memory-mapped.
-
-    Raises:
-        DataError: not a zip file of arrays, a header that does not fit, objects, or another number of axes.
-        UsageError: several arrays and none chosen, or a component is needed.
-    """
+    """Read one array of a ``.npz`` file; one that is stored plainly is memory-mapped."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}

@@ -167,12 +167,7 @@ class Remote:
 
 
 def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
-    """Return the store at an address, as `read_zarr` takes paths, and the options with the part after ``:/`` as array.
-
-    Raises:
-        DataError: a library is not installed, no answer, or no Zarr.
-        UsageError: two arrays.
-    """
+    """Return the store at an address, as `read_zarr` takes paths, and options with the part behind ``:/`` as array."""
     head, _, inner = url.rpartition(":/")
     if head in SCHEMES:
         head, inner = url, ""
@@ -188,18 +183,10 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
 
 
 def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
-    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored.
-
-    Raises:
-        DataError, UsageError: as `read_zarr`, or an address with nothing behind it.
-    """
+    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored."""
     return read_zarr(*_opened(f"{scheme}:{rest}", options))
 
 
 def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """List the shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
-
-    Raises:
-        DataError, UsageError: as `read_scheme`.
-    """
+    """List the shapes of an OME-Zarr image's levels, finest first; errors are those of `read_scheme`."""
     return zarr_levels(*_opened(url, options))

@@ -37,12 +37,7 @@ def holds_zarr(path: Path) -> bool:
 
 
 def read_zarr(path: Path, options: ReadOptions) -> Volume:
-    """Read one array of a Zarr store.
-
-    Raises:
-        DataError: zarr is not installed, no array of numbers, a codec that is not on the list, a damaged store.
-        UsageError: several arrays and none chosen, or choices that `labelled_volume` asks for.
-    """
+    """Read one array of a Zarr store."""
     zarr = need("zarr", "zarr", str(path), "Zarr")
     with library_errors(str(path), "Zarr"):
         place, facts = _choose(path, options.array, options.level)
@@ -51,15 +46,9 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         attributes = dict(array.attrs)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
         return labelled_volume(
-            lambda index: np.asarray(array[index]),
-            array.dtype,
-            axes,
-            attributes,
-            options,
-            str(place),
-            name_in(path, place),
-            array.chunks,
-        )
+            lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
+            name_in(path, place), array.chunks,
+        )  # fmt: skip
 
 
 def _array(zarr: Any, place: Path) -> Any:
@@ -83,11 +72,7 @@ def name_in(path: Path, place: Path) -> str:
 
 
 def inside(path: Path, wanted: str | None) -> Path:
-    """Return the place in a store that an option names; by default the store itself.
-
-    Raises:
-        UsageError: it lies elsewhere.
-    """
+    """Return the place in a store that an option names, by default the store; raise UsageError if it lies elsewhere."""
     here = path / (wanted or "").strip("/") if wanted else path
     if not here.resolve().is_relative_to(path.resolve()):
         raise UsageError(f"{path}: array {wanted}; expected a path inside the store")
@@ -95,11 +80,7 @@ def inside(path: Path, wanted: str | None) -> Path:
 
 
 def json_object(file: Path) -> dict[str, Any]:
-    """Read a file of metadata.
-
-    Raises:
-        DataError: more than `MAX_METADATA` bytes, or no object of JSON.
-    """
+    """Read a file of metadata; raise DataError for more than `MAX_METADATA` bytes, or no JSON object."""
     if file.stat().st_size > MAX_METADATA:
         raise DataError(f"{file}: {file.stat().st_size} bytes; expected metadata of at most 16 MiB")
     found = json.loads(file.read_text("utf-8"))

@@ -46,11 +46,7 @@ class _Zipped(Remote):
 
 
 def read_zipped(path: Path, options: ReadOptions) -> Volume:
-    """Read one array of a zipped Zarr store, which may be a folder in the zip file.
-
-    Raises:
-        DataError, UsageError: as `read_zarr`, or no Zarr in it.
-    """
+    """Read one array of a zipped Zarr store, which may be a folder in the zip file."""
     if not is_zipfile(path):
         raise DataError(f"{path}: no zip file; expected a Zarr store in one")
     with library_errors(str(path), "Zarr"), ZipFile(path) as file:

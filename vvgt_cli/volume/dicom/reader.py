@@ -142,11 +142,7 @@ def _is_mosaic(header: Any) -> bool:
 
 
 def _mosaic(source: Source) -> tuple[int, np.ndarray | None]:
-    """Return the number of slices in a Siemens mosaic, and the direction (3,) in which they follow, if it is stated.
-
-    Raises:
-        DataError: the number is not stated.
-    """
+    """Return slices in a Siemens mosaic and their direction (3,), if stated; raise DataError without their number."""
     header = read_file(source)
     count, normal = header.get((0x0019, 0x100A)), None
     if any("CSA HEADER" in str(header.get((0x0029, element), "")) for element in range(0x10, 0x20)):

@@ -70,11 +70,7 @@ def names_of(header: Any) -> str:
 
 
 def segments(source: str) -> list[Segment]:
-    """Read number, label and colour of every segment: the recommended CIELab colour, or the palette's.
-
-    Raises:
-        DataError: pydicom or highdicom is not installed, no segmentation, or a damaged one.
-    """
+    """Read number, label and colour (recommended CIELab, or the palette's) of every segment, or raise DataError."""
     pydicom, highdicom = need("pydicom", EXTRA, source, WHAT), need("highdicom", EXTRA, source, WHAT)
     with library_errors(source, WHAT):
         header = pydicom.dcmread(source, stop_before_pixels=True)

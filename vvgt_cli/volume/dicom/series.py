@@ -230,16 +230,8 @@ def one_stack(
 ) -> list[Any]:
     """Return the slices of one size and orientation: the stack asked for, or the only one of more than `_FEW` slices.
 
-    Args:
-        slices: of a series; each with a ``header`` and ``rows`` (2, 3).
-        alike: whether two slices may lie in one stack.
-        number: of the stack, from 1, in the order of their first slices; None for the only one.
-        title: how the series was asked for, "" where it was not.
-        path: for messages.
-
-    Raises:
-        SeveralArrays: several stacks.
-        UsageError: no such one.
+    ``alike`` tells whether two slices may lie in one stack; ``number`` counts stacks from 1. Raise SeveralArrays or
+    UsageError where it does not choose one.
     """
     stacks: list[list[Any]] = []
     for s in slices:

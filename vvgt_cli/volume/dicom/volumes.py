@@ -131,8 +131,7 @@ def _named(volumes: list[list[Any]]) -> dict[str, list[Any]]:
     values = list(zip(*(table[key] for key in chosen), strict=True)) or [()] * len(volumes)
     numbers = len(chosen) == 1 and all(isinstance(one[0], float) for one in values)
     order = sorted(
-        range(len(volumes)),
-        key=lambda k: (values[k][0] if numbers else 0.0, min(s.instance for s in volumes[k])),
+        range(len(volumes)), key=lambda k: (values[k][0] if numbers else 0.0, min(s.instance for s in volumes[k]))
     )
     named: dict[str, list[Any]] = {}
     for k, volume in enumerate(volumes[k] for k in order):

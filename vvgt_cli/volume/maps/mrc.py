@@ -68,11 +68,7 @@ def _order(head: bytes) -> str:
 
 
 def parse_header(head: bytes, name: str) -> Header:
-    """Parse the first 1024 bytes.
-
-    Raises:
-        DataError: too short, no such header, or values that are no real numbers.
-    """
+    """Parse the first 1024 bytes; raise DataError without such a header, or for values that are no real numbers."""
     if len(head) < MRC_HEADER:
         raise DataError(f"{name}: {len(head)} bytes; expected the {MRC_HEADER} of a header of an MRC or CCP4 map")
     order = _order(head)
@@ -134,10 +130,6 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
 
     MAPC, MAPR and MAPS say along which axes of the cell columns, rows and sections run; the cell and MX, MY, MZ say how
     far apart they are. The first voxel lies at ORIGIN where that is not 0, else at NXSTART, NYSTART, NZSTART steps.
-
-    Raises:
-        DataError: a header that is damaged or does not fit the data, or complex values.
-        UsageError: several volumes (`SeveralSteps`) and none chosen, or a choice that does not exist.
     """
     head, encoding = read_head(path, MRC_HEADER)
     if path.suffix.lower() == ".rec" and not is_mrc(head) and other_of_pair(path, ".PAR"):

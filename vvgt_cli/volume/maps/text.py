@@ -39,11 +39,7 @@ def _words(file: IO[bytes], path: Path, what: str) -> list[str]:
 
 
 def _floats(words: list[str], n: int, path: Path, what: str) -> list[float]:
-    """Parse the first ``n`` finite numbers of a line.
-
-    Raises:
-        DataError: others.
-    """
+    """Parse the first ``n`` finite numbers of a line; raise DataError for others."""
     try:
         found = [float(w) for w in words[:n]]
     except ValueError:
@@ -61,12 +57,7 @@ def _whole(words: list[str], path: Path, what: str) -> int:
 
 
 def read_cube(path: Path, options: ReadOptions) -> Volume:
-    """Read a Gaussian cube file; lengths become angstroms. Several orbitals, or values, are components.
-
-    Raises:
-        DataError: a header that is damaged or does not fit the file, or something that is no number.
-        UsageError: several orbitals and none chosen.
-    """
+    """Read a Gaussian cube file; lengths become angstroms. Several orbitals, or values, are components."""
     with open(path, "rb") as file:
         for title in ("its title", "its second title"):
             _words(file, path, title)
@@ -118,12 +109,7 @@ def _orbitals(file: IO[bytes], path: Path) -> list[str]:
 
 
 def read_dx(path: Path, options: ReadOptions) -> Volume:
-    """Read an OpenDX file of one regular grid of numbers, text or binary.
-
-    Raises:
-        DataError: another kind of object, a header that is damaged or does not fit the file, or no numbers.
-        UsageError: several components and none chosen.
-    """
+    """Read an OpenDX file of one regular grid of numbers, text or binary."""
     counts: list[int] = []
     origin: list[float] = []
     steps: list[list[float]] = []
@@ -182,10 +168,6 @@ def read_vasp(path: Path, options: ReadOptions) -> Volume:
     """Read a grid of VASP (CHGCAR, CHG, AECCAR, PARCHG, LOCPOT, ELFCAR) on its periodic cell, lengths in angstroms.
 
     Densities, which the file has multiplied by the cell's volume, are divided by it. Blocks of spin are components.
-
-    Raises:
-        DataError: a structure without a grid, or a damaged file.
-        UsageError: several blocks and none chosen.
     """
     with open(path, "rb") as file:
         cell = _vasp_cell(file, path)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import struct
 
-from vvgt_cli.volume.readers import Reader, lazy
+from vvgt_cli.volume.readers import HDF5, Reader, lazy
 
 NIFTI_MAGIC = {b"n+1\0": True, b"ni1\0": False, b"n+2\0": True, b"ni2\0": False}  # whether it is one file
 ANALYZE_OFFSET = 352  # least offset of values in NIfTI's single files, which those of an Analyze file never reach
 MGH_HEADER, MGH_TYPES = 90, {0: "u1", 1: "i4", 3: "f4", 4: "i2", 10: "u2"}  # bytes that say something; types of values
 _META = re.compile(rb"\s*(?:Comment|ObjectType|ObjectSubType|NDims|DimSize|BinaryData)\s*=", re.IGNORECASE)
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def byte_order(head: bytes) -> tuple[str, int] | None:
@@ -49,7 +48,7 @@ def is_mgh(head: bytes) -> bool:
 def is_minc(head: bytes) -> bool:
     """Tell whether a file begins as MINC does; a file of VTK's writer is known by its variables alone."""
     classic = head.startswith(b"CDF") and (b"MINC standard" in head or (b"rootvariable" in head and b"zspace" in head))
-    return classic or (head.startswith(_HDF5) and b"minc-2.0" in head)
+    return classic or (head.startswith(HDF5) and b"minc-2.0" in head)
 
 
 FORMATS = (

@@ -24,11 +24,7 @@ _SCALING = (("slope", 1), ("offset", 0))
 
 
 def read_header(path: Path) -> tuple[Fields, int]:
-    """Read the fields of a MetaImage header, and the position behind ElementDataFile (its last line).
-
-    Raises:
-        DataError: no ElementDataFile.
-    """
+    """Read the fields of a MetaImage header, and the position behind its last, ElementDataFile, or raise DataError."""
     fields = Fields(path.name)
     with open(path, "rb") as file:
         while (line := file.readline(MAX_HEADER)) and file.tell() <= MAX_HEADER:
@@ -89,12 +85,7 @@ def _place(fields: Fields, n: int, options: ReadOptions) -> dict[str, Any]:
 
 
 def read_metaimage(path: Path, options: ReadOptions) -> Volume:
-    """Read a MetaImage file; uncompressed data are memory-mapped.
-
-    Raises:
-        DataError: a header that is incomplete or does not fit the data, a data file outside the header's folder.
-        UsageError: several components (channels, or steps of a fourth axis) and none chosen.
-    """
+    """Read a MetaImage file; uncompressed data are memory-mapped."""
     fields, offset = read_header(path)
     sizes = fields.sizes("dimsize", fields.need("dimsize"))
     if len(sizes) != fields.integer("ndims", len(sizes)) or len(sizes) not in (2, 3, 4):

@@ -26,12 +26,7 @@ _CORONAL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mgh(path: Path, options: ReadOptions) -> Volume:
-    """Read an MGH or MGZ file; the former is memory-mapped. Frames are time steps.
-
-    Raises:
-        DataError: a header that is damaged or does not fit the data.
-        UsageError: several frames (`SeveralSteps`) and none chosen.
-    """
+    """Read an MGH or MGZ file; the former is memory-mapped. Frames are time steps."""
     head, encoding = read_head(path, MGH_HEADER)
     if not is_mgh(head):
         raise DataError(f"{path}: no header of an MGH file (version 1, sizes above 0, a type that is known)")

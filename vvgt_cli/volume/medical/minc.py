@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.arrays import MAGIC
 from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.stored import Slices, give_back, stored_or_held
 from vvgt_cli.volume.types import Volume
@@ -55,14 +54,9 @@ class _Image:
 
 
 def read_minc(path: Path, options: ReadOptions) -> Volume:
-    """Read a MINC file as float32. A fourth axis is time.
-
-    Raises:
-        DataError: h5py is not installed, a damaged file, values in other files, axes that are no volume.
-        UsageError: time steps (`SeveralSteps`) and none chosen, or a choice that does not exist.
-    """
+    """Read a MINC file as float32. A fourth axis is time."""
     with open(path, "rb") as file:
-        packed = file.read(len(MAGIC)) == MAGIC
+        packed = file.read(len(HDF5)) == HDF5
     with library_errors(str(path), "MINC"):
         image = _minc2(path) if packed else _minc1(path)
         return _volume(image, path, options)

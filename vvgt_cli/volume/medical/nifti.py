@@ -56,11 +56,7 @@ class Header:
 
 
 def parse_header(head: bytes, name: str) -> Header:
-    """Parse the first 348 (NIfTI-1) or 540 (NIfTI-2) bytes.
-
-    Raises:
-        DataError: no NIfTI header, a type without real numbers, or sizes below 1.
-    """
+    """Parse the first 348 (NIfTI-1) or 540 (NIfTI-2) bytes; raise DataError if no volume of real numbers begins so."""
     found = byte_order(head)
     if found is None or not is_nifti(head):
         raise DataError(f"{name}: no NIfTI header (348 or 540 bytes with the magic n+1, ni1, n+2 or ni2)")
@@ -166,10 +162,6 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     Where the fourth axis is the only one beyond space, ``component`` is taken for it too.
 
     sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
-
-    Raises:
-        DataError: a header that is damaged or does not fit the data, or complex values.
-        UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
     head, encoding = read_head(path, HEADER)
     return _volume(parse_header(head, str(path)), path, encoding, options)
@@ -208,10 +200,6 @@ def read_analyze(path: Path, options: ReadOptions) -> Volume:
     """Read an Analyze pair by its ``.hdr`` or ``.img``; values are memory-mapped. Voxels lie in no anatomical space.
 
     A message says so, as the format does not store which side is left. SPM's scale factor, offset and origin are used.
-
-    Raises:
-        DataError: a header that is damaged or does not fit the data, or values that are no real numbers.
-        UsageError: time steps (`SeveralSteps`), or several components, and none chosen.
     """
     if path.name.lower().endswith((".img", ".img.gz")):
         header = other_of_pair(path, ".hdr")
@@ -277,10 +265,6 @@ def load_frames(frames: Frames, options: ReadOptions, source: str) -> tuple[np.n
     """Load the volume (nz, ny, nx) that the options choose, memory-mapped where it is plain, and slope and intercept.
 
     Where the fourth axis is the only one beyond space, ``component`` is taken for it too.
-
-    Raises:
-        DataError: sizes that do not fit the file or memory.
-        UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
     spatial, offset = (*frames.dims, 1, 1)[:3], frames.offset
     times, rest = _times(frames, options, source)

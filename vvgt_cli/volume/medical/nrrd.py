@@ -38,11 +38,7 @@ _SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
 def read_header(path: Path) -> tuple[Fields, int]:
-    """Read the fields of a NRRD header, and the position behind its blank line (the file's end if detached).
-
-    Raises:
-        DataError: not a NRRD file, or a header without an end.
-    """
+    """Read the fields of a NRRD header, and the position behind its blank line (or the end), or raise DataError."""
     with open(path, "rb") as file:
         if not file.readline(MAX_HEADER).removeprefix(MARK).startswith(b"NRRD000"):
             raise DataError(f"{path}: does not begin with NRRD000; expected a NRRD file")
@@ -97,11 +93,7 @@ def _vector(fields: Fields, key: str, text: str) -> list[float]:
 
 
 def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
-    """Find the axis (fastest first) that holds components; None without one.
-
-    Raises:
-        DataError: more axes than three in space and one of components.
-    """
+    """Find the axis (fastest first) of components, None without one; raise DataError for several axes beside space."""
     kinds = fields.get("kinds", "").lower().split()
     odd = [k for k, vector in enumerate(vectors) if vector is None] if vectors else []
     if not odd and len(kinds) == len(sizes):
@@ -117,11 +109,7 @@ def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] 
 
 
 def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | None:
-    """Choose along a block's last axis, which is one of time: by ``time``, or by ``component``.
-
-    Raises:
-        UsageError: neither is given (`SeveralSteps`), both are, or a step that does not exist.
-    """
+    """Choose along a block's last axis, time, by ``time`` or ``component``; raise UsageError unless one says."""
     if options.component is not None:
         if options.time is not None:
             raise UsageError(f"{source}: --time and --component both choose along its one axis of time; leave out one")
@@ -223,12 +211,7 @@ def _line_skip(path: Path, offset: int, lines: int) -> int:
 
 
 def read_nrrd(path: Path, options: ReadOptions) -> Volume:
-    """Read a NRRD file; raw encoding is memory-mapped.
-
-    Raises:
-        DataError: a header that is incomplete or does not fit the data, a data file outside the header's folder.
-        UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
-    """
+    """Read a NRRD file; raw encoding is memory-mapped."""
     fields, offset = read_header(path)
     encoding = _ENCODINGS.get(fields.need("encoding").lower())
     if encoding is None:
@@ -287,16 +270,7 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
 
 
 def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
-    """Return file names and how many axes each file holds; None where ``named`` is one file's name.
-
-    Args:
-        path: the header, whose lines behind ``LIST`` are names.
-        named: value of the field.
-        n: axes of the array.
-
-    Raises:
-        DataError: a list without names, a pattern that is none, or axes that do not fit.
-    """
+    """Return names and how many of ``n`` axes each file holds, None if ``named`` is one file, or raise DataError."""
     words = named.split()
     if words and words[0] == "LIST":
         lines = path.read_bytes()[:MAX_HEADER].decode("utf-8", "replace").splitlines()
@@ -332,18 +306,9 @@ def _load_files(
     dtype: np.dtype,
     load: Callable[[str, tuple[int, ...]], np.ndarray],
 ) -> np.ndarray:
-    """Load the blocks of several files, one behind the other along the slowest axes.
+    """Load the blocks of files, in order along the slowest axes; each holds the fastest ``axes``, or a slab of all.
 
-    Args:
-        path: the header, for messages.
-        names: in the order of the array.
-        axes: that each file holds (the fastest ones; all: slabs of the slowest axis).
-        shape: of the whole, slowest first.
-        dtype: of the values.
-        load: name and shape to block.
-
-    Raises:
-        DataError: files and sizes that do not fit.
+    Raise DataError where files and sizes do not fit; ``load`` takes name and shape.
     """
     n = len(shape)
     part = shape[n - axes :]
@@ -362,11 +327,7 @@ def _load_files(
 
 
 def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
-    """Write the volume's data values as float32 into one attached raw file; return its size in bytes.
-
-    Raises:
-        UsageError, DataError: as `vvgt_cli.files.atomic_write`.
-    """
+    """Write data values as float32 into an attached raw file, return its bytes; errors are those of `atomic_write`."""
     values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
     vectors = " ".join(
         f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()

@@ -25,10 +25,6 @@ def read_pair(path: Path, options: ReadOptions) -> Volume:
 
     Philips' values are the "floating point" ones (1 / scale slope), which compare between scans. A fourth axis is time
     where only dynamics differ along it, else ``component`` takes a number or a label along it (AFNI's sub-bricks).
-
-    Raises:
-        DataError: nibabel is not installed, one of the files is missing, or they are damaged.
-        UsageError: several volumes and none chosen.
     """
     afni = path.name.lower().endswith((".head", ".brik", ".brik.gz"))
     kind, names = ("AFNI", (".HEAD", ".BRIK")) if afni else ("Philips PAR/REC", (".PAR", ".REC"))

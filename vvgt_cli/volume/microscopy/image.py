@@ -63,12 +63,7 @@ class Picture:
 
 
 def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
-
-    Raises:
-        DataError: sizes or values that are none, or more than the memory holds.
-        UsageError: several channels (`SeveralComponents`) or time steps (`SeveralSteps`) and none chosen, or none such.
-    """
+    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file."""
     if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
     channel = _channel(picture, options.component, source)
@@ -197,11 +192,7 @@ def hex_color(text: Any) -> Color:
 
 
 def safe_xml(text: str, source: str) -> ElementTree.Element:
-    """Parse a file's metadata and return the root.
-
-    Raises:
-        DataError: entities, more than `MAX_XML` characters, or damage.
-    """
+    """Return the root of a file's metadata; raise DataError for entities, damage, or more than `MAX_XML` characters."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text or len(text) > MAX_XML:
         raise DataError(f"{source}: XML metadata of {len(text)} characters or with entities; expected plain metadata")
     try:

@@ -43,18 +43,7 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
 
 
 def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[str], Any]) -> Volume:
-    """Read one channel of one time step of an open file, at ``options.level``.
-
-    Args:
-        file: open, by h5py.
-        path: of it.
-        options: level, time, component.
-        checked: the dataset of a path; raises where its values must not be read.
-
-    Raises:
-        DataError: a damaged file.
-        UsageError: several channels or time steps and none chosen, a level that is none.
-    """
+    """Read a channel of a time step of an open file at ``options.level``; ``checked`` returns a path's dataset."""
     if options.array is not None:
         raise UsageError(f"{path}: an Imaris file, which has one image; leave out --array {options.array}")
     levels, level = _count(file, "ResolutionLevel"), options.level or 0

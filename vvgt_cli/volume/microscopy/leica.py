@@ -30,12 +30,7 @@ LUTS: dict[str, Color] = {
 
 
 def read_lif(path: Path, options: ReadOptions) -> Volume:
-    """Read one image of a LIF file; spacing in micrometres.
-
-    Raises:
-        DataError: liffile is not installed, a damaged file, an image that is no volume.
-        UsageError: several images, channels or time steps and none chosen.
-    """
+    """Read one image of a LIF file; spacing in micrometres."""
     liffile = need("liffile", EXTRA, str(path), "LIF")
     _check_header(path)
     with library_errors(str(path), "LIF"), _opened(liffile, path) as file:

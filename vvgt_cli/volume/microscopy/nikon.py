@@ -28,12 +28,7 @@ MOST = 10_000_000  # frames
 
 
 def read_nd2(path: Path, options: ReadOptions) -> Volume:
-    """Read one position of an ND2 file; spacing in micrometres.
-
-    Raises:
-        DataError: nd2 is not installed, a damaged file, axes that are none of a volume.
-        UsageError: several positions, channels or time steps and none chosen.
-    """
+    """Read one position of an ND2 file; spacing in micrometres."""
     nd2 = need("nd2", EXTRA, str(path), "ND2")
     there = _frames(path)
     with library_errors(str(path), "ND2"), _opened(nd2, path) as file:

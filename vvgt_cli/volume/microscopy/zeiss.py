@@ -76,11 +76,7 @@ class Tile:
 
 
 def tiles_of(path: Path) -> tuple[list[Tile], str]:
-    """Read the tiles and the metadata, XML.
-
-    Raises:
-        DataError: segments that reach beyond the file, or numbers that cannot be.
-    """
+    """Read the tiles and the metadata, XML; raise DataError for segments beyond the file, or impossible numbers."""
     size = path.stat().st_size
     with Bounded(path) as file:
 
@@ -143,11 +139,7 @@ def _fits(path: Path, size: int, place: int, length: int, what: str) -> None:
 
 
 def pixels_of(tile: Tile, path: Path) -> np.ndarray:
-    """Read a tile, (height, width, samples); samples of colours are blue first.
-
-    Raises:
-        DataError: a compression that is not known, a library that is missing, damage.
-    """
+    """Read a tile, (height, width, samples), blue first; raise DataError for damage, or an unknown compression."""
     kind, samples = PIXELS[tile.pixel]
     shape, dtype = (tile.height, tile.width, samples), np.dtype(kind).newbyteorder("<")
     need_bytes = tile.height * tile.width * samples * dtype.itemsize
@@ -201,12 +193,7 @@ TILE = 512  # pixels along the edge of what is read together, at least
 
 
 def read_czi(path: Path, options: ReadOptions) -> Volume:
-    """Read one scene of a CZI file; spacing in micrometres.
-
-    Raises:
-        DataError: a damaged file, axes or pixels that are none of a volume, more pixels than tiles can fill.
-        UsageError: several scenes, channels or time steps and none chosen.
-    """
+    """Read one scene of a CZI file; spacing in micrometres."""
     with library_errors(str(path), "CZI"):
         every, xml = tiles_of(path)
         scene, tiles = _scene(every, options, path)

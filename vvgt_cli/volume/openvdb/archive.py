@@ -24,16 +24,9 @@ _SEPARATOR = "\x1e"  # stands between the name and the number of grids of one na
 _TREE = re.compile(r"Tree_(.+?)_(\d+(?:_\d+)*)(?:_.*)?")
 _LEVELS = "5_4_3"
 TYPES = {
-    "float": ("<f4", 1),
-    "double": ("<f8", 1),
-    "int32": ("<i4", 1),
-    "int64": ("<i8", 1),
-    "bool": ("?", 1),
-    "mask": ("?", 1),
-    "vec3s": ("<f4", 3),
-    "vec3d": ("<f8", 3),
-    "vec3i": ("<i4", 3),
-}
+    "float": ("<f4", 1), "double": ("<f8", 1), "int32": ("<i4", 1), "int64": ("<i8", 1), "bool": ("?", 1),
+    "mask": ("?", 1), "vec3s": ("<f4", 3), "vec3d": ("<f8", 3), "vec3i": ("<i4", 3),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -86,11 +79,7 @@ class Grid:
 
 
 def read_header(cursor: Cursor) -> list[Grid]:
-    """Read the descriptors of a file's grids; the cursor stands at its beginning.
-
-    Raises:
-        DataError: no OpenVDB file, another version, one that was written as a stream, or damage.
-    """
+    """Read the descriptors of a file's grids, the cursor at its beginning; raise DataError if it is unreadable."""
     if bytes(cursor.take(8)) != MAGIC:
         raise DataError(f"{cursor.name}: does not begin as an OpenVDB file does")
     (version,) = cursor.unpack("I")

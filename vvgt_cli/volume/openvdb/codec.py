@@ -20,11 +20,7 @@ _MAX_SPLITS, _MIN_SPLIT = 16, 128  # blosc.c
 
 
 def read_block(cursor: Cursor, need: int, compression: int) -> bytes | memoryview:
-    """Read the next ``need`` bytes of values.
-
-    Raises:
-        DataError: cut short, damaged, or of another length.
-    """
+    """Read the next ``need`` bytes of values; raise DataError for another length, or damage."""
     if not compression & (ZIP | BLOSC):
         return cursor.take(need)
     (packed,) = cursor.unpack("q")
@@ -122,11 +118,7 @@ class Cursor:
         return DataError(f"{self.name}: {what} (near byte {self.at}); check that the file is whole")
 
     def take(self, n: int) -> memoryview:
-        """Take the next ``n`` bytes.
-
-        Raises:
-            DataError: there are fewer.
-        """
+        """Take the next ``n`` bytes; raise DataError if there are fewer."""
         if not 0 <= n <= len(self.data) - self.at:
             raise self.bad(f"{n} bytes are expected, {len(self.data) - self.at} are left")
         self.at += n
@@ -142,11 +134,7 @@ class Cursor:
         return str(self.take(n), "utf-8", "replace")
 
     def seek(self, at: int) -> None:
-        """Move to ``at``.
-
-        Raises:
-            DataError: outside the file.
-        """
+        """Move to ``at``; raise DataError if it is outside the file."""
         if not 0 <= at <= len(self.data):
             raise self.bad(f"an offset of {at} in a file of {len(self.data)} bytes")
         self.at = at

@@ -51,11 +51,7 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
 
 
 def read_tree(cursor: Cursor, grids: list[Grid], grid: Grid) -> Tree:
-    """Read the tree of a grid, or of the grid that it shares it with; the cursor stands behind the grid's transform.
-
-    Raises:
-        DataError: damage, or no such other grid.
-    """
+    """Read a grid's tree, or that it shares, the cursor behind the grid's transform, or raise DataError."""
     if grid.parent:
         owner = next((g for g in grids if not g.parent and g.unique == grid.parent), None)
         if owner is None or owner.kind != grid.kind:
@@ -72,10 +68,6 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     """Read a grid: all voxels of its active bounding box, tiles and background filled in.
 
     Spacing, direction and origin come from the grid's transform.
-
-    Raises:
-        DataError: a version, tree or transform that cannot be read, damage, no active voxel, or more than the memory.
-        UsageError: several grids, or components of vectors, and none chosen.
     """
     with open(path, "rb") as file:
         # not closed here: an error on its way up still holds views of it
@@ -98,11 +90,7 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
 
 
 def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first and last active voxel, (3,) int64 each (x, y, z).
-
-    Raises:
-        DataError: none is active.
-    """
+    """Find the first and last active voxel, (3,) int64 each (x, y, z); raise DataError if none is active."""
     lo, hi = [], []
     for node in tree.nodes:
         for axis in range(3):
@@ -208,14 +196,10 @@ class BrickArray:
     def __init__(
         self, fill: np.ndarray, which: np.ndarray, bricks: np.ndarray, first: tuple[int, int, int], shape: Any
     ) -> None:
-        """Take the parts as they are.
+        """Take ``bricks`` (n, 8, 8, 8) by x, y, z, and their rows ``which`` (bz, by, bx) int32, -1 where there is none.
 
-        Args:
-            fill: (bz, by, bx) value of the bricks that do not vary.
-            which: (bz, by, bx) int32 row of ``bricks``, -1 where there is none.
-            bricks: (n, 8, 8, 8) values by x, y, z.
-            first: voxels (z, y, x) of the first bricks that lie before the array.
-            shape: of the array.
+        ``fill`` (bz, by, bx) holds the values of those; ``first`` voxels (z, y, x) of the first bricks lie before the
+        array.
         """
         self.shape: tuple[int, int, int] = tuple(shape)
         self.dtype = fill.dtype
@@ -301,11 +285,7 @@ class BrickArray:
 
 
 def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return first brick and number of bricks, (3,) each, that hold the voxels ``lo`` to ``hi`` (3,), both included.
-
-    Raises:
-        DataError: a box that is too large to be walked through, or tables beyond the free memory.
-    """
+    """Return first brick and number of bricks, (3,) each, of voxels ``lo`` to ``hi`` (3,), both included."""
     size = [int(b) - int(a) + 1 for a, b in zip(lo, hi, strict=True)]
     if math.prod(size) > MAX_VOXELS:
         raise DataError(

@@ -73,11 +73,7 @@ class TreeReader:
         self.room = free_memory()
 
     def read(self) -> Tree:
-        """Read the tree.
-
-        Raises:
-            DataError: cut short, damaged, or more than the free memory.
-        """
+        """Read the tree; raise DataError if it is cut short, damaged, or larger than the free memory."""
         (buffers,) = self.cursor.unpack("i")
         if buffers != 1:
             raise self.cursor.bad(f"a tree of {buffers} buffers where one is expected")

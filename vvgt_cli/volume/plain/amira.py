@@ -31,12 +31,7 @@ _STREAM = re.compile(  # place, type, components, name, number, encoding, length
 
 
 def read_amira(path: Path, options: ReadOptions) -> Volume:
-    """Read values of a uniform lattice; labels keep their numbers.
-
-    Raises:
-        DataError: no uniform lattice, a type or an encoding that is unknown, or sizes that do not fit the file.
-        UsageError: several arrays or components and none chosen.
-    """
+    """Read values of a uniform lattice; labels keep their numbers."""
     with open(path, "rb") as file:
         head = file.read(MAX_HEADER)
     mark = re.search(rb"^@\d+[ \t]*\r?\n", head, re.MULTILINE)

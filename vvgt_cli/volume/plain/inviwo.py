@@ -72,10 +72,6 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
 
     DataRange and ValueRange, where both are given, are the stored-value scaling. Without basis vectors or spacing
     voxels are unit cubes. Offset is the corner of the box, which is centred without one.
-
-    Raises:
-        DataError: a header that is incomplete or does not fit the data, a data file outside the header's folder.
-        UsageError: several components or volumes and none chosen.
     """
     fields = _fields(path)
     dims = fields.sizes("Resolution", fields.need("resolution", "dimensions", "dimension"))

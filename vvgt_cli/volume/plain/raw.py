@@ -36,11 +36,7 @@ def parse_name(name: str) -> tuple[tuple[int, int, int], str] | None:
 
 
 def layout(name: str, options: ReadOptions) -> tuple[tuple[int, int, int], np.dtype]:
-    """Return dims (x, y, z) and dtype: the options', else the name's.
-
-    Raises:
-        UsageError: neither says.
-    """
+    """Return dims (x, y, z) and dtype: the options', else the name's; raise UsageError if neither says."""
     dims, dtype = parse_name(name) or (None, None)
     dims, dtype = options.dims or dims, options.dtype or dtype
     if dims is None or dtype is None:
@@ -104,12 +100,7 @@ def _volume(data: np.ndarray, name: str, source: str, options: ReadOptions) -> V
 
 
 def read_raw(path: Path, options: ReadOptions) -> Volume:
-    """Read a raw file; plain files are memory-mapped, ``.gz`` ones decompressed.
-
-    Raises:
-        UsageError: layout unknown.
-        DataError: the file's size is not exactly header + dims x dtype.
-    """
+    """Read a raw file; plain files are memory-mapped, ``.gz`` ones decompressed."""
     dims, dtype = layout(path.name, options)
     need = dims[0] * dims[1] * dims[2] * dtype.itemsize + options.header_bytes
     encoding, size = "gzip" if path.name.lower().endswith(".gz") else "raw", path.stat().st_size
@@ -123,12 +114,7 @@ def read_raw(path: Path, options: ReadOptions) -> Volume:
 
 
 def read_stdin(options: ReadOptions, stream: IO[bytes] | None = None) -> Volume:
-    """Read raw values from standard input (or ``stream``); needs dims and dtype.
-
-    Raises:
-        UsageError: dims or dtype missing, or options that raw values do not take.
-        DataError: too few or too many bytes.
-    """
+    """Read raw values from standard input (or ``stream``); needs dims and dtype."""
     if options.array is not None:
         raise UsageError(f"standard input: raw values have no named arrays; leave out --array {options.array}")
     dims, dtype = layout("standard input", options)

@@ -24,11 +24,7 @@ _PLANE = re.compile(rb"\s*(\d{1,12}) X")
 
 
 def read_slc(path: Path, options: ReadOptions) -> Volume:
-    """Read an SLC file.
-
-    Raises:
-        DataError: no SLC header, not 8-bit, or planes that do not fit the file.
-    """
+    """Read an SLC file; raise DataError if it is none, not 8-bit, or has planes that do not fit the file."""
     with open(path, "rb") as file:
         match = _HEADER.match(file.read(4096))
     if match is None:

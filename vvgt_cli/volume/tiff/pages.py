@@ -1,4 +1,4 @@
-"""The directories of a TIFF file, walked before a library sees them: no circles, no sizes that the file cannot hold."""
+"""Checks of the directories of a TIFF file, before a library reads them, and slices that stay in TIFF files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import size_text
-from vvgt_cli.volume.stored import Slices, Stored
+from vvgt_cli.volume.stored import Stored, slice_by_slice
 from vvgt_cli.volume.tiff.decode import Pages
 
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _DEPTH = 256, 257, 258, 277, 32997
@@ -37,11 +37,7 @@ class _Layout:
 
 
 def check_pages(path: Path) -> int:
-    """Count the pages of a file and check that its directories lie in it.
-
-    Raises:
-        DataError: a directory outside the file or in a circle, a tag or pixels that the file cannot hold.
-    """
+    """Count the pages of a file; raise DataError unless its directories, tags and pixels fit into it."""
     try:
         with open(path, "rb") as file:
             return _walk(file, path)
@@ -133,35 +129,28 @@ def lazy_pages(
         file = tifffile.TiffFile(path)
         return file, file.series[number], Pages(path)  # the file to keep it open
 
-    def read(slices: Slices) -> np.ndarray:
-        z, y, x = slices
-        out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), dtype)
-        for k in range(z.start, z.stop):
-            place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
-            with turn:
-                _, series, pages = opened()
-                page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
-            page = page.reshape(inner)[index[len(lead) :]]
-            out[k - z.start] = (page.T if turned else page)[y, x]
-        return out
+    def read(k: int) -> np.ndarray:
+        place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
+        with turn:
+            _, series, pages = opened()
+            page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
+        kept: np.ndarray = page.reshape(inner)[index[len(lead) :]]
+        return kept.T if turned else kept
 
-    return Stored(read, dtype, (lead[axis], rows, columns), (1, rows, columns), str(path))
+    return slice_by_slice(read, dtype, (lead[axis], rows, columns), str(path))
 
 
 def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
     """Return slices that stay in their files; ``of`` reads one as (1, y, x), all as ``plane``, the first of them."""
 
-    def read(slices: Slices) -> np.ndarray:
-        z, y, x = slices
-        out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), plane.dtype)
-        for k in range(z.start, z.stop):
-            values = of(files[k])
-            if values.shape != plane.shape or values.dtype != plane.dtype:
-                raise DataError(
-                    f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
-                    f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
-                )
-            out[k - z.start] = values[0, y, x]
-        return out
+    def read(k: int) -> np.ndarray:
+        values = of(files[k])
+        if values.shape != plane.shape or values.dtype != plane.dtype:
+            raise DataError(
+                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
+                f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
+            )
+        only: np.ndarray = values[0]
+        return only
 
-    return Stored(read, plane.dtype, (len(files), *plane.shape[1:]), (1, *plane.shape[1:]), source)
+    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)

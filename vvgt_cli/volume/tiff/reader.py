@@ -69,10 +69,6 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         path: the file.
         options: see `ReadOptions`.
         slices: how many slices a volume has, if the file is one of them.
-
-    Raises:
-        DataError: directories or OME-XML that cannot be, damaged or missing pages, pixels of an unknown coding.
-        UsageError: several series, channels or time steps (`SeveralSteps`) and none chosen.
     """
     import tifffile
 
@@ -293,11 +289,7 @@ class Facts:
     length: str = ""
 
     def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], list[str]]:
-        """Return the spacing (x, y, z) to use, and what was assumed for it.
-
-        Raises:
-            UsageError: sizes that cannot be used, and no spacing given.
-        """
+        """Return the spacing (x, y, z) and what was assumed for it; raise UsageError if unusable and none is given."""
         if self.trouble and options.spacing is None:
             raise UsageError(f"{source}: {self.trouble}; try --spacing X Y Z")
         if options.spacing is not None or self.spacing == (None, None, None):
@@ -395,13 +387,8 @@ def _color(text: str | None) -> tuple[float, float, float] | None:
 def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:
     """Return what ImageJ's description says, as ImageJ reads it (ij.io.TiffDecoder and FileOpener, 1.54).
 
-    ImageJ counts the resolution in the description's unit (micrometres per centimetre excepted), takes 72 dots per
-    inch for no size, and leaves out a distance between slices that is 1.
-
-    Args:
-        stated: its entries.
-        resolution: pixels per unit along x and y (tags 282 and 283); None where the file has none.
-        tag: ResolutionUnit (tag 296); 1 where the file has none.
+    ImageJ counts the ``resolution`` (tags 282 and 283, or None) in the description's unit (micrometres per centimetre,
+    by ``tag`` 296, excepted), takes 72 dots per inch for no size, and leaves out a distance between slices that is 1.
     """
     if "scales" in stated:  # SCIFIO's lists, in parallel
         scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))

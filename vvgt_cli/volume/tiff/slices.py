@@ -49,13 +49,7 @@ def _of_one_format(files: list[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def read_slices(files: list[Path], options: ReadOptions, source: str, name: str) -> Volume:
-    """Read slices, slice z with rows from the top as y; the spacing is the first file's, else that of a scanner's log.
-
-    Raises:
-        DataError: slices of different sizes or types, names of several stacks, files of several pages, more files than
-            `MOST`.
-        UsageError: colour slices and no component chosen.
-    """
+    """Read slices, slice z with rows from the top as y; spacing is the first file's, else that of a scanner's log."""
     files, others = _of_one_format(files) if len(files) > 1 else (files, [])
     if len(files) > MOST:
         raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
@@ -91,11 +85,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
 
 
 def read_glob(pattern: str, options: ReadOptions) -> Volume | None:
-    """Return the volume of a glob of slices; None where no file fits the pattern.
-
-    Raises:
-        DataError: files of other formats.
-    """
+    """Return the volume of a glob of slices, None where no file fits; raise DataError for files of other formats."""
     files = matching(pattern)
     if not files:
         return None

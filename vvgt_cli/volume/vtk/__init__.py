@@ -10,9 +10,8 @@ import re
 from collections.abc import Callable
 
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.readers import Reader, lazy
+from vvgt_cli.volume.readers import HDF5, Reader, lazy
 
-HDF5 = b"\x89HDF\r\n\x1a\n"
 INDEX, SINGLE = "index", "single"  # what `child` reads beside programs' files: an index of VTK's files, or one of these
 GRIDS = ("UnstructuredGrid", "RectilinearGrid", "StructuredGrid")
 LEGACY_GRIDS = ("UNSTRUCTURED_GRID", "RECTILINEAR_GRID", "STRUCTURED_GRID")

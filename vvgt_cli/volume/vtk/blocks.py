@@ -40,17 +40,10 @@ class _Array:
 
 
 def check_blocks(path: Path, root: dict[str, str], encoding: str, data_start: int, ratio: int) -> None:
-    """Check that no array's block sizes, nor its number of tuples, ask for more than the file can hold.
+    """Raise DataError if an array's block sizes, or number of tuples, ask for more than the file can hold.
 
-    Args:
-        path: the file.
-        root: attributes of VTKFile.
-        encoding: of the appended data, ``raw`` or ``base64``.
-        data_start: position of the appended data, -1 without.
-        ratio: most bytes that a byte of the file can stand for.
-
-    Raises:
-        DataError: an array's do.
+    ``encoding`` is that of the appended data (``raw`` or ``base64``) at byte ``data_start`` (-1 without); a byte of the
+    file stands for at most ``ratio``.
     """
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     word = np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4"))
@@ -143,11 +136,6 @@ def _decode(text: bytes, word: np.dtype) -> np.ndarray:
 
 def _words(data: bytes, word: np.dtype) -> np.ndarray:
     return np.frombuffer(data[: len(data) // word.itemsize * word.itemsize], word)
-
-
-def table_bytes(words: int, word: np.dtype, coded: bool) -> int:
-    """Return the bytes of the file that so many words before the blocks take."""
-    return 4 * -(-words * word.itemsize // 3) if coded else words * word.itemsize
 
 
 def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:

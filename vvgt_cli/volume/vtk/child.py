@@ -27,9 +27,9 @@ from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.components import ArrayInfo
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
+from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.vtk import GRIDS, HDF5, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
+from vvgt_cli.volume.vtk import GRIDS, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
 from vvgt_cli.volume.vtk.grids import arrays_of, check_legacy_grid, check_xml_grid, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
@@ -41,28 +41,19 @@ SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 KEYS = ("dims", "spacing", "array", "component", "time")
+MOST_ROWS = 50  # of blocks or steps that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
 
 
 def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
-    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume.
-
-    Raises:
-        DataError: damaged, or VTK's reader did not come to an end.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume."""
     facts, values = _asked(program, path, options, "volume")
     place = {key: tuple(facts[key]) for key in ("spacing", "origin", "direction")}
     return Volume(values, name=facts["name"], quantity=facts["quantity"], **place)  # type: ignore[arg-type]  # three numbers each
 
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
-    """Read what an index names: a single file as that file's reader does, several as one volume.
-
-    Raises:
-        DataError: damaged, or files that are missing, lie elsewhere or are no datasets.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read what an index names: a single file as that file's reader does, several as one volume."""
     found = _single(read_index(path), options.time)
     if found is None:
         return volume_by_child(INDEX, path, options)
@@ -86,11 +77,7 @@ def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tup
 
 
 def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """List steps, arrays and blocks, each a row with the option that chooses it.
-
-    Raises:
-        DataError: as `volume_by_child`.
-    """
+    """List steps, arrays and blocks, each with the option that chooses it; errors are those of `volume_by_child`."""
     return _asked(program, path, options, "contents")[0]
 
 
@@ -290,10 +277,6 @@ def main() -> None:
     os._exit(0)  # whatever a damaged file left behind is not taken apart
 
 
-HEAD = 4096
-LISTED = 50  # blocks and steps
-
-
 def datasets(program: str, path: Path, time: int | None, array: str | None = None) -> tuple[list[Leaf], list[float]]:
     """Read the datasets of a time step, and the times of all steps.
 
@@ -321,7 +304,7 @@ def _indexed(index: Index, time: int | None, above: tuple[Path, ...]) -> Iterato
 def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
     """Read the datasets in a file that an index names."""
     with open(path, "rb") as file:
-        head = file.read(HEAD)
+        head = file.read(HEAD_BYTES)
     kind = xml_kind(head)
     if kind in INDEXES:
         yield from _indexed(read_index(path), None, above)
@@ -358,11 +341,7 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
 
 
 def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """List steps, arrays and blocks, each a row with the option that chooses it; by default those of the first step.
-
-    Raises:
-        DataError: as `datasets`.
-    """
+    """List steps, arrays and blocks (by default of the first step) with the option of each, or raise DataError."""
     leaves, times = datasets(program, path, options.time or 0)
     steps = [{"step": k, "time": t, "option": f"--time {k}"} for k, t in enumerate(times)] if len(times) > 1 else []
     rows = {"steps": steps, "arrays": [_array(info, leaves) for info in arrays_in(leaves)], "blocks": _blocks(leaves)}
@@ -370,8 +349,8 @@ def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any
 
 
 def _short(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    left = len(rows) - LISTED
-    return rows if left <= 0 else [*rows[:LISTED], {"more": left}]
+    left = len(rows) - MOST_ROWS
+    return rows if left <= 0 else [*rows[:MOST_ROWS], {"more": left}]
 
 
 def _array(info: ArrayInfo, leaves: Sequence[Leaf]) -> dict[str, Any]:

@@ -23,23 +23,11 @@ from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.blocks import check_blocks
 from vvgt_cli.volume.vtk.legacy import Parser
 from vvgt_cli.volume.vtk.resample import resample
-from vvgt_cli.volume.vtk.xml import (
-    GHOSTS,
-    HIDDEN,
-    around,
-    extent_dims,
-    scan,
-    stored_ratio,
-    without,
-)
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, around, extent_dims, scan, stored_ratio, without
 
 
 def check_xml_grid(path: Path) -> str:
-    """Check that a ``.vtu``, ``.vtr`` or ``.vts`` can hold what it declares, and return its type of dataset.
-
-    Raises:
-        DataError: damaged, or it cannot.
-    """
+    """Return the type of a ``.vtu``, ``.vtr`` or ``.vts``; raise DataError if it cannot hold what it declares."""
     found = scan(path)
     points, cells = found.points, found.cells
     if found.image:
@@ -90,28 +78,13 @@ class _Sections(Parser):
 
 
 def check_legacy_grid(path: Path) -> None:
-    """Check that a legacy ``.vtk`` mesh or grid holds what its sections declare.
-
-    Raises:
-        DataError: it does not.
-    """
+    """Raise DataError if a legacy ``.vtk`` mesh or grid does not hold what its sections declare."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         _Sections(text, path).parse()
 
 
 def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of a vtkDataSet: an image as it is, any other grid or mesh of cells resampled.
-
-    Args:
-        mesh: vtkDataSet (pyvista's are).
-        options: ``array``, ``component``, ``spacing``, and ``dims`` of what is resampled.
-        source: for messages.
-        name: of the volume.
-
-    Raises:
-        DataError: a surface, or damaged cells.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
+    """Make a volume of a vtkDataSet (pyvista's are): an image as it is, any other grid or mesh of cells resampled."""
     if not mesh.IsA("vtkDataSet"):
         raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
     if mesh.IsA("vtkPolyData"):

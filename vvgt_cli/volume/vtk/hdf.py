@@ -29,27 +29,18 @@ PLACE = ("WholeExtent", "Spacing", "Origin", "Direction")
 
 
 def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
-    """Read a ``.vtkhdf``.
-
-    Raises:
-        DataError: damaged.
-        UsageError: a choice of step, array or component that is missing or does not exist.
-    """
+    """Read a ``.vtkhdf``."""
     try:
         import h5py
     except ImportError:
         return volume_by_child("VTKHDF", path, options)
     with library_errors(str(path), "VTKHDF"), h5py.File(path, "r") as file:
         root = file.get("VTKHDF")
-        if isinstance(root, h5py.Group) and _is_image(root) and options.component != "magnitude":
-            return _image(h5py, file, path, options)
+        if isinstance(root, h5py.Group) and options.component != "magnitude":
+            hidden = any(f"{group}/{GHOSTS}" in root for group in GROUPS.values())
+            if text_of(root.attrs.get("Type", "")) == "ImageData" and not hidden:
+                return _image(h5py, file, path, options)
     return volume_by_child("VTKHDF", path, options)
-
-
-def _is_image(root: Any) -> bool:
-    """Tell whether the file is an image in which nothing is hidden."""
-    hidden = any(f"{group}/{GHOSTS}" in root for group in GROUPS.values())
-    return text_of(root.attrs.get("Type", "")) == "ImageData" and not hidden
 
 
 def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:

@@ -62,31 +62,19 @@ class Index:
         return sorted({entry.time for entry in self.entries if not math.isnan(entry.time)})
 
     def at(self, time: int | None) -> list[Entry]:
-        """Return the entries of a time step.
-
-        Raises:
-            UsageError: several and none chosen (`SeveralSteps`), or one that there is not.
-        """
+        """Return the entries of a time step, or raise UsageError."""
         chosen = chosen_time(self.times, time, str(self.path))
         return self.entries if chosen is None else [entry for entry in self.entries if entry.time == chosen]
 
 
 def chosen_time(times: list[float], time: int | None, source: str) -> float | None:
-    """Return the time of step ``time``, or of the single one; None where there are none.
-
-    Raises:
-        UsageError: several and none chosen (`SeveralSteps`), or one that there is not.
-    """
+    """Return the time of step ``time``, or the only one, else raise UsageError; None where there are none."""
     step = ReadOptions(time=time).step(max(len(times), 1), source, times=times)
     return times[step] if times else None
 
 
 def read_index(path: Path) -> Index:
-    """Read an index file, XML or JSON; the files are not looked at.
-
-    Raises:
-        DataError: damaged, or it names none, or more than `MOST`.
-    """
+    """Read an index file, XML or JSON, but none of its files; raise DataError if it names none, or more than `MOST`."""
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise DataError(f"{path}: {size} bytes; expected an index of at most {MAX_BYTES >> 20} MiB")
@@ -153,11 +141,7 @@ def _parse(path: Path) -> Index:
 
 
 def files_of(index: Index, entries: list[Entry], above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, Entry]]:
-    """Yield the files of entries, in the folder of the index.
-
-    Raises:
-        DataError: a file that is not there, lies elsewhere, or is one of the indexes ``above``.
-    """
+    """Yield the files of entries, in the folder of the index; raise DataError for others, or an index ``above``."""
     here = (*above, index.path.resolve())
     if len(here) > DEEPEST:
         raise DataError(f"{index.path}: more than {DEEPEST} indexes that name each other; expected fewer")

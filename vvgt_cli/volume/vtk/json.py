@@ -31,12 +31,7 @@ def holds_vtkjs(folder: Path) -> bool:
 
 
 def read_vtkjs(folder: Path, options: ReadOptions) -> Volume:
-    """Read the point data of an image; arrays that are not compressed are memory-mapped.
-
-    Raises:
-        DataError: another kind of dataset, or an index that does not fit the data.
-        UsageError: several arrays or components and none chosen.
-    """
+    """Read the point data of an image; arrays that are not compressed are memory-mapped."""
     index, source = folder / INDEX, str(folder)
     with library_errors(source, "vtk.js"):
         with open(index, "rb") as file:

@@ -76,12 +76,7 @@ def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
 
 
 def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
-    """Make a volume of the array that is asked for, from all datasets that hold it.
-
-    Raises:
-        DataError: surfaces alone, damaged cells, or memory that does not suffice.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
+    """Make a volume of the array that is asked for, from all datasets that hold it."""
     if not leaves:
         raise DataError(f"{source}: no dataset in it; expected an image, a grid or a mesh")
     for leaf in leaves:

@@ -24,23 +24,10 @@ from vvgt_cli.volume.types import Volume
 
 # vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.
 _TYPES = {
-    "bit": "",
-    "char": "i1",
-    "signed_char": "i1",
-    "unsigned_char": "u1",
-    "short": "i2",
-    "unsigned_short": "u2",
-    "int": "i4",
-    "unsigned_int": "u4",
-    "long": "i8",
-    "unsigned_long": "u8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "vtkidtype": "i4",
-    "colour": "u1",
-    "float": "f4",
-    "double": "f8",
-}
+    "bit": "", "char": "i1", "signed_char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2",
+    "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8",
+    "vtkidtype": "i4", "colour": "u1", "float": "f4", "double": "f8",
+}  # fmt: skip
 _FIXED = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1, "EDGE_FLAGS": 1}
 
 
@@ -230,12 +217,7 @@ def _grid(parser: Parser, where: str) -> tuple[tuple[int, ...], list[float], lis
 
 
 def read_legacy(path: Path, options: ReadOptions) -> Volume:
-    """Read a legacy VTK image: point data, or cell data on the grid of cell centres.
-
-    Raises:
-        DataError: another dataset than an image, or sections that do not fit the file.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
+    """Read a legacy VTK image: point data, or cell data on the grid of cell centres."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         parser = Parser(text, path)
         parser.parse()

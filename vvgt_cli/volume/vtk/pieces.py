@@ -23,16 +23,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
 from vvgt_cli.volume.types import Volume, float_dtype, triple
-from vvgt_cli.volume.vtk.xml import (
-    GHOSTS,
-    HIDDEN,
-    Scan,
-    extent_dims,
-    extent_of,
-    image_grid,
-    image_values,
-    scan,
-)
+from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
 HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
@@ -46,10 +37,6 @@ def read_pvti(path: Path, options: ReadOptions) -> Volume:
     """Read a ``.pvti``: point data, or cell data on the grid of cell centres.
 
     With ``options.stored`` values stay in the pieces, which are mapped, or unpacked and kept for a while.
-
-    Raises:
-        DataError: damaged, no pieces, pieces that do not lie in its folder, or are not what it says.
-        UsageError: a choice of array or component that is missing or does not exist.
     """
     found = scan(path)
     if found.kind != "PImageData" or not found.image:
@@ -204,11 +191,7 @@ def _overlapping(lo: np.ndarray, hi: np.ndarray) -> bool:
 
 
 def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
-    """List the arrays of a ``.pvti``, each with the range that the headers of its pieces state, and its pieces.
-
-    Raises:
-        DataError: damaged.
-    """
+    """List pieces and arrays of a ``.pvti``, with the range that the pieces' headers state, or raise DataError."""
     index = scan(path)
     pieces = [scan(data_file(path, name)) for name, _ in index.sources[:LISTED]]
     rows = []

@@ -93,19 +93,15 @@ def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
         return not message(errors=True)
 
 
-def _check_name(path: Path, named: str) -> None:
-    """Refuse a file named by another that does not lie in its folder, or is not there; a pattern stands for several."""
-    if not re.search(r"[*%]", named):
-        data_file(path, named, exact=True)  # VTK opens it
-    elif Path(named).is_absolute() or ".." in Path(named).parts:
-        raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
-
-
 def _check_names(path: Path, names: Sequence[str]) -> None:
+    """Refuse files named by another that do not lie in its folder, or are not there; a pattern stands for several."""
     if len(names) > MOST_NAMES:
         raise DataError(f"{path}: it names {len(names)} files; expected at most {MOST_NAMES}")
     for named in dict.fromkeys(names):
-        _check_name(path, named)
+        if not re.search(r"[*%]", named):
+            data_file(path, named, exact=True)  # VTK opens it
+        elif Path(named).is_absolute() or ".." in Path(named).parts:
+            raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
 
 
 def _small(path: Path) -> str:

@@ -65,11 +65,7 @@ class Samples:
 
 
 def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
-    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2).
-
-    Raises:
-        DataError: bounds that are not finite.
-    """
+    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2); raise DataError if these are not finite."""
     if not np.isfinite(bounds).all():
         raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
     size, spacing = _grid(bounds, dims, cells)
@@ -78,17 +74,7 @@ def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, s
 
 
 def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the values on a vtkDataSet, by vtkProbeFilter.
-
-    Args:
-        mesh: a vtkDataSet.
-        values: (n,) scalars of its points or cells.
-        where: ``point`` or ``cell``.
-        grid: the samples.
-
-    Returns:
-        (nz, ny, nx) values, and a mask of those that lie in a cell.
-    """
+    """Return samples (nz, ny, nx) of values (n,) of a vtkDataSet's points or cells, and a mask of those inside."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
     from vtkmodules.vtkFiltersCore import vtkProbeFilter
@@ -115,20 +101,7 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
 def sampled_volume(
     values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
 ) -> Volume:
-    """Make the volume of samples; warn of their number where ``dims`` is None.
-
-    Args:
-        values: (nz, ny, nx), NaN where not ``inside``.
-        inside: mask of the samples in a cell.
-        dtype: of the values before.
-        grid: the samples.
-        dims: what was asked for, None: nothing.
-        source: for messages.
-        name: of the volume.
-
-    Raises:
-        DataError: none is inside.
-    """
+    """Make the volume of samples, and warn of their number if ``dims`` is None; raise DataError if none is inside."""
     if not inside.any():
         raise DataError(f"{source}: no sample of {_text(grid.dims)} lies in a cell of the mesh; try other --dims")
     if dims is None:

@@ -28,7 +28,7 @@ from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
-from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, table_bytes, walk_xml
+from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
@@ -69,11 +69,7 @@ class Scan:
 
 
 def scan(path: Path) -> Scan:
-    """Scan the elements of a VTK XML file, up to its appended data.
-
-    Raises:
-        DataError: not well-formed, or not a VTKFile.
-    """
+    """Scan the elements of a VTK XML file, up to its appended data; raise DataError if it is damaged or no VTKFile."""
     found = Scan()
 
     def start(tag: str, attributes: dict[str, str], position: int) -> bool:
@@ -144,20 +140,12 @@ class Grid:
 
 
 def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
-    """Parse the six numbers of an extent.
-
-    Raises:
-        DataError: they are not.
-    """
+    """Parse the six numbers of an extent, or raise DataError."""
     return [int(e) for e in _numbers(text, 6, path, what)]
 
 
 def extent_dims(image: dict[str, str], path: Path) -> list[int]:
-    """Return the points along (x, y, z) of an image or a structured grid, by its attributes.
-
-    Raises:
-        DataError: none along an axis.
-    """
+    """Return the points along (x, y, z) of an image or structured grid; raise DataError if there are none."""
     extent = extent_of(image.get("WholeExtent", ""), path)
     dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
     if min(dims) < 1:
@@ -166,11 +154,7 @@ def extent_dims(image: dict[str, str], path: Path) -> list[int]:
 
 
 def stored_ratio(found: Scan, path: Path) -> int:
-    """Return the most bytes of values that a byte of the file can stand for.
-
-    Raises:
-        DataError: an unknown compressor.
-    """
+    """Return the most bytes of values that a byte can stand for; raise DataError for an unknown compressor."""
     compressor = found.root.get("compressor", "")
     if compressor not in _RATIO:
         raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
@@ -178,11 +162,7 @@ def stored_ratio(found: Scan, path: Path) -> int:
 
 
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
-    """Return the grid of points, or of cell centres (half a voxel further, one fewer along each axis), by attributes.
-
-    Raises:
-        DataError: numbers that are none.
-    """
+    """Return the grid of points, or of cell centres (half a voxel further, one fewer per axis), or raise DataError."""
     extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
@@ -200,12 +180,7 @@ def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
 
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:
-    """Read a VTK XML image: point data, or cell data on the grid of cell centres.
-
-    Raises:
-        DataError: another dataset than an image, damaged, or sizes that the file cannot hold.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
+    """Read a VTK XML image: point data, or cell data on the grid of cell centres."""
     found = scan(path)
     if found.kind != "ImageData" or not found.image:
         raise DataError(
@@ -224,10 +199,6 @@ def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions,
     """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
     With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden.
-
-    Raises:
-        DataError: sizes that the file cannot hold, or it is damaged.
-        UsageError: a choice of component that is missing or does not exist.
     """
     packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
     if packed is not None:
@@ -390,7 +361,8 @@ def packed_array(
             f"{path}: array {info.name!r} has no table of {need} bytes in blocks; check that the file is whole"
         )
     begins = np.concatenate([[0], np.cumsum(sizes)])
-    place = start + table_bytes(len(words), word, coded)
+    size = len(words) * word.itemsize
+    place = start + (4 * -(-size // 3) if coded else size)
     packed = _Blocks(path, compressor, coded, place, begins, each, need)
     _, ny, nx, components = shape
     row = nx * components * dtype.itemsize

@@ -37,11 +37,7 @@ splats, volume, scene_of = (_load(FOLDER / f"{name}.py") for name in ("splats", 
 
 
 def imported(path: str) -> tuple[Any, list[str]]:
-    """Add the Gaussians of a file, and return the object and what is not shown.
-
-    Raises:
-        RuntimeError: it cannot be read.
-    """
+    """Add the Gaussians of a file, and return the object and what is not shown, or raise RuntimeError."""
     with tempfile.TemporaryDirectory() as folder:
         plain = path
         if not path.lower().endswith(".ply") or path.lower().endswith(".compressed.ply"):
@@ -52,11 +48,7 @@ def imported(path: str) -> tuple[Any, list[str]]:
 
 
 def converted(scene: Any, item: Any, path: str, options: list[str]) -> list[str]:
-    """Convert a Volume object to a file, and return what is not taken.
-
-    Raises:
-        RuntimeError: its grid, its material or the conversion.
-    """
+    """Convert a Volume object to a file, and return what is not taken, or raise RuntimeError."""
     with tempfile.TemporaryDirectory() as name:
         source, tf = (Path(name) / part for part in ("volume.vdb", "tf.json"))
         shown = volume.Material(item, scene_of.saved(item, source))
