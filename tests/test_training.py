@@ -153,7 +153,8 @@ def test_training_from_random_points_learns(monkeypatch, tmp_path):
     gsplat = SimpleNamespace(rasterization=drawn, MCMCStrategy=lambda cap_max: strategy)
     monkeypatch.setitem(sys.modules, "gsplat", gsplat)
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
-    module = importlib.import_module("gsplat_trainer")
+    bench = importlib.import_module
+    module = bench("gsplat_trainer")
     for constant, value in {"COUNT": 300, "SIZE": 24, "SCORED": 24, "REPORTED": (1,)}.items():
         monkeypatch.setattr(module, constant, value)
     write_nrrd(tmp_path / "blob.nrrd", read_volume("example:blob:10"))
