@@ -1,7 +1,5 @@
 """Volumes at known places: three balls and an F, on grids of any orientation, written in formats that have one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import nibabel as nib
@@ -26,8 +24,7 @@ def turned(a: float, b: float, c: float) -> np.ndarray:
     """(3, 3) rotation about x, then y, then z."""
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    rz = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    return rz @ ry @ rx
+    return np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]]) @ ry @ rx
 
 
 def place(axes: np.ndarray, middle: tuple[float, ...] = (12.0, -34.0, 56.0)) -> np.ndarray:

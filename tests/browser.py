@@ -1,7 +1,5 @@
 """Web viewers in headless Chromium: `tests/viewers` has the pages, their packages live in a cache folder."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

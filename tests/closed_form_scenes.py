@@ -1,7 +1,5 @@
 """Scenes, transfer functions and pictures that the tests of vvgt_cli.closed_form share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

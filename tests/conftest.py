@@ -1,11 +1,9 @@
 """Shared fixtures: the command line in-process, the `long` marker, hypothesis profiles."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import hypothesis
@@ -90,7 +88,6 @@ def display() -> Iterator[str]:
         pytest.skip("Xvfb is not on the path (Debian: xvfb)")
     words = ["Xvfb", "-noreset", "-displayfd", "1", "-screen", "0", "1280x1024x24"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as server:
-        assert server.stdout is not None
         yield f":{server.stdout.readline().decode().strip()}"
         server.terminate()
 
@@ -113,15 +110,36 @@ class Result:
         return lines[0]
 
 
-@pytest.fixture
-def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[Callable[..., Result]]:
-    """Run a command line in this process; output is captured at the file descriptors, so VTK's is seen too."""
+class CommandLine:
+    """Run command lines in this process; output is captured at the file descriptors, so VTK's is seen too.
 
-    def call(*args: object) -> Result:
-        capfdbinary.readouterr()
-        code = run([str(arg) for arg in args])
-        out, err = capfdbinary.readouterr()
+    An argument that begins with ``--`` is split at blanks: vvgt("info", path, "--time 1 --json").
+    """
+
+    def __init__(self, captured: pytest.CaptureFixture[bytes]) -> None:
+        self.captured = captured
+
+    def __call__(self, *args: object) -> Result:
+        self.captured.readouterr()
+        words = [text.split() if text.startswith("--") else [text] for text in map(str, args)]
+        code = run([word for group in words for word in group])
+        out, err = self.captured.readouterr()
         return Result(code, out, err.decode())
 
-    yield call
+    def ok(self, *args: object) -> Result:
+        """Run a command line that must succeed."""
+        result = self(*args)
+        assert result.code == 0, result.err
+        return result
+
+    def fails(self, code: int, *args: object) -> str:
+        """Run a command line that must end with an exit status, and return the one line that says why."""
+        result = self(*args)
+        assert result.code == code, result.err
+        return result.error
+
+
+@pytest.fixture
+def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[CommandLine]:
+    yield CommandLine(capfdbinary)
     set_memory(None)  # `--memory` is of the whole process

@@ -1,7 +1,5 @@
 """The pages' commands at sizes that tests have time for; `python -m tests.docs_commands` stands in for `vvgt`."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

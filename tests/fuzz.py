@@ -5,8 +5,6 @@ with the reader's name and ``i``: the same number is always the same file. A rea
 errors with one line of text, within `SECONDS` of processor time and `MEMORY` bytes. Prints one line of JSON a reader.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import mmap

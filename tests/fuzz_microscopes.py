@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: files of microscopes, and blocks of N5."""
 
-from __future__ import annotations
-
 import tarfile
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: small whole files of every format that the package reads by itself."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io
@@ -259,8 +257,7 @@ def transfer() -> list[Seed]:
     from vvgt_cli.look.readers.names import FILE as NAMED
 
     def read(path: Path) -> None:
-        tf = read_transfer_function(str(path))
-        tf.node_range()
+        read_transfer_function(str(path)).node_range()
 
     preset = {
         "ColorSpace": "Diverging", "Name": "Preset", "NanColor": [1, 1, 0],
@@ -383,26 +380,10 @@ def readers() -> dict[str, list[Seed]]:
     from fuzz_seeds_scans import scans
 
     return {
-        "raw": raw(),
-        "NRRD": nrrd(),
-        "MetaImage": metaimage(),
-        "Inviwo": inviwo(),
-        **scans(),
-        **hospital(),
-        "SLC": slc(),
-        "TIFF": tiff(),
-        "VTK legacy": vtk_legacy(),
-        "VTK XML": vti(),
-        "OpenVDB": vdb(),
-        "NumPy": numpy_files(),
-        "transfer function": transfer(),
-        "colour map": colormaps(),
-        "label table": label_tables(),
-        "Gaussians": ply(),
-        "Gaussians of others": others(),
-        "SOG": sog(),
-        "view set": cameras(),
-        "model card": model_card(),
-        "manifest of views": manifest(),
+        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), **scans(), **hospital(),
+        "SLC": slc(), "TIFF": tiff(), "VTK legacy": vtk_legacy(), "VTK XML": vti(), "OpenVDB": vdb(),
+        "NumPy": numpy_files(), "transfer function": transfer(), "colour map": colormaps(),
+        "label table": label_tables(), "Gaussians": ply(), "Gaussians of others": others(), "SOG": sog(),
+        "view set": cameras(), "model card": model_card(), "manifest of views": manifest(),
         "checkpoint": checkpoint(),
-    }
+    }  # fmt: skip

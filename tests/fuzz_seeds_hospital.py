@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: DICOM, and conventions on top of HDF5 and Zarr."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -95,8 +93,7 @@ def vtkjs() -> list[Seed]:
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / "v")
         files = {f"v/{p.relative_to(f'{folder}/v')}": p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
-    index = files.pop("v/index.json")
-    return [Seed("v/index.json", index, in_folder(array="v"), files)]
+    return [Seed("v/index.json", files.pop("v/index.json"), in_folder(array="v"), files)]
 
 
 def hospital() -> dict[str, list[Seed]]:

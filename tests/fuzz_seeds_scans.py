@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: formats of neuroimaging, density maps and molecules."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io
@@ -194,15 +192,7 @@ def pictures() -> list[Seed]:
 def scans() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     return {
-        "NIfTI": nifti(),
-        "Analyze": analyze(),
-        "MGH": mgh(),
-        "MRC": mrc(),
-        "cube and OpenDX": text_grids(),
-        "VASP": vasp(),
-        "AmiraMesh": amira_files(),
-        **pairs(),
-        "zipped Zarr": zipped_zarr(),
-        "MINC": minc(),
+        "NIfTI": nifti(), "Analyze": analyze(), "MGH": mgh(), "MRC": mrc(), "cube and OpenDX": text_grids(),
+        "VASP": vasp(), "AmiraMesh": amira_files(), **pairs(), "zipped Zarr": zipped_zarr(), "MINC": minc(),
         "pictures": pictures(),
-    }
+    }  # fmt: skip

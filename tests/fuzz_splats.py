@@ -1,7 +1,5 @@
 """Seeds of tests/fuzz.py: files of Gaussians."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

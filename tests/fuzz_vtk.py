@@ -4,8 +4,6 @@ Here that process is a fork that answers many requests, for speed: what it canno
 is in the program, and the next request has a new one.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

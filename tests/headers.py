@@ -1,7 +1,5 @@
 """Files of Gaussians without the line of their header that says how they were made."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The stream of live attributes as a page decodes it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of microscopes, written by hand where no program at hand writes them (LIF, ND2), else by its library."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib
@@ -127,8 +125,7 @@ def nd2(values: np.ndarray, packed: bool = False, spacing: Sequence[float] = SPA
     for name, data in chunks.items():
         where += name + struct.pack("<QQ", out.tell(), len(data))
         out.write(struct.pack("<IIQ", 0x0ABECEDA, 4072, len(data)) + name.ljust(4072, b"\0") + data)
-    begin = out.tell()
-    end = b"ND2 CHUNK MAP SIGNATURE 0000001!" + struct.pack("<Q", begin)
+    end = b"ND2 CHUNK MAP SIGNATURE 0000001!" + struct.pack("<Q", out.tell())
     title = b"ND2 FILEMAP SIGNATURE NAME 0001!"
     out.write(struct.pack("<IIQ", 0x0ABECEDA, len(title), len(where) + len(end)) + title + where + end)
     return out.getvalue()

@@ -4,8 +4,6 @@
 "path:qualified name". Calls of compiled kernels go unseen.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

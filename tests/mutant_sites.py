@@ -4,8 +4,6 @@ Only code that computes: function bodies without docstrings, annotations, string
 statements and `__repr__`.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import tokenize

@@ -9,8 +9,6 @@ Works in copies of the checkout in a temporary folder. Prints a line for each mu
 ``OUT/mutants.json``, from which an interrupted run resumes. ``--again`` retries the mutants that no test noticed.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import hashlib

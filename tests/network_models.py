@@ -1,7 +1,5 @@
 """A network of a few thousand weights, and scenes to put through it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

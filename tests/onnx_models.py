@@ -1,7 +1,5 @@
 """Models in the form of `vvgt export`, built by hand: what they compute is known, and no torch is needed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A field that tells every axis and every spacing apart: 1 + 2 x + 30 y + 500 z at world positions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vvgt_cli.volume import Volume

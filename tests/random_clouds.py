@@ -1,7 +1,5 @@
 """Random Gaussians of tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
@@ -20,6 +18,17 @@ def random_cloud(
         rng.normal(*opacity, count),
         rng.uniform(*colors, (count, 3)),
     )
+
+
+def turns(quaternions: np.ndarray) -> np.ndarray:
+    """Return rotation matrices (K, 3, 3) of quaternions (K, 4), (w, x, y, z) of any norm."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T.astype(float)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def extreme_cloud(count: int = 80) -> Gaussians:

@@ -1,7 +1,5 @@
 """Reports with numbers of the kind that runs give, for tests of what is made of them."""
 
-from __future__ import annotations
-
 import math
 
 ROWS = (  # name, label, kind, K, seconds, dB, steps

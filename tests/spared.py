@@ -1,7 +1,5 @@
 """What small conversions in tests are spared; tests that compare with vvgt in a process of its own undo it."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 MARCH = "vvgt_cli.closed_form.closed_form.MARCH_SIZE"

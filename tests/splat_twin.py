@@ -1,7 +1,5 @@
 """The float64 twins of the splatter's gradients and of `gather`, to compare the kernels with."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stiff, extreme and odd scenes, and the few helpers that make them: scalar volumes, label maps, colours, layers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -65,8 +63,7 @@ def build(data: np.ndarray, tf: TransferFunction, distance: float = 1.0, spacing
 def quadrature(scene: Scene, points: int) -> float:
     """Return the optical mass of a scene in float64, by the midpoint rule at ``points``^3 a voxel."""
     axes = [(np.arange(n * points) + 0.5) / points - 0.5 for n in scene.volume.dims]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    tau, _ = optics_at(scene, grid)
+    tau, _ = optics_at(scene, np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
     return float(tau.sum() * np.prod(scene.step / points))
 
 

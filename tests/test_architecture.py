@@ -1,7 +1,5 @@
 """The rules of the house: import order of the rooms, sizes of files and functions, where heavy imports sit."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
@@ -190,8 +188,7 @@ def test_rooms_and_commands_do_not_import_kernels_at_module_level():
 
 @of_every_file(FILES + TESTS)
 def test_files_and_functions_are_short(path):
-    text = path.read_text("utf-8")
-    assert text.count("\n") <= MAX_FILE
+    assert path.read_text("utf-8").count("\n") <= MAX_FILE
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = (node.end_lineno or node.lineno) - node.lineno + 1
@@ -241,5 +238,4 @@ def test_help_loads_click_and_nothing_heavier():
 
 def test_every_room_imports_without_the_heavy_packages():
     rooms = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]
-    modules = loaded(*(f"import vvgt_cli.{room}" for room in rooms))
-    assert not modules & HEAVY
+    assert not loaded(*(f"import vvgt_cli.{room}" for room in rooms)) & HEAVY

@@ -1,7 +1,5 @@
 """The function that is made when none is given, from files to its unit distance."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every program of benchmarks/, run on one tiny scene with tiny pictures."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import importlib
@@ -340,13 +338,8 @@ def test_training(bench, scenes, tmp_path, monkeypatch):
     assert [row["way"] for row in rows_of(tmp_path / "a.csv")] == ["closed form", "network"]
     assert len(list((tmp_path / "cache").iterdir())) == 2
     small = {
-        "SIZES": (8,),
-        "KINDS": ("shells",),
-        "TRAINED": range(1),
-        "HELD": range(100, 101),
-        "GRID": 8,
-        "SNAPSHOTS": 1,
-    }
+        "SIZES": (8,), "KINDS": ("shells",), "TRAINED": range(1), "HELD": range(100, 101), "GRID": 8, "SNAPSHOTS": 1,
+    }  # fmt: skip
     call(bench("training", **small, FIRST=0.01, EVERY=0.01).main, "data", tmp_path / "data")
     assert len(list((tmp_path / "data" / "train").glob("shells_*.nrrd"))) == 1
     assert len(list((tmp_path / "data" / "held").glob("*_speed.nrrd"))) == 2
@@ -434,15 +427,9 @@ def test_viewers(bench, scenes, tmp_path, monkeypatch):
     block[7:11, 2:9, 1:5] = 1  # at one corner, with three different edges
     write_nrrd(tmp_path / "block.nrrd", Volume(block, (1, 1, 1), space="RAS"))
     look = [
-        "--tf",
-        f"{scenes[1]}/shells.json",
-        "--max-gaussians",
-        300,
-        "--steps",
-        0,
-        "--pictures",
+        "--tf", f"{scenes[1]}/shells.json", "--max-gaussians", 300, "--steps", 0, "--pictures",
         tmp_path / "pictures",
-    ]
+    ]  # fmt: skip
     only = ["--viewer", "three", "--viewer", "gsplatjs", "--format", ".ply", "--format", ".glb"]
     said = call(module.main, tmp_path / "block.nrrd", *look, *only)
     rows = [line.split(",") for line in said.splitlines()[:3]]

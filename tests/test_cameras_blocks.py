@@ -1,7 +1,5 @@
 """Blocks of pixels that stand for a picture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -44,8 +42,7 @@ def test_small_pictures_are_taken_whole():
 def test_what_is_picked_is_what_is_there(width, height):
     blocks = spread_blocks(width, height, 3)
     rows, columns = np.indices((height, width))
-    image = np.stack([rows, columns], axis=-1)
-    picked = blocks.pick(image)
+    picked = blocks.pick(np.stack([rows, columns], axis=-1))
     assert picked.shape == (blocks.numbers.size * BLOCK, BLOCK, 2)
     assert len({tuple(pixel) for pixel in picked.reshape(-1, 2)}) == blocks.mask().sum()
     assert blocks.mask()[picked[..., 0], picked[..., 1]].all()

@@ -1,7 +1,5 @@
 """What files say of their own error: written, read from every format, checked against the volume."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -60,11 +58,8 @@ def made(folder):
 
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
-    result = vvgt(
-        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-conditions", "--json", *more
-    )
-    assert result.code == 0, result.err
-    return json.loads(result.out)["certificate"]
+    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--json", *more)
+    return json.loads(vvgt.ok("evaluate", ply, "--volume", folder / volume, *how).out)["certificate"]
 
 
 def test_a_line_gives_the_certificate_back() -> None:
@@ -103,13 +98,11 @@ def test_a_certificate_that_is_none_is_one_line(text) -> None:
 
 def test_a_conversion_certifies_its_file(made) -> None:
     found = read_ply(made)[1].certificate
-    assert found is not None
     assert (found.volume, found.size, found.rule) == ("volume, 20 x 18 x 22", 64, "inria")
     assert (found.views, found.pixels) == (3, 64**2)
     assert found.psnr > 20
     assert len(found.conditions) == 10
     assert found.conditions[0][1] == min(dB for _, dB in found.conditions)
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME --")
     assert "/" not in found.command
     for words in ("--tf tf.json", "--size 64", "--max-gaussians 300", "--steps 8", "--dims 20 18 22"):
@@ -121,10 +114,8 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     for k, name in enumerate(("ball", "moved")):
         (tmp_path / f"t_{k}.raw").write_bytes((folder / f"{name}.raw").read_bytes())
     args = (tmp_path / "t_*.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--shard", "2/2")
-    assert vvgt("convert", *args, "-o", tmp_path / "out_{}.ply").code == 0
+    vvgt.ok("convert", *args, "-o", tmp_path / "out_{}.ply")
     found = read_ply(tmp_path / "out_1.ply")[1].certificate
-    assert found is not None
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME ")
     assert "--shard 2/2" in found.command
 
@@ -134,16 +125,14 @@ def test_no_folder_is_named_whatever_its_name(vvgt, folder, tmp_path) -> None:
     odd.mkdir()
     shutil.copy(folder / "ball.raw", odd / "ball.raw")
     args = (odd / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", tmp_path / "odd.ply")
-    assert vvgt("convert", *args).code == 0
+    vvgt.ok("convert", *args)
     found = read_ply(tmp_path / "odd.ply")[1].certificate
-    assert found is not None
-    assert found.command is not None
     assert found.command.startswith("vvgt convert VOLUME ")
 
 
 def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--no-comments")
-    assert vvgt("convert", *args, "-o", tmp_path / "out.ply").code == 0
+    vvgt.ok("convert", *args, "-o", tmp_path / "out.ply")
     assert read_ply(tmp_path / "out.ply")[1].certificate is None
     assert b"sha256" not in (tmp_path / "out.ply").read_bytes()
 
@@ -153,12 +142,11 @@ def test_every_format_carries_it(vvgt, folder, made, tmp_path, suffix) -> None:
     if suffix in (".usdc", ".usdz"):
         pytest.importorskip("pxr")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
-    assert vvgt("convert", *args, "-o", tmp_path / f"out{suffix}").code == 0
+    vvgt.ok("convert", *args, "-o", tmp_path / f"out{suffix}")
     expected = read_ply(made)[1].certificate
     assert expected is not None
     assert read_splats(tmp_path / f"out{suffix}")[1].certificate == expected
-    told = vvgt("info", tmp_path / f"out{suffix}")
-    assert told.code == 0
+    told = vvgt.ok("info", tmp_path / f"out{suffix}")
     assert expected.sha256 in told.out.decode()
     assert f"psnr {expected.psnr:g}" in told.out.decode()
     assert evaluated(vvgt, folder, tmp_path / f"out{suffix}")["same_volume"]
@@ -197,22 +185,21 @@ def test_it_does_not_hold_for_another_volume_function_or_damaged_gaussians(vvgt,
 def test_gaussians_that_change_lose_it(vvgt, folder, made, tmp_path) -> None:
     views = tmp_path / "views"
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--views", "4", "-o", views)
-    assert vvgt("render-views", *args).code == 0
-    assert vvgt("optimize", made, "--views", views, "--steps", "2", "-o", tmp_path / "more.ply").code == 0
+    vvgt.ok("render-views", *args)
+    vvgt.ok("optimize", made, "--views", views, "--steps", "2", "-o", tmp_path / "more.ply")
     assert read_ply(tmp_path / "more.ply")[1].certificate is None
 
 
 def test_a_live_file_keeps_its_own_and_a_recolored_one_has_none(vvgt, folder, tmp_path) -> None:
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--max-gaussians", "300", "--live")
-    assert vvgt("convert", *args, "-o", tmp_path / "live.ply").code == 0
+    vvgt.ok("convert", *args, "-o", tmp_path / "live.ply")
     certificate = read_ply(tmp_path / "live.ply")[1].certificate
-    assert certificate is not None
     assert certificate.live_psnr is not None
     found = evaluated(vvgt, folder, tmp_path / "live.ply")  # with --tf: as recolor shows it
     assert (found["holds"], found["recorded"]) == (True, certificate.live_psnr)
     assert found["psnr"] == pytest.approx(found["recorded"], abs=0.02)
     recolor = ("recolor", tmp_path / "live.ply", "--tf", folder / "other.json", "-o", tmp_path / "other.ply")
-    assert vvgt(*recolor).code == 0
+    vvgt.ok(*recolor)
     assert read_ply(tmp_path / "other.ply")[1].certificate is None
 
 
@@ -220,7 +207,6 @@ def test_from_python(tmp_path) -> None:
     result = vvgt_cli.convert(ball(), goal={"max_gaussians": 300, "size": 64, "steps": 0})
     result.save(tmp_path / "a.ply")
     found = read_ply(tmp_path / "a.ply")[1].certificate
-    assert found is not None
     assert found.command is None
     assert found.psnr == round(preview_psnr(result.scores), 2)
 
@@ -279,9 +265,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 60, "opacity": 1, "rgb": [1, 0.9, 0.8]}]
     (tmp_path / "solid.json").write_text(json.dumps({"points": points}))
     solid = (folder / "ball.raw", *RAW, "--tf", tmp_path / "solid.json", "--max-gaussians", "1500", "--steps", "4")
-    assert (
-        vvgt("convert", *solid, "--size", "256", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json").code == 0
-    )
+    vvgt.ok("convert", *solid, "--size", "256", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json")
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
@@ -290,14 +274,12 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4
     assert header.certificate.texture == pytest.approx((found.ours, found.reference), abs=1e-3)
-    told = json.loads((tmp_path / "r.json").read_text())["texture"]
-    assert told["blocks"] == found.blocks
+    assert json.loads((tmp_path / "r.json").read_text())["texture"]["blocks"] == found.blocks
     assert f"texture {header.certificate.texture[0]:g}" in vvgt("info", tmp_path / "out.ply").out.decode()
-    blocks = vvgt("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
-    assert blocks.code == 0
+    vvgt.ok("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
     assert read_ply(tmp_path / "blocks.ply")[1].certificate.texture[1] == pytest.approx(found.reference, abs=0.01)
     small = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
-    assert vvgt("convert", *small, "--size", "48", "-o", tmp_path / "small.ply").code == 0
+    vvgt.ok("convert", *small, "--size", "48", "-o", tmp_path / "small.ply")
     assert read_ply(tmp_path / "small.ply")[1].certificate.texture is None  # 16 px: no block of 32
 
 
@@ -308,9 +290,8 @@ def test_a_run_that_ends_among_its_scores_leaves_the_whole_file(vvgt, folder, tm
 
     monkeypatch.setattr(ViewingConditions, "run", end)
     how = SMALL[: 4 if more else 6]
-    result = vvgt(
-        "convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name
-    )  # fmt: skip
+    words = ("--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name)
+    result = vvgt("convert", folder / "ball.raw", *RAW, *words)
     assert result.code == 130
     assert "complete; scoring next" in result.err
     assert os.listdir(tmp_path) == [name]
@@ -332,8 +313,7 @@ def test_what_cannot_be_written_twice_or_has_no_certificate_is_written_once(
         "checkpoint": ("-o", tmp_path / "out.ply", "--checkpoint", tmp_path / "kept"),
         "comments": ("-o", tmp_path / "out.ply", "--no-comments"),
     }[once]
-    result = vvgt("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, *options)
-    assert result.code == 0
+    result = vvgt.ok("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, *options)
     assert there == [once == "comments"]
     assert "certificate " not in result.err
     assert result.err.count("\nwrite ") == 1
@@ -343,8 +323,7 @@ def test_a_page_is_whole_before_it_is_scored(vvgt, folder, tmp_path, monkeypatch
     page, seen = tmp_path / "out.html", []
     monkeypatch.setattr(TestViews, "run", lambda *args: seen.append(page.read_text("utf-8")))
     command = ("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", page)
-    result = vvgt(*command)
-    assert result.code == 0, result.err
+    result = vvgt.ok(*command)
     for held in ("slices-0", "splats-0", "live-0"):
         assert f'id="{held}"' in seen[0], held
     assert result.err.count("\nslices") == result.err.count("\nvalues") == 1
@@ -363,5 +342,5 @@ def test_no_view_is_rendered_twice_to_be_scored(vvgt, folder, tmp_path, monkeypa
 
     monkeypatch.setattr("vvgt_cli.dvr.render_view", counted)
     how = ("--tf", folder / "tf.json", "--max-gaussians", "300", "--size", "512", "--live")
-    assert vvgt("convert", folder / "ball.raw", *RAW, *how, "-o", tmp_path / "out.ply").code == 0
+    vvgt.ok("convert", folder / "ball.raw", *RAW, *how, "-o", tmp_path / "out.ply")
     assert len(rendered) == len(set(rendered)) == 4  # three test views, one on the next larger screen

@@ -1,7 +1,5 @@
 """`vvgt check`: its self-test, the stiffness of a scene, and what it prints when cases fail."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -19,8 +17,7 @@ from vvgt_cli.volume import Volume
 
 
 def test_the_self_test_passes_and_prints_a_table(vvgt):
-    result = vvgt("check")
-    assert result.code == 0, result.out
+    result = vvgt.ok("check")
     rows, counts = result.out.decode().split("\n\n")
     assert all(line.startswith("ok") for line in rows.splitlines()[1:])
     for known in FORMATS:
@@ -75,9 +72,7 @@ def test_failures_end_with_status_1_and_are_named(vvgt, monkeypatch):
 
 def test_a_scene_is_measured_and_checked(vvgt):
     scene = ("check", "example:blob:16", "--tf", "viridis")
-    result = vvgt(*scene, "--json", "--tolerance", "0.01")
-    assert result.code == 0, result.err
-    document = json.loads(result.out)
+    document = json.loads(vvgt.ok(*scene, "--json", "--tolerance", "0.01").out)
     assert document["volume"]["dims"] == [16, 16, 16]
     found = document["stiffness"]
     assert found["needed_step"] in (1.0, 2.0, 4.0)

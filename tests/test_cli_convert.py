@@ -1,7 +1,5 @@
 """The commands end to end on small volumes."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -100,17 +98,14 @@ def test_the_same_command_gives_the_same_bytes_on_standard_output_too(converted)
 
 
 def test_report_to_standard_output(folder, vvgt):
-    result = vvgt("init", SOURCE, *SMALL, "-o", "a.ply", "--report", "-")
-    report = json.loads(result.out)
+    report = json.loads(vvgt("init", SOURCE, *SMALL, "-o", "a.ply", "--report", "-").out)
     assert (report["command"], report["scores"]) == ("init", None)
     assert report["gaussians"] == len(read_ply("a.ply")[0])
 
 
 @pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
 def test_init_has_three_methods(method, folder, vvgt):
-    result = vvgt("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply")
-    assert result.code == 0, result.err
-    assert method in result.err
+    assert method in vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply").err
     assert 0 < len(read_ply("a.ply")[0]) <= 300
 
 
@@ -123,20 +118,20 @@ def test_the_seed_draws_other_samples(folder, vvgt):
 
 def test_frames_agree(folder, vvgt):
     options = ("init", SOURCE, *SMALL, "--spacing", 2, 1, 0.5, "--tf", "tf.json", "-q", "-o")
-    assert vvgt(*options, "unit.ply").code == 0
-    assert vvgt(*options, "world.ply", "--frame", "world", "--up", "z", "--sh-degree", 3).code == 0
+    vvgt.ok(*options, "unit.ply")
+    vvgt.ok(*options, "world.ply", "--frame", "world", "--up", "z", "--sh-degree", 3)
     unit, _ = read_ply("unit.ply")
     world, header = read_ply("world.ply")
     assert (header.frame, header.up, header.sh_degree) == ("world", "z", 3)
     np.testing.assert_allclose(in_unit_frame(world, header).means, unit.means, atol=1e-5)
-    assert vvgt(*options, "bare.ply", "--no-comments").code == 0
+    vvgt.ok(*options, "bare.ply", "--no-comments")
     assert b"comment" not in Path("bare.ply").read_bytes().split(b"end_header")[0]
 
 
 def test_a_world_file_renders_like_the_unit_one(folder, vvgt):
     for frame in ("unit", "world"):
         vvgt("init", SOURCE, *SMALL, "--frame", frame, "--up", "x", "-o", f"{frame}.ply", "-q")
-        assert vvgt("render", f"{frame}.ply", "--orbit", 2, "--size", 40, "--exr", "-o", frame, "-q").code == 0
+        vvgt.ok("render", f"{frame}.ply", "--orbit", 2, "--size", 40, "--exr", "-o", frame, "-q")
     a, b = (read_exr(folder / frame / "orbit_001.exr")[0] for frame in ("unit", "world"))
     assert a[..., 3].max() > 0.1
     np.testing.assert_allclose(a, b, atol=2e-2)  # a splat at the 1/255 cut may fall on either side
@@ -144,17 +139,15 @@ def test_a_world_file_renders_like_the_unit_one(folder, vvgt):
 
 def test_render_writes_views_that_render_again(converted, folder, vvgt):
     ply = converted[0] / "a.ply"
-    assert vvgt("render", ply, "--orbit", 3, "--size", 40, "--background", 1, 1, 1, "-o", "turn").code == 0
+    vvgt.ok("render", ply, "--orbit", 3, "--size", 40, "--background", 1, 1, 1, "-o", "turn")
     assert sorted(path.name for path in Path("turn").iterdir()) == [
         *(f"orbit_{i:03d}.png" for i in range(3)),
         "transforms.json",
     ]
     assert read_png("turn/orbit_000.png").shape == (40, 40, 3)
     assert len(read_cameras("turn/transforms.json")) == 3
-    taken = vvgt("render", ply, "--orbit", 3, "--size", 40, "-o", "turn")
-    assert (taken.code, "exists" in taken.error) == (2, True)
-    again = vvgt("render", ply, "--camera", "turn/transforms.json", "--size", 20, "-o", "again")
-    assert again.code == 0, again.err
+    assert "exists" in vvgt.fails(2, "render", ply, "--orbit", 3, "--size", 40, "-o", "turn")
+    vvgt.ok("render", ply, "--camera", "turn/transforms.json", "--size", 20, "-o", "again")
     assert read_png("again/orbit_002.png").shape == (20, 20, 4)
 
 
@@ -208,9 +201,7 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
     assert near[:, :48].mean((0, 1)) == pytest.approx(middle.mean((0, 1)), rel=0.1)
     assert far[:, :48].mean((0, 1)) != pytest.approx(middle.mean((0, 1)), rel=0.1)
     assert psnr(near[:, :48], near[:, 48:96]) > 20
-    again = vvgt(*options)
-    assert again.code == 2
-    assert "exists" in again.error
+    assert "exists" in vvgt.fails(2, *options)
 
 
 def test_rules_are_the_tables():
@@ -228,8 +219,7 @@ def test_a_scene_without_anything_to_see_is_an_error(folder, vvgt):
     points = [{"x": x, "rgb": [1, 1, 1], "opacity": float(x > 0.5)} for x in (0, 0.5, 0.51, 1)]
     Path("high.json").write_text(json.dumps({"range": [0, 1], "points": points}))
     raw = ("v.raw", "--dims", 9, 9, 9, "--dtype", "float32")
-    result = vvgt("convert", *raw, "--tf", "high.json", *SMALL, "-o", "a.ply")
-    assert (result.code, "nothing visible" in result.error) == (1, True)
+    assert "nothing visible" in vvgt.fails(1, "convert", *raw, "--tf", "high.json", *SMALL, "-o", "a.ply")
     assert not Path("a.ply").exists()
 
 
@@ -240,17 +230,15 @@ def test_info_on_every_kind(converted, folder, vvgt):
         str(converted[0] / "a.ply"): "gaussians",
     }
     for file, kind in kinds.items():
-        result = vvgt("info", file)
-        assert result.code == 0, result.err
-        assert result.out.decode().splitlines()[0].split(None, 1) == ["kind", kind]
+        assert vvgt.ok("info", file).out.decode().splitlines()[0].split(None, 1) == ["kind", kind]
         assert json.loads(vvgt("info", file, "--json").out)["kind"] == kind
     vvgt("render", converted[0] / "a.ply", "--orbit", 2, "--size", 16, "-o", "d")
     assert json.loads(vvgt("info", "d/transforms.json", "--json").out)["views"] == 2
 
 
 def test_tf_show_draws(folder, vvgt):
-    assert vvgt("tf", "show", "tf.json", "-o", "a.png").code == 0
-    assert vvgt("tf", "show", "tf.json", "-o", "b.png", "--volume", SOURCE).code == 0
+    vvgt.ok("tf", "show", "tf.json", "-o", "a.png")
+    vvgt.ok("tf", "show", "tf.json", "-o", "b.png", "--volume", SOURCE)
     a, b = read_png("a.png"), read_png("b.png")
     assert a.shape == b.shape
     assert np.abs(a - b).max() > 0.1  # the histogram behind

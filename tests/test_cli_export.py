@@ -1,7 +1,5 @@
 """`vvgt export`: one real export of a tiny network, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 from network_models import FED, TINY, as_rows, scene
 
+from tests.refused import refused
 from vvgt_cli.cli.main import run
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network.prepare import prepare
@@ -89,29 +88,23 @@ def test_a_head_that_is_zero_is_not_compared_as_it_is(made, traced, tmp_path):
     heads = [network.geometry.head.last.weight.abs().max() > 0 for network in traced]
     assert heads == [True, False]
     assert card.difference > 0
-    with pytest.raises(DataError, match="returns its input"):
-        ex.difference(fresh(), Model.open(made / "tiny"))
+    refused(DataError, "returns its input", ex.difference, fresh(), Model.open(made / "tiny"))
 
 
 def test_graphs_that_differ_are_not_written(traced, tmp_path):
-    other = ex.randomised(ex.randomised(fresh()))
-    save_checkpoint(tmp_path / "other.pt", Checkpoint(other))
-    with pytest.raises(DataError, match="differs from torch"):
-        ex.export_model(tmp_path / "other.pt", tmp_path / "other")
+    save_checkpoint(tmp_path / "other.pt", Checkpoint(ex.randomised(ex.randomised(fresh()))))
+    refused(DataError, "differs from torch", ex.export_model, tmp_path / "other.pt", tmp_path / "other")
     assert [path.name for path in tmp_path.iterdir()] == ["other.pt"]
 
 
 def test_a_model_is_replaced_only_when_told_and_nothing_else_ever(made, traced, tmp_path):
     ex.export_model(made / "tiny.pt", tmp_path / "a")
-    with pytest.raises(UsageError, match="--overwrite"):
-        ex.export_model(made / "tiny.pt", tmp_path / "a")
+    refused(UsageError, "--overwrite", ex.export_model, made / "tiny.pt", tmp_path / "a")
     ex.export_model(made / "tiny.pt", tmp_path / "a", overwrite=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
-    with pytest.raises(UsageError, match="not a model"):
-        ex.export_model(made / "tiny.pt", tmp_path / "mine", overwrite=True)
-    with pytest.raises(UsageError, match="make it first"):
-        ex.export_model(made / "tiny.pt", tmp_path / "no" / "b")
+    refused(UsageError, "not a model", ex.export_model, made / "tiny.pt", tmp_path / "mine", overwrite=True)
+    refused(UsageError, "make it first", ex.export_model, made / "tiny.pt", tmp_path / "no" / "b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "mine"]
 
 

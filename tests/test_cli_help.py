@@ -1,7 +1,5 @@
 """`--help` in sections."""
 
-from __future__ import annotations
-
 import re
 
 import click

@@ -1,7 +1,5 @@
 """`vvgt infer` on models built by hand: what is kept, what is dropped, what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -40,8 +38,7 @@ def made(tmp_path_factory):
     assert run([str(arg) for arg in start]) == 0
     gaussians, _ = read_ply(folder / "init.ply")
     world = PlyOptions(frame="world", up="z", scale=0.5, centre=(3.0, 4.0, 5.0), unit_distance=0.7)
-    dark = replace(gaussians, colors=gaussians.colors - DARK)
-    write_ply(folder / "in.ply", dark, world)
+    write_ply(folder / "in.ply", replace(gaussians, colors=gaussians.colors - DARK), world)
     write_model(folder / "brighter", BRIGHTER)
     write_model(folder / "darker", DARKER)
     return folder
@@ -52,9 +49,7 @@ def call(made, model, output, *more):
 
 
 def test_a_gain_is_kept_and_the_file_is_as_the_one_read(made, tmp_path, vvgt):
-    result = vvgt(*call(made, "brighter", tmp_path / "out.ply", "--report", tmp_path / "r.json"))
-    assert result.code == 0, result.err
-    assert "dropped" not in result.err
+    assert "dropped" not in vvgt.ok(*call(made, "brighter", tmp_path / "out.ply", "--report", tmp_path / "r.json")).err
     (before, old), (after, new) = read_ply(made / "in.ply"), read_ply(tmp_path / "out.ply")
     assert np.allclose(after.colors, before.colors + DARK, atol=1e-5)
     assert np.allclose(after.means, before.means, atol=1e-5)
@@ -67,9 +62,7 @@ def test_a_gain_is_kept_and_the_file_is_as_the_one_read(made, tmp_path, vvgt):
 
 
 def test_without_a_gain_the_input_is_written_and_it_is_said(made, tmp_path, vvgt):
-    result = vvgt(*call(made, "darker", tmp_path / "out.ply"))
-    assert result.code == 0, result.err
-    assert "no gain: dropped" in result.err
+    assert "no gain: dropped" in vvgt.ok(*call(made, "darker", tmp_path / "out.ply")).err
     (before, _), (after, _) = read_ply(made / "in.ply"), read_ply(tmp_path / "out.ply")
     assert np.allclose(as_rows(after), as_rows(before), atol=1e-5)
 
@@ -170,16 +163,13 @@ def test_bad_input_gets_one_line_and_leaves_nothing(case, made, tmp_path, vvgt, 
         args[args.index(change) + 1] = value
     else:
         args += [change, value]
-    result = vvgt(*args)
-    assert result.code == code, result.err
-    assert message in result.error
-    assert "internal" not in result.error
+    result = vvgt.fails(code, *args)
+    assert message in result
+    assert "internal" not in result
     assert not list(Path().iterdir())
 
 
 def test_nothing_is_overwritten_unasked(made, tmp_path, vvgt):
     (tmp_path / "out.ply").write_bytes(b"mine")
-    result = vvgt(*call(made, "brighter", tmp_path / "out.ply"))
-    assert result.code == 2
-    assert "--overwrite" in result.error
+    assert "--overwrite" in vvgt.fails(2, *call(made, "brighter", tmp_path / "out.ply"))
     assert (tmp_path / "out.ply").read_bytes() == b"mine"

@@ -1,7 +1,5 @@
 """Light on the command line and in the library: files that say what fell on them, degrees, normals, refusals."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -37,16 +35,14 @@ def tf(folder, name="dark"):
 
 
 def psnr(vvgt, ply, *more):
-    result = vvgt("evaluate", ply, "--volume", SOURCE, "--no-conditions", "--step", "0.5", "--json", *more)
-    assert result.code == 0, result.err
+    result = vvgt.ok("evaluate", ply, "--volume", SOURCE, "--no-conditions", "--step", "0.5", "--json", *more)
     return json.loads(result.out)["scores"]["psnr"]
 
 
 def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
     out = folder / "head.ply"
     report = folder / "head.json"
-    made = vvgt("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--report", report, "-o", out)
-    assert made.code == 0, made.err
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--report", report, "-o", out)
     gaussians, header = read_ply(out)
     assert header.light == Lighting()
     assert gaussians.degree == header.sh_degree == 2
@@ -57,25 +53,20 @@ def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
     assert psnr(vvgt, out, *tf(folder), "--light", "none") < own - 3
     rows = _rows(out, "head")[1]
     normals = np.stack([rows[n] for n in ("nx", "ny", "nz")], axis=1)
-    lengths = np.linalg.norm(normals, axis=1)
-    assert (np.abs(lengths - 1) < 1e-5).mean() > 0.9
-    info = json.loads(vvgt("info", out, "--json").out)
-    assert info["light"] == Lighting().text()
+    assert (np.abs(np.linalg.norm(normals, axis=1) - 1) < 1e-5).mean() > 0.9
+    assert json.loads(vvgt("info", out, "--json").out)["light"] == Lighting().text()
 
 
 def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):
     out = folder / "fixed.ply"
-    made = vvgt(
-        "convert", SOURCE, *tf(folder), *SMALL, "--light", "1,0,2", "--shadows", "--specular", "0",
-        "--ambient-occlusion", "-o", out,
-    )  # fmt: skip
-    assert made.code == 0, made.err
+    lit = "--light 1,0,2 --shadows --specular 0 --ambient-occlusion"
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, lit, "-o", out)
     gaussians, header = read_ply(out)
     assert (gaussians.harmonics, header.sh_degree) == (None, 0)
     assert header.light.shadows
     assert header.light.occlusion == 0.1
     dark = folder / "dark.ply"
-    assert vvgt("convert", SOURCE, *tf(folder), *SMALL, "-o", dark).code == 0
+    vvgt.ok("convert", SOURCE, *tf(folder), *SMALL, "-o", dark)
     assert read_ply(dark)[1].light is None
     assert gaussians.colors.mean() < 0.8 * read_ply(dark)[0].colors.mean()
     assert not np.any(_rows(dark, "dark")[1]["nz"])
@@ -83,24 +74,13 @@ def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt)
 
 def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
     out = folder / "flat.ply"
-    made = vvgt("init", SOURCE, *tf(folder, "lit"), "--max-gaussians", "300", "--sh-degree", "0", "-o", out)
-    assert made.code == 0, made.err
+    made = vvgt.ok("init", SOURCE, *tf(folder, "lit"), "--max-gaussians", "300", "--sh-degree", "0", "-o", out)
     assert "--sh-degree 0: headlight and highlights change with the view" in made.err
     gaussians, header = read_ply(out)
     assert (gaussians.degree, header.light) == (0, Lighting(diffuse=0.9))
     for degree in (1, 3):
-        again = vvgt(
-            "init",
-            SOURCE,
-            *tf(folder, "lit"),
-            "--max-gaussians",
-            "300",
-            "--sh-degree",
-            degree,
-            "-o",
-            out,
-            "--overwrite",
-        )
+        few = ("--max-gaussians 300 --overwrite --sh-degree", degree, "-o", out)
+        again = vvgt("init", SOURCE, *tf(folder, "lit"), *few)
         assert read_ply(out)[1].sh_degree == degree
         assert ("change with the view" in again.err) == (degree == 1)
 
@@ -108,11 +88,8 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
 def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
     shown = {}
     for name, more in (("preset", ()), ("none", ("--light", "none")), ("left", ("--light", "left"))):
-        done = vvgt(
-            "render-views", SOURCE, *tf(folder, "lit"), "--views", "1", "--test-views", "0", "--size", "32", "--format",
-            "exr", "--no-points", *more, "-o", folder / name,
-        )  # fmt: skip
-        assert done.code == 0, done.err
+        views = "--views 1 --test-views 0 --size 32 --format exr --no-points"
+        vvgt.ok("render-views", SOURCE, *tf(folder, "lit"), views, *more, "-o", folder / name)
         shown[name] = next((folder / name).rglob("*.exr")).read_bytes()
     assert len(set(shown.values())) == 3
 
@@ -124,9 +101,7 @@ def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
         (("--light", "headlight", "--ambient", "nan"), "--ambient nan"),
         (("--light", "headlight", "--shadows"), "--shadows: a headlight casts no visible shadows"),
     ):
-        failed = vvgt("convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
-        assert failed.code == 2
-        assert message in failed.error
+        assert message in vvgt.fails(2, "convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
         assert not (folder / "no.ply").exists()
 
 
@@ -155,7 +130,6 @@ def test_presets_with_surfaces_and_label_maps_are_lit_unless_told_otherwise() ->
     assert [name for name, light in found.items() if light == MATTE] == list(names[:5])
     assert [name for name, light in found.items() if light is None] == list(names[5:])
     table = load(SourceRequest(labels, labels="auto")).lighting
-    assert table is not None
     assert table.ambient + table.diffuse == 1
     unlit, layer = LightOptions(("none",)), SourceRequest(labels, labels="auto")
     assert load(SourceRequest(scan, tf="ct-bone", light=unlit)).lighting is None
@@ -176,23 +150,21 @@ def test_files_are_lit_by_default_in_memory_in_blocks_and_live(vvgt, tmp_path) -
         "flat": ("--live", "--light", "none"),
     }
     for name, more in ways.items():
-        done = vvgt("convert", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.ply")
-        assert done.code == 0, done.err
+        done = vvgt.ok("convert", tmp_path / "v.npy", *look, *more, "-o", tmp_path / f"{name}.ply")
         assert ("--light none omits it" in done.err) == (name != "flat")
         headers[name] = read_ply(tmp_path / f"{name}.ply")[1].light
     assert headers == dict.fromkeys(("a", "b", "live"), LabelTable.lighting) | {"flat": None}
     again = {"as": (), "new": ("--labels", "auto")}
     for name, more in again.items():  # a new table brings its light, the file's own look does not
         where = tmp_path / f"{name}.ply"
-        assert vvgt("recolor", tmp_path / "flat.ply", *more, "--opacity-unit-distance", 2, "-o", where).code == 0
+        vvgt.ok("recolor", tmp_path / "flat.ply", *more, "--opacity-unit-distance", 2, "-o", where)
         assert read_ply(where)[1].light == (LabelTable.lighting if more else None)
 
 
 def test_a_network_leaves_harmonics_as_they_are(folder, vvgt):
     call = ("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--steps", "8")
-    assert vvgt(*call, "-o", folder / "plain.ply").code == 0
-    result = vvgt(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
-    assert result.code == 0, result.err
+    vvgt.ok(*call, "-o", folder / "plain.ply")
+    vvgt.ok(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
     stages = {stage["name"]: stage for stage in json.loads((folder / "m.json").read_text())["stages"]}
     assert stages["network"]["psnr"] > 15
     assert read_ply(folder / "m.ply")[0].degree == 2

@@ -1,7 +1,5 @@
 """Options of several numbers as people write them, and words that are nearly right."""
 
-from __future__ import annotations
-
 import json
 from itertools import permutations
 from pathlib import Path
@@ -60,19 +58,15 @@ def test_the_command_line_takes_both_forms(vvgt) -> None:
     options = ("--volume", "v.raw", "--dims", "4,5,6", "--dtype", "uint8", "--overwrite")
     pictures = []
     for limits in (["20,90"], ["20", "90"]):
-        assert vvgt("tf", "show", "viridis", "-o", "a.png", *options, "--tf-range", *limits).code == 0
+        vvgt.ok("tf", "show", "viridis", "-o", "a.png", *options, "--tf-range", *limits)
         pictures.append(Path("a.png").read_bytes())
     assert pictures[0] == pictures[1]
 
 
 def test_a_name_with_line_breaks_stays_on_a_line(vvgt) -> None:
     np.save("a\nb\x85c.npy", blob((12, 12, 12)).data)
-    out = vvgt("info", "a\nb\x85c.npy")
-    assert out.code == 0
-    assert "name           a b c" in out.out.decode().split("\n")
-    done = vvgt("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--size", 32)
-    assert done.code == 0
-    lines = done.err.splitlines()
+    assert "name           a b c" in vvgt.ok("info", "a\nb\x85c.npy").out.decode().split("\n")
+    lines = vvgt.ok("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--size", 32).err.splitlines()
     assert sum(line.startswith("read ") and "a b c: 12 x 12 x 12" in line for line in lines) == 1
     assert sum(line.startswith("write ") and "d e.ply: " in line for line in lines) == 1
     assert "a b" in vvgt("init", "no\nsuch\nfile.nrrd", "-o", "a b.ply").error.replace("no such file.nrrd", "a b")
@@ -85,13 +79,12 @@ def test_raw_values_read_in_another_order_than_they_lie_in_are_told(vvgt, recwar
         data = np.fromfile("v.raw", np.float32).reshape(order[::-1])
         assert guess_dims(data) == (None if order == dims else dims)
         recwarn.clear()
-        assert vvgt("info", "v.raw", "--dims", *order, "--dtype", "float32").code == 0
+        vvgt.ok("info", "v.raw", "--dims", *order, "--dtype", "float32")
         assert ["did you mean --dims 40 28 20?" in str(w.message) for w in recwarn] == [True] * (order != dims)
 
 
 def test_of_noise_cubes_and_tiny_volumes_no_order_is_told() -> None:
-    rng = np.random.default_rng(0)
-    assert guess_dims(rng.random((20, 30, 40))) is None
+    assert guess_dims(np.random.default_rng(0).random((20, 30, 40))) is None
     assert guess_dims(blob((24, 24, 24)).data) is None
     assert guess_dims(np.arange(24.0).reshape(2, 3, 4)) is None
     assert guess_dims(np.full((20, 30, 40), np.nan)) is None

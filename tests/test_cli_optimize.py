@@ -1,7 +1,5 @@
 """`vvgt optimize`: nearer to the views, never worse, stopped by budgets and by Ctrl-C with a valid file."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -78,8 +76,7 @@ def test_methods_to_compare_with(call, method):
 
 
 def test_a_file_of_another_program_gets_no_comments(folder, call, vvgt, tmp_path):
-    gaussians = read_ply(folder / "in.ply")[0]
-    write_ply(tmp_path / "plain.ply", gaussians, PlyOptions(comments=False))
+    write_ply(tmp_path / "plain.ply", read_ply(folder / "in.ply")[0], PlyOptions(comments=False))
     result = vvgt("optimize", "plain.ply", "--views", folder / "views", "--steps", 0, "-o", "-", "-q")
     assert result.out == (tmp_path / "plain.ply").read_bytes()
 
@@ -91,7 +88,7 @@ def test_what_is_worse_is_not_written(folder, vvgt, tmp_path, monkeypatch):
     shutil.copy("mixed/transforms_test.json", "mixed/transforms_check.json")
     for image in Path("mixed/train").glob("*.exr"):
         write_exr(image, np.zeros((32, 32, 4), np.float32), overwrite=True)
-    assert vvgt("optimize", folder / "in.ply", "--views", folder / "views", "--steps", 40, "-o", "good.ply").code == 0
+    vvgt.ok("optimize", folder / "in.ply", "--views", folder / "views", "--steps", 40, "-o", "good.ply")
     args = ("good.ply", "--views", "mixed", "--steps", 400, "-o", "out.ply", "--report", "r.json")
     result = vvgt("optimize", *args)
     assert (result.code, "ended early" in result.err) == (0, True), result.err
@@ -157,7 +154,6 @@ def test_ctrl_c_writes_what_there_is(folder, tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-c", code, "optimize", *map(str, args)], stderr=subprocess.PIPE, env=environment, text=True
     )
-    assert child.stderr is not None
     said = [child.stderr.readline(), child.stderr.readline()]  # read, views: the descent begins
     assert said[1].startswith("views"), said
     time.sleep(5)  # kernels are loaded, on a busy machine too
@@ -172,7 +168,7 @@ def test_ctrl_c_writes_what_there_is(folder, tmp_path):
 def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, tmp_path, vvgt):
     world = PlyOptions(frame="world", up="x", scale=0.5, centre=(3.0, -2.0, 9.0))
     write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], world)
-    assert vvgt("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q").code == 0
+    vvgt.ok("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q")
     far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
     assert (same[1].made_for, same[1].rule) == (
         read_cameras(folder / "views" / "transforms_train.json")[0].width,
@@ -185,8 +181,7 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
 
 def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
     small = ("--size", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
-    result = vvgt("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
-    assert result.code == 0, result.err
+    vvgt.ok("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
     report = json.loads((tmp_path / "r.json").read_text())
     stages = {stage["name"]: stage for stage in report["stages"]}
     assert "back-projection" not in stages

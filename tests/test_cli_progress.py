@@ -1,7 +1,5 @@
 """What goes to standard error: stage lines always, bars only for someone who watches, nothing when quiet."""
 
-from __future__ import annotations
-
 import io
 import sys
 

@@ -1,7 +1,5 @@
 """Signals that end: within seconds from any stage, one line, nothing partial; a hangup counts unless it is ignored."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

@@ -1,7 +1,5 @@
 """Streams that are closed, full or pipes: talk that cannot be heard costs nothing, data that cannot go is one line."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import json
@@ -59,8 +57,7 @@ def test_data_that_cannot_be_written_is_one_line(line, told, tmp_path):
 @pytest.fixture
 def head(tmp_path: Path) -> Path:
     """A compressed volume and a function, in a folder of their own."""
-    values = np.arange(512, dtype=np.float32).reshape(8, 8, 8)
-    np.save(tmp_path / "head.npy", values)
+    np.save(tmp_path / "head.npy", np.arange(512, dtype=np.float32).reshape(8, 8, 8))
     (tmp_path / "head.npy.gz").write_bytes(gzip.compress((tmp_path / "head.npy").read_bytes()))
     points = [{"x": x, "rgb": [1, 1, 0], "opacity": 0.8 * x} for x in (0, 1)]
     (tmp_path / "tf.json").write_text(json.dumps({"range": [0, 511], "points": points}))

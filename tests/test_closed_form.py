@@ -1,7 +1,5 @@
 """The stage as a whole: invariants, extreme scenes, budgets, and how good the pictures are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -191,8 +189,7 @@ def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPa
 
     scene = scene_of(shapes.checkerboard(32, 32), Tent(0.5, 0.1))
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 5000)
-    level = base_level(scene, 400, 10**6)
-    assert len(base_cells(scene, exponents(scene.step, level)).index) <= 5000
+    assert len(base_cells(scene, exponents(scene.step, base_level(scene, 400, 10**6))).index) <= 5000
 
 
 def test_coarse_cells_still_make_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,8 +234,7 @@ def test_extremes(name: str) -> None:
     views, truth = (render_views(scene, cameras, EVERYWHERE) for cameras in (train, test))
     empty = score(start(scene, 1).take(np.arange(0)), test, truth)
     for method in METHODS:
-        begun = initialise(scene, VbmOptions(400, 32, method))
-        fitted, _ = backproject(begun, train, views)
+        fitted, _ = backproject(initialise(scene, VbmOptions(400, 32, method)), train, views)
         assert np.abs(fitted.means).max(initial=0) < 1.5
         assert 0 <= fitted.colors.min(initial=0) <= fitted.colors.max(initial=0) <= 2
         if method == "vbm":

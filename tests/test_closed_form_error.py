@@ -1,7 +1,5 @@
 """The pyramid cut by the error of pictures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colours by least squares, and where the image error is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -73,8 +71,7 @@ def test_twin_of_the_normal_equations() -> None:
     a = design(truth)
     right = a.T @ views[..., :3].reshape(-1, 3).astype(np.float64) + PRIOR * 0.5
     expected = np.linalg.solve(a.T @ a + PRIOR * np.eye(24), right)
-    solved = solve_colors(start, CAMERAS, views, rounds=30)
-    np.testing.assert_allclose(solved.colors, expected, atol=2e-4)
+    np.testing.assert_allclose(solve_colors(start, CAMERAS, views, rounds=30).colors, expected, atol=2e-4)
 
 
 @pytest.mark.usefixtures("all_rounds")
@@ -151,8 +148,7 @@ def test_nothing_to_mend() -> None:
 def test_colours_stay_in_range() -> None:
     truth = cloud(30)
     views = pictures(with_colors(truth, 9.0))
-    solved = solve_colors(truth, CAMERAS, views, rounds=8)
-    assert solved.colors.max() == BRIGHTEST
+    assert solve_colors(truth, CAMERAS, views, rounds=8).colors.max() == BRIGHTEST
     assert solve_colors(truth, CAMERAS, -views, rounds=8).colors.min() == 0
 
 

@@ -1,7 +1,5 @@
 """Light in closed form: harmonics of the head-light and of highlights, colours of lit cells, normals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

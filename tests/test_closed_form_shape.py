@@ -1,7 +1,5 @@
 """From moments to splats: opacity, rotation, shape, and the offset of opaque surfaces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -60,14 +58,12 @@ def test_inverse_dilogarithm() -> None:
 
 
 def test_peak_opacity_bounds_and_order() -> None:
-    rng = np.random.default_rng(0)
-    variances = 10.0 ** rng.uniform(-12, 2, (500, 3))
+    variances = 10.0 ** np.random.default_rng(0).uniform(-12, 2, (500, 3))
     for mass in (0.0, 1e-9, 1e-3, 1.0, 1e6):
         opacity = peak_opacity(np.full(500, mass), variances, 0.005)
         assert (opacity >= 0).all()
         assert (opacity <= MAX_ALPHA).all()
-    masses = np.logspace(-8, 3, 200)
-    rising = peak_opacity(masses, np.broadcast_to([1e-4, 2e-4, 4e-4], (200, 3)), 0.005)
+    rising = peak_opacity(np.logspace(-8, 3, 200), np.broadcast_to([1e-4, 2e-4, 4e-4], (200, 3)), 0.005)
     assert (np.diff(rising) >= 0).all()
     assert rising[0] == pytest.approx(MIN_ALPHA, rel=0.01)  # with no mass to show: just cut
     assert rising[-1] == pytest.approx(MAX_ALPHA)
@@ -165,8 +161,7 @@ def test_box_surrogate_is_the_best_fit() -> None:
 
 def surfaces(volume: Volume, tf=None):
     scene = scene_of(volume, tf or Above(1.0))
-    cells = base_cells(scene, np.zeros(3, np.int64))
-    return scene, opaque_field(cells, scene.step, scene.half)
+    return scene, opaque_field(base_cells(scene, np.zeros(3, np.int64)), scene.step, scene.half)
 
 
 def test_a_field_of_wider_cells_holds_their_means(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,8 +207,7 @@ def test_inset_leaves_the_inside_alone() -> None:
     deep = np.random.default_rng(0).uniform(-0.2, 0.2, (100, 3))
     np.testing.assert_array_equal(moved(opaque, deep, 0.03), 0)
     np.testing.assert_array_equal(moved(opaque, np.full((1, 3), 0.95), 0.03), 0)  # no body near
-    shallow = np.array([[0.58, 0, 0]])
-    np.testing.assert_array_equal(moved(opaque, shallow, 0.03, reach=0.0), 0)
+    np.testing.assert_array_equal(moved(opaque, np.array([[0.58, 0, 0]]), 0.03, reach=0.0), 0)
 
 
 @pytest.mark.parametrize("voxels", [3, 4, 6])
@@ -250,15 +244,13 @@ def test_covariances_are_flattened_along_the_normal_of_a_surface() -> None:
 
 def test_filled_cells_lie_flat_under_a_surface() -> None:
     """The shortest axis is the normal of an opaque ball, whose filled cells have no axes of their own."""
-    form = closed_form(scene_of(shapes.sphere(40, 0.6), Above(1.0)), 6000, 400)
-    splats = form.gaussians()
+    splats = closed_form(scene_of(shapes.sphere(40, 0.6), Above(1.0)), 6000, 400).gaussians()
     scales = np.exp(splats.log_scales.astype(np.float64))
     shortest = rotations(splats.quaternions)[np.arange(len(splats)), :, scales.argmin(axis=1)]
     place = np.linalg.norm(splats.means, axis=1)
     outer = place > 0.5
     assert outer.sum() > 2000
-    facing = np.abs((shortest * splats.means).sum(axis=1) / place)[outer]
-    assert np.quantile(facing, 0.05) > 0.9
+    assert np.quantile(np.abs((shortest * splats.means).sum(axis=1) / place)[outer], 0.05) > 0.9
 
 
 def test_translucent_scenes_have_no_surfaces() -> None:

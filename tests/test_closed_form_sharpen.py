@@ -1,7 +1,5 @@
 """Colours of the closed form against the blur of its Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -110,7 +108,6 @@ def test_what_is_extreme_stays_finite_and_within_its_range():
 @pytest.mark.usefixtures("unbounded")
 def test_harmonics_are_sharpened_as_colours_are():
     gaussians = cloud(300, 6, harmonics=8)
-    assert gaussians.harmonics is not None
     second = replace(gaussians, colors=np.ascontiguousarray(gaussians.harmonics[:, 3]))
     found, beside = sharpened(gaussians, np.ones(300), BOX).harmonics, sharpened(second, np.ones(300), BOX).colors
     np.testing.assert_allclose(found[:, 3], beside, atol=1e-6)
@@ -129,8 +126,7 @@ def test_what_is_hidden_takes_the_colour_of_what_hides_it():
     behind, front = cloud(400, 9), cloud(400, 10)
     both = replace(behind.take(np.arange(400)), colors=np.tile(np.float32(YELLOW), (400, 1)))
     both = concatenate([both, replace(front, colors=np.tile(np.float32(BLUE), (400, 1)))])
-    seen = np.concatenate([np.full(400, 0.01), np.ones(400)])
-    found = sharpened(both, seen, BOX).colors
+    found = sharpened(both, np.concatenate([np.full(400, 0.01), np.ones(400)]), BOX).colors
     assert np.abs(found[:400] - BLUE).mean() < 0.1 * np.abs(np.subtract(YELLOW, BLUE)).mean()
     alike = sharpened(both, np.ones(800), BOX).colors
     assert np.abs(alike[:400] - YELLOW).mean() < 0.3 * np.abs(np.subtract(YELLOW, BLUE)).mean()

@@ -1,7 +1,5 @@
 """Lines, sheets, single voxels and voxels of 1000:1 along every axis: they convert, and they show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

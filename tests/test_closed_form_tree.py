@@ -1,7 +1,5 @@
 """Visibility, the pyramid of moments and its cuts."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

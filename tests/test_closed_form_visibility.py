@@ -1,7 +1,5 @@
 """The march through cells against rays that are followed in small steps, in float64; cells of any edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Several clouds from Python: frames, looks and labels as one result, with the bytes of the command line."""
 
-from __future__ import annotations
-
 import html
 import json
 from pathlib import Path
@@ -11,6 +9,7 @@ import pytest
 
 import vvgt_cli as vvgt
 from tests.headers import uncertified
+from tests.refused import refused
 from tests.test_index import HOW, LINES, NAMES, SHOWN, TF, at  # noqa: F401 - a fixture
 from tests.test_pages import clouds, same
 
@@ -111,14 +110,11 @@ def test_what_several_clouds_cannot_do_is_refused_before_anything_is_written(at)
         ("x.obj", {}, "expected a name ending in"),
         ("none/x.ply", {}, "does not exist"),
     ):
-        with pytest.raises(vvgt.UsageError, match=words):
-            result.save(path, **how)
+        refused(vvgt.UsageError, words, result.save, path, **how)
     assert sorted(path.name for path in at.glob("x*")) == ["x_skin.ply"]
     with pytest.raises(KeyError, match="expected one of bone, skin"):
         result["bones"]
-    with pytest.raises(vvgt.UsageError, match="pass a mapping of names"):
-        vvgt.convert("ball.npy", ["bone.json", "bone.json"])
+    refused(vvgt.UsageError, "pass a mapping of names", vvgt.convert, "ball.npy", ["bone.json", "bone.json"])
     with pytest.raises(vvgt.UsageError, match="--split-labels with functions"):
         vvgt.convert("ball.npy", ["bone.json", "skin.json"], split_labels=True)
-    with pytest.raises(vvgt.UsageError, match="3 time steps"):
-        vvgt.convert("four.nii", ["bone.json", "skin.json"])
+    refused(vvgt.UsageError, "3 time steps", vvgt.convert, "four.nii", ["bone.json", "skin.json"])

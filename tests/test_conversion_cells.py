@@ -1,7 +1,5 @@
 """Cells by error: when they are cut, and when they are kept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

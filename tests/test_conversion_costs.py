@@ -1,7 +1,5 @@
 """What a conversion's stages are foreseen to cost."""
 
-from __future__ import annotations
-
 import pytest
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks

@@ -1,7 +1,5 @@
 """What `convert` decides to do: limits, estimates, and what is skipped."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import pytest
 from onnx_models import write_model
 from test_cli_infer import DARKER
 
+from tests.refused import refused
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
 from vvgt_cli.conversion.plan import Planner, check_memory
@@ -69,8 +68,7 @@ def drawn(size, enough):
 
 
 def done(tmp_path, fit=SMALL, **options):
-    request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options)
-    return convert(request, Console(quiet=True))
+    return convert(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True))
 
 
 def chosen(report):
@@ -159,8 +157,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
     check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 26)
     for pictures, size in ((0, 392), (400**2 * 32 * 23, 288)):  # with those that a series keeps
-        with pytest.raises(UsageError, match=f"--size 400.*--size {size} would fit"):
-            check_memory(found, pictures)
+        refused(UsageError, f"--size 400.*--size {size} would fit", check_memory, found, pictures)
 
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
@@ -171,8 +168,7 @@ def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkey
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
     check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 3e5 + views)
-    with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
-        check_memory(found)
+    refused(UsageError, "--max-gaussians 250000 would fit", check_memory, found)
     with pytest.raises(UsageError, match="--max-gaussians 125000 would fit"):  # a series keeps more
         check_memory(found, beside=lambda workload: 0.5 * each * workload.gaussians)
 
@@ -187,8 +183,7 @@ def test_no_steps_leave_back_projection():
 
 def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
     fit = FitOptions(200, 48, steps=0)
-    request = ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit)
-    initialise_only(request, Console(quiet=True))
+    initialise_only(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit), Console(quiet=True))
     alone = read_ply(tmp_path / "init.ply")[0]
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "back-projection")
     assert stage.kept
@@ -304,8 +299,7 @@ def test_views_come_in_sets():
     ],
 )
 def test_limits_that_cannot_be_are_refused(limits, line):
-    with pytest.raises(UsageError, match=line):
-        Limits(**limits)
+    refused(UsageError, line, Limits, **limits)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -315,22 +309,14 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
     assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
     assert 0.02e6 - 4500 < report.bytes <= 0.02e6  # room for a long legend is left
     assert (tmp_path / "a.ply").stat().st_size == report.bytes
-    with pytest.raises(UsageError, match="no Gaussian fits"):
-        done(tmp_path, limits=Limits(max_megabytes=0.001))
+    refused(UsageError, "no Gaussian fits", done, tmp_path, limits=Limits(max_megabytes=0.001))
 
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=10.0))
     assert names(report) == [
-        "read",
-        "scene",
-        "closed form",
-        "check views",
-        "write",
-        "test views",
-        "conditions",
-        "certificate",
-    ]
+        "read", "scene", "closed form", "check views", "write", "test views", "conditions", "certificate",
+    ]  # fmt: skip
     assert report.gaussians <= 400 // 8
     assert [name for name, _ in report.skipped[:2]] == ["cells by error", "refinement"]
     assert "Gaussians" in report.skipped[2][0]
@@ -368,8 +354,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
     assert "120 views of 48 px" in found.text()
     done(tmp_path)
-    with pytest.raises(UsageError, match="exists"):
-        plan_conversion(request, Console(quiet=True))
+    refused(UsageError, "exists", plan_conversion, request, Console(quiet=True))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
@@ -394,8 +379,7 @@ def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
     assert not stage.kept
     assert stage.psnr < stage.psnr_before
     assert worse.scores["psnr"] == plain.scores["psnr"]
-    with pytest.raises(UsageError, match="no such folder"):
-        done(tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
+    refused(UsageError, "no such folder", done, tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
 
 
 def test_without_gaussians_views_are_guessed_by_the_budget():

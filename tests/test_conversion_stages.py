@@ -1,7 +1,5 @@
 """Parts of the stages of a conversion: which views, how fine, and what viewers leave out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How often a conversion writes its file, as the plan counts it."""
 
-from __future__ import annotations
-
 import pytest
 
 from vvgt_cli.conversion.convert import plan_conversion

@@ -1,7 +1,5 @@
 """DICOM segmentations, written by highdicom: label maps with their own tables, over their scans; contours refused."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from pydicom.dataset import Dataset
 from pydicom.sr.codedict import codes
 from pydicom.uid import UID, generate_uid
 
+from tests.refused import refused
 from tests.test_volume_slices import header, write_series
 from vvgt_cli.dvr.layers import common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
@@ -147,17 +146,15 @@ def test_by_command(vvgt, tmp_path: Path) -> None:
     assert (colors[:, 0] - colors[:, 2] > 0.9).any()
     assert (colors[:, 2] - colors[:, 0] > 0.9).any()
     split = ("--split-labels", "-o", tmp_path / "s_{}.ply")
-    assert vvgt("convert", tmp_path / "s.dcm", *SMALL, *split).code == 0
+    vvgt.ok("convert", tmp_path / "s.dcm", *SMALL, *split)
     assert sorted(p.name for p in tmp_path.glob("s_*.ply")) == ["s_1-liver.ply", "s_2-spleen.ply"]
-    facts = vvgt("info", tmp_path / "s.dcm").out.decode()
-    assert "label_map" in facts
+    assert "label_map" in vvgt("info", tmp_path / "s.dcm").out.decode()
 
 
 def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     path = tmp_path / "s.dcm"
     write_seg(path, scan(tmp_path / "ct"), organs(overlap=True))
-    with pytest.raises(SeveralComponents, match="2 segments that overlap"):
-        read_volume(str(path))
+    refused(SeveralComponents, "2 segments that overlap", read_volume, str(path))
     source = load(SourceRequest(str(path)))
     grid = grid_of(source.layers, source.volume)
     both = organs(overlap=True).sum(axis=3) == 2
@@ -166,31 +163,25 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     i, j, k, _ = own @ [x, y, z, 1]
     assert grid[..., 3].max() == pytest.approx(grid[k, j, i, 3])
     assert grid[k, j, i, 0] == pytest.approx(grid[k, j, i, 2], rel=0.05)  # as much of red as of blue
-    one = read_volume(str(path), ReadOptions(component=1))
-    assert set(np.unique(one.data)) == {0, 2}
+    assert set(np.unique(read_volume(str(path), ReadOptions(component=1)).data)) == {0, 2}
     source = load(SourceRequest(str(path), ReadOptions(component=1)))
     assert [layer.tf.labels[-1].name for layer in source.layers] == ["spleen"]
-    with pytest.raises(UsageError, match="no segment 2; expected --component 0 to 1"):
-        read_volume(str(path), ReadOptions(component=2))
+    refused(UsageError, "no segment 2; expected --component 0 to 1", read_volume, str(path), ReadOptions(component=2))
 
 
 def test_what_is_no_label_map_is_refused_in_a_line(tmp_path: Path, monkeypatch) -> None:
     files = scan(tmp_path / "ct")
     write_seg(tmp_path / "f.dcm", files, organs() / 2.0, "FRACTIONAL")
-    with pytest.raises(DataError, match=r"of fractions; expected one of bits or of labels"):
-        read_volume(str(tmp_path / "f.dcm"))
-    with pytest.raises(DataError, match=r"expected a table of labels"):
-        read_labels(str(tmp_path / "ct" / "0.dcm"))
+    refused(DataError, r"of fractions; expected one of bits or of labels", read_volume, str(tmp_path / "f.dcm"))
+    refused(DataError, r"expected a table of labels", read_labels, str(tmp_path / "ct" / "0.dcm"))
     write_seg(tmp_path / "s.dcm", files, organs())
     whole = (tmp_path / "s.dcm").read_bytes()
     for size in (300, 1000, len(whole) // 2, len(whole) - 9):
         (tmp_path / "cut.dcm").write_bytes(whole[:size])
-        with pytest.raises(DataError, match=r"cut\.dcm"):
-            load(SourceRequest(str(tmp_path / "cut.dcm")))
+        refused(DataError, r"cut\.dcm", load, SourceRequest(str(tmp_path / "cut.dcm")))
     monkeypatch.setitem(sys.modules, "highdicom", None)
     for read in (read_volume, read_labels):
-        with pytest.raises(DataError, match=r"needs highdicom .*pip install 'vvgt\[dicom-seg\]'"):
-            read(str(tmp_path / "s.dcm"))
+        refused(DataError, r"needs highdicom .*pip install 'vvgt\[dicom-seg\]'", read, str(tmp_path / "s.dcm"))
 
 
 def test_folders_of_segmentations_and_contours_say_what_to_give(tmp_path: Path) -> None:
@@ -208,6 +199,5 @@ def test_folders_of_segmentations_and_contours_say_what_to_give(tmp_path: Path) 
         r"no DICOM images \(3 RTSTRUCT\).*of contours \(RTSTRUCT\) nothing is filled: export them as a label map or SEG"
     )
     for source in (tmp_path / "rt", tmp_path / "rt" / "a-1.dcm"):
-        with pytest.raises(DataError, match=said if source.is_dir() else said.replace("3", "1")):
-            read_volume(str(source))
+        refused(DataError, said if source.is_dir() else said.replace("3", "1"), read_volume, str(source))
     assert pydicom.dcmread(tmp_path / "rt" / "a-1.dcm").Modality == "RTSTRUCT"

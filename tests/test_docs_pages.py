@@ -1,7 +1,5 @@
 """The documentation holds what the program has: a page a command, every option, links that lead somewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
@@ -85,8 +83,7 @@ def test_links_to_sections_find_them(path):
 
 
 def test_the_index_leads_to_every_page():
-    text = (ROOT / "docs" / "index.md").read_text("utf-8")
-    pages = SITE["navigation"](text).splitlines()
+    pages = SITE["navigation"]((ROOT / "docs" / "index.md").read_text("utf-8")).splitlines()
     for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "commands").glob("*.md")]:
         assert page.name == "index.md" or page.relative_to(ROOT / "docs").with_suffix("").as_posix() in pages, page
 
@@ -102,8 +99,7 @@ def test_files_that_contributors_are_sent_to_are_there():
 def test_the_map_for_contributors_has_every_room_in_its_order_and_every_test_file():
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     table = text.partition("## Map of the package")[2].partition("\n\n| where")[0]
-    rows = re.findall(r"^\| (`.*?`) \| ", table, re.M)
-    assert tuple(re.findall(r"`(\w+)`", " ".join(rows))) == ROOMS
+    assert tuple(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?`) \| ", table, re.M)))) == ROOMS
     named = {path for name in re.findall(r"`(test_[\w*]+\.py)`", table) for path in ROOT.glob(f"tests/{name}")}
     assert [path.name for path in ROOT.glob("tests/test_*.py") if path not in named] == []
 

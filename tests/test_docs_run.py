@@ -1,7 +1,5 @@
 """What the pages show runs: Python of docs/python.md, commands of the tutorial and of the how-to, the notebook."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os
@@ -106,8 +104,7 @@ def run_blocks(page: str, vvgt) -> list[str]:
         for line in block.splitlines():
             words = shlex.split(line)
             assert words[0] == "vvgt", f"{page}: {line}: expected a vvgt command"
-            result = vvgt(*small(words[1:]))
-            assert result.code == 0, f"{line}\n{result.err}"
+            vvgt.ok(*small(words[1:]))
             done.append(line)
     return done
 

@@ -1,13 +1,12 @@
 """What the float64 twin rests on: closed forms, order of convergence; and what the kernel gains over plain stepping."""
 
-from __future__ import annotations
-
 import math
 
 import numba as nb
 import numpy as np
 import pytest
 
+from tests.test_dvr_render import LinearExtinction, smooth
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.layout import Optics, Voxels
@@ -28,32 +27,9 @@ def function(x, opacity, rgb=None):
     )
 
 
-class LinearExtinction:
-    """Extinction ``peak x`` per unit distance 1 on [0, 1], white; conforms to `TransferFunctionLike`."""
-
-    name = "linear"
-
-    def __init__(self, peak):
-        self.peak = peak
-
-    def opacity(self, x):
-        return -np.expm1(-self.peak * np.clip(x, 0, 1))
-
-    def color(self, x):
-        return np.ones((len(x), 3))
-
-    def node_range(self):
-        return 0.0, 1.0
-
-
 def along_x(scene, step):
     """The twin's (r, g, b, alpha) of the ray along x through the box's centre."""
     return march(scene, np.array([-5.0, 0, 0]), np.array([[1.0, 0, 0]]), step)[0]
-
-
-def smooth(n=12):
-    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij")
-    return np.exp(-2 * (x * x + 1.5 * y * y + 0.7 * z * z) + 0.4 * np.sin(3 * x + y))
 
 
 @pytest.mark.parametrize("depth", [1e-6, 1e-3, 1.0, 10.0])
@@ -62,15 +38,6 @@ def test_the_twin_is_exact_in_a_homogeneous_slab(depth, step):
     opacity = -math.expm1(-depth / 8)  # per voxel
     scene = Scene.build(Volume(np.ones((3, 5, 8))), function([0.0, 1.0], [opacity, opacity], 0.5 * WHITE), 1.0)
     np.testing.assert_allclose(along_x(scene, step), -math.expm1(-depth) * np.array([0.5, 0.5, 0.5, 1]), rtol=1e-9)
-
-
-@pytest.mark.parametrize("step", [0.25, 0.5])
-def test_the_twin_is_exact_on_a_linear_ramp(step):
-    n, peak = 9, 0.3
-    volume = Volume(np.broadcast_to(np.linspace(0, 1, n), (n, n, n)).copy())
-    scene = Scene.build(volume, LinearExtinction(peak), 1.0)
-    depth = peak * (0.5 * (n - 1) + 0.5)  # between the centres, and the rim of value 1
-    assert along_x(scene, step)[3] == pytest.approx(-math.expm1(-depth), abs=1e-12)
 
 
 def test_a_gaussian_blob_is_met_to_1e6_by_the_twin_and_by_the_kernel():
@@ -87,7 +54,7 @@ def test_a_gaussian_blob_is_met_to_1e6_by_the_twin_and_by_the_kernel():
 
 
 def test_the_order_of_convergence_of_the_twin_is_two():
-    scene = Scene.build(Volume(smooth()), function([0.0, 1.0], [0, 0.5], [[0, 0, 1], [1, 0, 0]]), 1.0)
+    scene = Scene.build(Volume(smooth(12)), function([0.0, 1.0], [0, 0.5], [[0, 0, 1], [1, 0, 0]]), 1.0)
     camera = look_at((2.2, -1.6, 1.1), width=6, height=6)
     exact = render_view_reference(scene, camera, step=1 / 128)
     steps = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])

@@ -1,7 +1,5 @@
 """Renderers behind one switch: VTK against the kernel, errors of one line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

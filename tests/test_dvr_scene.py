@@ -1,7 +1,5 @@
 """Scenes: stored values of every type, the empty-space map, the optical tables."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numba as nb
@@ -57,8 +55,7 @@ def test_every_type_and_byte_order_gives_the_same_picture(kind):
     expected = view(Volume(data.astype(np.float32)), tf)
     assert expected.max() > 0.1
     for order in "<>":
-        picture = view(Volume(data.astype(order + kind)), tf)
-        np.testing.assert_allclose(picture, expected, atol=2e-6)
+        np.testing.assert_allclose(view(Volume(data.astype(order + kind)), tf), expected, atol=2e-6)
 
 
 @pytest.mark.parametrize(("slope", "intercept"), [(0.5, -3.0), (-2.0, 7.0), (1e-20, 0.0)])
@@ -169,8 +166,7 @@ def test_the_empty_map_is_the_distance_to_the_nearest_visible_brick(shape):
 def test_bricks_without_a_finite_voxel_are_empty():
     data = np.full((8, 8, 24), np.nan, np.float32)
     data[:, :, 20:] = 1
-    scene = Scene.build(Volume(data), Ramp(0, 0.5), 1.0)
-    np.testing.assert_array_equal(scene.empty, [[[2, 1, 0]]])
+    np.testing.assert_array_equal(Scene.build(Volume(data), Ramp(0, 0.5), 1.0).empty, [[[2, 1, 0]]])
 
 
 @pytest.mark.parametrize("slope", [1.0, -0.25])

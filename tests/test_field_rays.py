@@ -1,7 +1,5 @@
 """Pictures of a volume in blocks: rays cut at pieces of it compose to those of the renderer, whatever the blocks."""
 
-from __future__ import annotations
-
 import json
 import re
 from contextlib import contextmanager
@@ -170,8 +168,7 @@ def test_pieces_follow_from_the_volume_and_come_front_to_back():
     assert sorted(order) == list(range(len(pieces)))
     ranks = np.empty(len(pieces))
     ranks[order] = np.arange(len(pieces))
-    direction = np.array([-0.9, 0.1, 0.5])
-    points = eye + np.arange(0, 120, 0.5)[:, None] * direction
+    points = eye + np.arange(0, 120, 0.5)[:, None] * np.array([-0.9, 0.1, 0.5])
     inside = points[((points >= -0.5) & (points < np.array(pieces.dims) - 0.5)).all(axis=1)]
     index = np.floor((inside + 0.5) / 16).astype(int)
     met = [ranks[(k * pieces.shape[1] + j) * pieces.shape[0] + i] for i, j, k in index]
@@ -184,8 +181,7 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     notes = []
     for blocks in ("32", "128"):
-        run = vvgt("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
-        assert run.code == 0
+        run = vvgt.ok("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
         notes.append(re.search(r"PSNR ([\d.]+) dB .* 3 views of 150 px, through all voxels", run.err))
         scores = json.loads(run.out)["scores"]
         assert f"{scores['psnr']:.2f}" == notes[-1][1]
@@ -203,11 +199,9 @@ def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
 def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, monkeypatch):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
-    assert vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64").code == 0
+    vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.A_GAUSSIAN", 1 << 40)
-    run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
-    assert run.code == 0
-    assert "skipped: test views" in run.err
+    assert "skipped: test views" in vvgt.ok("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64").err
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
@@ -219,6 +213,4 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
         ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "blocks of moments"),
         ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
     ):
-        run = vvgt(command, path, *options)
-        assert run.code == 2, run.err
-        assert word in run.err
+        assert word in vvgt.fails(2, command, path, *options)

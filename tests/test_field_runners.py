@@ -1,7 +1,5 @@
 """Processes that do blocks: the same ones in all passes, and none that is left."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Writing: one run at a time to a name, disks that are full, and what is left where a run is killed."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal
@@ -40,9 +38,9 @@ def test_the_second_of_two_runs_to_one_name_fails_at_once(tmp_path, vvgt, monkey
     assert (result.code, result.error) == (
         2, "vvgt: error: a.ply: another run is at work on it; wait until that has ended, or give another name",
     )  # fmt: skip
-    assert vvgt(*INIT, "-o", "b.ply").code == 0
+    vvgt.ok(*INIT, "-o", "b.ply")
     holder.communicate("\n")
-    assert vvgt(*INIT, "-o", "a.ply").code == 0
+    vvgt.ok(*INIT, "-o", "a.ply")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
 
 
@@ -65,10 +63,9 @@ def test_two_equal_series_in_one_folder(tmp_path, vvgt, monkeypatch):
     holder = process(HOLD.replace("a.ply", "manifest.json"), tmp_path)
     assert holder.stdout.readline() == "held\n"
     line = ("convert", "f*.raw", *INIT[2:], "--steps", "0", "-o", "p_{}.ply")
-    result = vvgt(*line)
-    assert (result.code, "manifest.json: another run is at work on it" in result.error) == (2, True)
+    assert "manifest.json: another run is at work on it" in vvgt.fails(2, *line)
     holder.communicate("\n")
-    assert vvgt(*line).code == 0
+    vvgt.ok(*line)
 
 
 def test_where_there_are_no_locks_everyone_may_write(tmp_path, monkeypatch):
@@ -86,8 +83,8 @@ def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     disk = {"f_frsize": 512, "f_blocks": 1000, "f_bavail": 4}
     monkeypatch.setattr(os, "statvfs", lambda folder: SimpleNamespace(**disk))
-    result = vvgt("convert", *INIT[1:], "-o", "a.ply")
-    assert (result.code, "No space left on device: needs 4096 bytes, 2048 are free" in result.error) == (1, True)
+    result = vvgt.fails(1, "convert", *INIT[1:], "-o", "a.ply")
+    assert "No space left on device: needs 4096 bytes, 2048 are free" in result
     disk["f_bavail"] = 8  # enough to begin with; not for the Gaussians that are found
     result = vvgt("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "-o", "a.ply")
     assert (result.code, "No space left on device" in result.error) == (1, True)

@@ -1,7 +1,5 @@
 """Other programs' formats of Gaussians: what each keeps, what it costs, and what it does with bad input."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import re
@@ -15,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats, ready
@@ -130,8 +129,7 @@ def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_
 
 
 def test_an_old_openusd_is_reported(monkeypatch):
-    usd = pytest.importorskip("pxr.Usd")
-    monkeypatch.setattr(usd, "GetVersion", lambda: (0, 25, 11))
+    monkeypatch.setattr(pytest.importorskip("pxr.Usd"), "GetVersion", lambda: (0, 25, 11))
     with pytest.raises(
         DataError, match=r"OpenUSD 25\.11 does not support ParticleField3DGaussianSplat.*usd-core>=26\.3"
     ):
@@ -140,23 +138,19 @@ def test_an_old_openusd_is_reported(monkeypatch):
 
 @pytest.mark.parametrize("name", ["a.obj", "a", "a.spz.gz", "a.splat"])
 def test_unknown_endings_are_refused(name, tmp_path, vvgt):
-    result = vvgt("convert", "example:blob:8", "-o", tmp_path / name)
-    assert result.code == 2
-    assert ".spz" in result.error
-    assert ".html" in result.error
+    result = vvgt.fails(2, "convert", "example:blob:8", "-o", tmp_path / name)
+    assert ".spz" in result
+    assert ".html" in result
 
 
 def test_a_size_limit_is_of_a_ply(tmp_path, vvgt):
-    result = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.spz", "--max-size", 1)
-    assert result.code == 2
-    assert "--max-gaussians" in result.error
+    assert "--max-gaussians" in vvgt.fails(2, "convert", "example:blob:8", "-o", tmp_path / "a.spz", "--max-size", 1)
 
 
 def test_positions_that_spz_cannot_hold(tmp_path):
     far = cloud(10)
     far = Gaussians(1e8 * far.means, far.log_scales, far.quaternions, far.opacity_logits, far.colors)
-    with pytest.raises(DataError, match="expected less than"):
-        encoded(format_of("a.spz"), far, PlyOptions(), "a.spz")
+    refused(DataError, "expected less than", encoded, format_of("a.spz"), far, PlyOptions(), "a.spz")
 
 
 def test_files_of_other_programs_have_no_comments(tmp_path):
@@ -211,8 +205,7 @@ def test_a_usd_stage_is_turned_upright():
     from pxr import Sdf, UsdGeom
 
     layer = Sdf.Layer.CreateAnonymous(".usdc")
-    path = Path(layer.realPath or "/nonexistent")
-    assert not path.exists()
+    assert not Path(layer.realPath or "/nonexistent").exists()
     content = encoded(format_of("a.usdc"), cloud(20), PlyOptions(), "a.usdc")
     import tempfile
 
@@ -227,25 +220,21 @@ def test_a_usd_stage_is_turned_upright():
 
 def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
-    result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
-    assert result.code == 0, result.err
+    result = vvgt.ok("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     found = re.search(r"PSNR ([\d.]+) dB, a \.ply would have ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
     after, before, cost = map(float, found.groups())
     assert cost == pytest.approx(before - after, abs=0.011)
     assert 0 < before < 60
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
-    scored = vvgt("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis", "--json",
-                  "--no-conditions", "--step", 0.5)  # fmt: skip
-    assert scored.code == 0, scored.err
+    assert json.loads((tmp_path / "r.json").read_text())["bytes"] == (tmp_path / "a.spz").stat().st_size
+    scored = vvgt.ok("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis",
+                     "--json", "--no-conditions", "--step", 0.5)  # fmt: skip
     assert json.loads(scored.out)["size"] == 64
 
 
 def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
-        result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
-        assert result.code == 0, result.err
+        result = vvgt.ok("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
         found = re.search(r"([\d.]+|inf) dB from the Gaussians before writing, 3 views of 64 px", result.err)
         assert (found is None) == (least is None)
         assert least is None or float(found[1]) > least, result.err
@@ -253,7 +242,7 @@ def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
     for name in ("a.ply", "b.spz", "b.html"):
         folder = tmp_path / f"{name}-views"
-        assert vvgt("render", tmp_path / name, "--orbit", 1, "--size", 64, "-o", folder).code == 0
+        vvgt.ok("render", tmp_path / name, "--orbit", 1, "--size", 64, "-o", folder)
     pictures = [read_png(tmp_path / f"{name}-views" / "orbit_000.png") for name in ("a.ply", "b.spz", "b.html")]
     assert psnr(pictures[0], pictures[1]) > 30
     assert psnr(pictures[0], pictures[2]) > 35
@@ -273,8 +262,7 @@ def test_the_page_is_one_small_file(tmp_path):
     assert "</script><b>" not in text
     assert not re.findall(r"""(?:src|href)=["']?(?!data:)\w""", text)  # nothing is fetched
     (tmp_path / "b.html").write_text("<!doctype html><title>another</title>")
-    with pytest.raises(DataError, match="a page without Gaussians"):
-        read_splats(tmp_path / "b.html")
+    refused(DataError, "a page without Gaussians", read_splats, tmp_path / "b.html")
 
 
 def test_the_licences_of_what_the_page_holds_are_beside_it():
@@ -354,10 +342,8 @@ def test_records_of_spz_4(tmp_path):
     other = struct.pack("<II", 0x12340001, 3) + b"abc"
     assert given(record, other + record) == "x"  # skipped
     assert given(record, b"") == "x"
-    with pytest.raises(DataError, match="axes of kind 04"):
-        given(record, record[:8] + b"\4\0\0\0")
-    with pytest.raises(DataError, match="a record of"):
-        given(record, record[:4] + b"\xff\xff\0\0")
+    refused(DataError, "axes of kind 04", given, record, record[:8] + b"\4\0\0\0")
+    refused(DataError, "a record of", given, record, record[:4] + b"\xff\xff\0\0")
 
 
 def test_hostile_spz_are_one_line_before_memory_is_taken():
@@ -366,8 +352,7 @@ def test_hostile_spz_are_one_line_before_memory_is_taken():
         bytearray(struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 4 * 10**9, 0, 12, 0, 5, 32)),
     )
     content += b"".join(struct.pack("<QQ", 0, width * 4 * 10**9) for width in (9, 1, 3, 3, 4))
-    with pytest.raises(DataError, match=r"4,000,000,000 Gaussians: needs .* of memory"):
-        known.read(bytes(content), "a.spz")
+    refused(DataError, r"4,000,000,000 Gaussians: needs .* of memory", known.read, bytes(content), "a.spz")
     with pytest.raises(DataError, match=r"a\.spz: cannot be read as an \.spz"):
         known.read(b"\x1f\x8b\x08\x10" + b"a" * 40, "a.spz")  # a comment without its end
 
@@ -379,8 +364,7 @@ def test_a_stream_of_spz_4_that_ends_early_is_one_line():
     (size, whole), short = struct.unpack_from("<QQ", content, table), bytes(zstd.compress(bytes(200), 1))
     end = len(content) - sum(struct.unpack_from("<Q", content, table + 16 * k)[0] for k in range(1, content[15]))
     changed = content[:table] + struct.pack("<QQ", len(short), whole) + content[table + 16 : end - size] + short
-    with pytest.raises(DataError, match=r"stream 0: truncated; expected 540 bytes"):
-        known.read(changed + content[end:], "a.spz")
+    refused(DataError, r"stream 0: truncated; expected 540 bytes", known.read, changed + content[end:], "a.spz")
 
 
 @pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])

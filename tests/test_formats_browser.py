@@ -1,7 +1,5 @@
 """The page of `vvgt view`, and the one in a file, in a real browser that reaches nothing but its own address."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,8 +43,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def ours(file: Path) -> np.ndarray:
     """As `vvgt render --orbit` draws its first view, by the file's rule; the file is not turned."""
-    camera = orbit_views(1, size=SIZE)[0]
-    return render(read_ply(file)[0], camera, rule="inria")[..., :3]
+    return render(read_ply(file)[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
 
 
 def test_view_shows_what_render_draws(file: Path, tmp_path: Path) -> None:
@@ -80,8 +77,7 @@ def test_a_series_goes_to_its_frames(file: Path, tmp_path: Path) -> None:
     with shown("f*.ply", folder=tmp_path) as (_, url):
         shot, noted = shoot(url, tmp_path, frame=1)
     assert noted["frames"] == 2
-    expected = render(white, orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
-    assert psnr(expected, shot) > 38
+    assert psnr(render(white, orbit_views(1, size=SIZE)[0], rule="inria")[..., :3], shot) > 38
     assert psnr(ours(file), shot) < 25
 
 

@@ -1,7 +1,5 @@
 """The server of `vvgt view`: what it hands out, and to whom; how it ends."""
 
-from __future__ import annotations
-
 import gzip
 import http.client
 import json
@@ -84,8 +82,7 @@ def test_the_page_and_its_files_are_handed_out(site):
      "/..", "/{}x/"],
 )  # fmt: skip
 def test_other_paths_get_nothing(site, path):
-    word = urlsplit(site).path.strip("/")
-    assert ask(site, path.format(word))[:2] == (404, b"")
+    assert ask(site, path.format(urlsplit(site).path.strip("/")))[:2] == (404, b"")
 
 
 @pytest.mark.parametrize(
@@ -154,7 +151,6 @@ def shown(*args: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], str
         env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     try:
-        assert child.stdout is not None
         yield child, child.stdout.readline().strip()
     finally:
         child.kill()
@@ -165,8 +161,7 @@ def test_view_shows_a_series_and_ends_on_an_interrupt(tmp_path):
     for k in (0, 1, 10, 2):
         write_ply(tmp_path / f"run_{k}.ply", cloud(shift=k / 100), PlyOptions(up="x"))
     with shown("run_*.ply", folder=tmp_path) as (child, url):
-        page = ask(url)[1].decode()
-        scene = json.loads(re.search(r'id="scene">(.*?)</script>', page)[1])
+        scene = json.loads(re.search(r'id="scene">(.*?)</script>', ask(url)[1].decode())[1])
         assert [frame["name"] for frame in scene["frames"]] == ["run_0.ply", "run_1.ply", "run_2.ply", "run_10.ply"]
         path = urlsplit(url).path
         for k, frame in zip((0, 1, 2, 10), scene["frames"], strict=True):

@@ -1,7 +1,5 @@
 """From files of any orientation to Gaussians, views and back: the right place, the right way round and up."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 from dataclasses import replace
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests import anatomy
+from tests.random_clouds import turns
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
@@ -52,8 +51,7 @@ def clouds(cloud: Gaussians) -> np.ndarray:
 
 
 def init(vvgt, source: object, output: str, *options: object) -> tuple[Gaussians, PlyHeader]:
-    result = vvgt("init", source, "--tf", "tf.json", *SMALL, "-o", output, *options)
-    assert result.code == 0, result.err
+    vvgt.ok("init", source, "--tf", "tf.json", *SMALL, "-o", output, *options)
     return read_ply(output)
 
 
@@ -130,14 +128,8 @@ def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:
 def covariance(cloud: Gaussians, centre: np.ndarray) -> np.ndarray:
     """Of all Gaussians within 8 mm, their own extents included."""
     near = cloud.take(np.flatnonzero(np.linalg.norm(cloud.means - centre, axis=1) < 8))
-    w, x, y, z = (near.quaternions / np.linalg.norm(near.quaternions, axis=1, keepdims=True)).T.astype(float)
-    rotation = np.array(
-        [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
-    ).transpose(2, 0, 1)  # fmt: skip
-    sigma = np.exp(near.log_scales.astype(float))
-    own = np.einsum("kab,kb,kcb->kac", rotation, sigma**2, rotation)
+    turned, sigma = turns(near.quaternions), np.exp(near.log_scales.astype(float))
+    own = np.einsum("kab,kb,kcb->kac", turned, sigma**2, turned)
     mass = sigma.prod(axis=1) / (1 + np.exp(-near.opacity_logits.astype(float)))
     away = near.means - np.average(near.means, axis=0, weights=mass)
     return np.average(own + away[:, :, None] * away[:, None, :], axis=0, weights=mass)
@@ -174,7 +166,7 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     Path("front.json").write_text(transforms_json([FRONT]))
     for frame in ("unit", "world"):
         _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame)
-        assert vvgt("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q").code == 0
+        vvgt.ok("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q")
         assert_reads_right(read_png(f"{frame}/front.png")[..., 3], frame)
         assert header.up == ("z" if frame == "unit" else "none")
     # as SuperSplat shows it: PLY (x, y, z) at (-x, -y, z), +y up; the eye before it, at the patient's front
@@ -183,10 +175,9 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     assert_reads_right(render(shown, eye)[..., 3], "viewer")
     # the reference renderer, and the points that trainers start from
     options = ("--tf", "tf.json", "--cameras", "front.json", "--format", "both", "-o", "views", "-q")
-    assert vvgt("render-views", "f.nii", *options).code == 0
+    vvgt.ok("render-views", "f.nii", *options)
     assert_reads_right(read_png("views/train/front.png")[..., 3], "reference")
-    points = read_points(Path("views/points3d.ply"))
-    assert_reads_right(splatted(points), "points", 0.5)
+    assert_reads_right(splatted(read_points(Path("views/points3d.ply"))), "points", 0.5)
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -249,7 +240,7 @@ def test_an_orbit_circles_the_way_up(vvgt, up: str) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("b"), anatomy.balls(affine), affine)
     init(vvgt, "b.nii", "b.ply", "--up", up)
-    assert vvgt("render", "b.ply", "--orbit", 5, "--size", 32, "-o", "turn", "-q").code == 0
+    vvgt.ok("render", "b.ply", "--orbit", 5, "--size", 32, "-o", "turn", "-q")
     towards = np.array({"inferior": (0, 0, -1), "left": (-1, 0, 0), "y": (0, 1, 0)}.get(up, (0, 0, 1)), float)
     for camera in read_cameras("turn/transforms.json"):
         assert camera.position @ towards == pytest.approx(3 * np.sin(np.radians(20)), abs=1e-6)
@@ -265,11 +256,8 @@ def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
 
 
 def evaluated(vvgt, ply: str, volume: str, *options: str) -> dict:
-    result = vvgt(
-        "evaluate", ply, "--volume", volume, "--tf", "tf.json", "--size", 48, "--no-conditions", "--step", 0.5,
-        "--json", *options,
-    )  # fmt: skip
-    assert result.code == 0, result.err
+    how = "--tf tf.json --size 48 --no-conditions --step 0.5 --json"
+    result = vvgt.ok("evaluate", ply, "--volume", volume, how, *options)
     return json.loads(result.out)["scores"] | {"said": result.err}
 
 
@@ -304,12 +292,10 @@ def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:
     affine = anatomy.place(anatomy.OBLIQUE * (1, -1, 1))
     anatomy.nifti(Path("v"), anatomy.letter(affine) + anatomy.balls(affine), affine)
     views = ("--views", 8, "--test-views", 2, "--size", 48, "-o", "views", "-q")
-    assert vvgt("render-views", "v.nii", "--tf", "tf.json", *views).code == 0
+    vvgt.ok("render-views", "v.nii", "--tf", "tf.json", *views)
     init(vvgt, "v.nii", "in.ply")
-    result = vvgt("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
-    assert result.code == 0, result.err
-    report = json.loads(Path("r.json").read_text())
-    assert report["scores"]["psnr"] > 24
+    vvgt.ok("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
+    assert json.loads(Path("r.json").read_text())["scores"]["psnr"] > 24
     before, after = (read_ply(name)[1] for name in ("in.ply", "out.ply"))
     assert (after.affine, after.space, after.up, after.centre) == (before.affine, "RAS", "z", before.centre)
     assert evaluated(vvgt, "out.ply", "v.nii")["psnr"] > evaluated(vvgt, "in.ply", "v.nii")["psnr"]
@@ -332,8 +318,7 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
         anatomy.nifti(Path(name), both[index[..., 2], index[..., 1], index[..., 0]], affine)
         options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png")
         options += ("-o", f"{name}.ply")
-        result = vvgt("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
-        assert result.code == 0, result.err
+        vvgt.ok("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
         pictures.append(read_png(f"{name}.png"))
     reference = slice(0, 64)
     np.testing.assert_allclose(pictures[0][:, reference], pictures[1][:, reference], atol=0.02)

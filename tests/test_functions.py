@@ -1,7 +1,5 @@
 """`vvgt convert` with several transfer functions: one file each, the volume read once."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -22,23 +20,20 @@ def functions(tmp_path):
 def test_each_function_gets_the_file_that_it_gets_alone(vvgt, tmp_path, functions):
     bone, skin = functions
     out = str(tmp_path / "blob_{}.ply")
-    done = vvgt("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
     assert done.err.count("volume ") == 1
     assert "function 2 of 2" in done.err
     for name, tf in (("bone", bone), ("skin", skin)):
         alone = tmp_path / f"alone-{name}.ply"
-        assert vvgt("convert", "example:blob:16", "--tf", tf, "-o", str(alone), *HOW).code == 0
+        vvgt.ok("convert", "example:blob:16", "--tf", tf, "-o", str(alone), *HOW)
         assert uncertified(tmp_path / f"blob_{name}.ply") == uncertified(alone)
-    again = vvgt("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
-    assert (again.code, "blob_bone.ply" in again.err) == (2, True)
+    assert "blob_bone.ply" in vvgt.fails(2, "convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
 
 
 def test_reports_and_previews_have_the_name_too(vvgt, tmp_path, functions):
     names = [str(tmp_path / name) for name in ("{}.ply", "{}.report.json", "{}.png")]
     line = ("convert", "example:blob:16", "--tf", functions[0], "--tf", functions[1], *HOW)
-    done = vvgt(*line, "-o", names[0], "--report", names[1], "--preview", names[2])
-    assert done.code == 0, done.err
+    vvgt.ok(*line, "-o", names[0], "--report", names[1], "--preview", names[2])
     for name in ("bone", "skin"):
         assert json.loads((tmp_path / f"{name}.report.json").read_text())["transfer_function"]["name"]
         assert (tmp_path / f"{name}.png").stat().st_size > 0
@@ -67,5 +62,6 @@ def test_functions_of_one_name_are_refused(vvgt, tmp_path, functions):
     twin = tmp_path / "other" / "bone.json"
     twin.write_text((tmp_path / "bone.json").read_text())
     for output in ("{}.ply", "page.html"):
-        done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / output))
-        assert (done.code, "expected one name each" in done.err) == (2, True)
+        twins = ("--tf", functions[0], "--tf", twin, "-o", tmp_path / output)
+        done = vvgt.fails(2, "convert", "example:blob:16", *twins)
+        assert "expected one name each" in done

@@ -1,7 +1,5 @@
 """Every reader of ours against damaged files (tests/fuzz.py), in a process of their own; 100,000 each with --long."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Gaussians of other programs: rows that cannot be drawn, compressed files of SuperSplat 1, `.splat` and `.ksplat`."""
 
-from __future__ import annotations
-
 import io
 import json
 import warnings
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as library
+from tests.refused import refused
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -129,7 +128,7 @@ def test_splat(vvgt: Callable, tmp_path: Path) -> None:
     opacity = [1 / (1 + np.exp(-g.opacity_logits.astype(float))) for g in (found, expected)]
     np.testing.assert_allclose(*opacity, atol=1 / 255)
     assert json.loads(vvgt("info", path, "--json").out)["format"] == ".splat"
-    assert vvgt("render", path, "-o", tmp_path / "r", "--size", 32, "--orbit", 1).code == 0
+    vvgt.ok("render", path, "-o", tmp_path / "r", "--size", 32, "--orbit", 1)
     flat = GOOD.copy()
     flat[3, 7] = -np.inf
     path.write_bytes(splat(flat))
@@ -140,14 +139,12 @@ def test_splat(vvgt: Callable, tmp_path: Path) -> None:
 def test_what_is_no_splat_and_what_is_not_written(vvgt: Callable, tmp_path: Path) -> None:
     for content in (b"", splat(GOOD)[:-1]):
         (tmp_path / "a.splat").write_bytes(content)
-        with pytest.raises(DataError, match=r"expected a .splat of 32 bytes a Gaussian"):
-            read_splats(tmp_path / "a.splat")
+        refused(DataError, r"expected a .splat of 32 bytes a Gaussian", read_splats, tmp_path / "a.splat")
     (tmp_path / "a.ksplat").write_bytes(bytes(4096))
     for command in ("info", "check", "view"):
         assert "a.ksplat out.ply" in vvgt(command, tmp_path / "a.ksplat").error
     (tmp_path / "a.ply").write_bytes(ply(GOOD))
-    done = vvgt("optimize", tmp_path / "a.ply", "--volume", "example:blob:16", "-o", tmp_path / "b.splat")
-    assert done.code == 2, done.err
+    vvgt.fails(2, "optimize", tmp_path / "a.ply", "--volume", "example:blob:16", "-o", tmp_path / "b.splat")
     assert not (tmp_path / "b.splat").exists()
 
 
@@ -220,8 +217,7 @@ def test_columns_are_found_by_name(tmp_path: Path, ranges: list[str]) -> None:
     ],
 )
 def test_faulty_compressed_files(tmp_path: Path, content: bytes, said: str) -> None:
-    with pytest.raises(DataError, match=said):
-        read(tmp_path, content)
+    refused(DataError, said, read, tmp_path, content)
 
 
 def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Optics grids: against the float64 twin, quadrature, the scalar scene that they come from, and themselves turned."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,8 +141,7 @@ def test_first_moments_converge_to_quadrature() -> None:
 
 
 def test_cuts_keep_the_mass() -> None:
-    form = closed_form(grid_scene(random_grid((20, 20, 20), share=0.8)), 300, 64)
-    require_cuts_keep_mass(form.tree)
+    require_cuts_keep_mass(closed_form(grid_scene(random_grid((20, 20, 20), share=0.8)), 300, 64).tree)
 
 
 def test_the_same_bytes_twice_and_turned_volumes_are_as_good() -> None:

@@ -1,7 +1,5 @@
 """The page in a headset: an emulated one, both eyes beside our own drawing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

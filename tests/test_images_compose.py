@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.images import contact_sheet, over, side_by_side
@@ -13,8 +14,7 @@ def test_over_black_white_and_colour():
     np.testing.assert_allclose(over(image), [[[0.2, 0.1, 0.0], [0, 0, 0]]], atol=1e-7)
     np.testing.assert_allclose(over(image, 1.0), [[[0.7, 0.6, 0.5], [1, 1, 1]]], atol=1e-7)
     np.testing.assert_allclose(over(image, (0, 0.5, 1)), [[[0.2, 0.35, 0.5], [0, 0.5, 1]]], atol=1e-7)
-    with pytest.raises(DataError, match="four channels"):
-        over(np.zeros((2, 2, 3)))
+    refused(DataError, "four channels", over, np.zeros((2, 2, 3)))
 
 
 def test_side_by_side_holds_both_and_the_difference():
@@ -23,8 +23,7 @@ def test_side_by_side_holds_both_and_the_difference():
     assert strip.shape == (2, 9, 3)
     np.testing.assert_allclose(strip[0, [0, 3, 6], 0], [0.5, 0.25, 0.5])
     assert side_by_side(left, right, gain=100)[..., 6:, :].max() == 1
-    with pytest.raises(DataError, match="same size"):
-        side_by_side(left, right[:1])
+    refused(DataError, "same size", side_by_side, left, right[:1])
 
 
 def test_contact_sheet_places_images_row_by_row():
@@ -36,10 +35,8 @@ def test_contact_sheet_places_images_row_by_row():
     assert (sheet[6:, 4:] == 1).all()  # the place left over
     assert contact_sheet(images).shape == (2 * 2 + 4, 3 * 3 + 8, 3)
     for bad in ([], [np.zeros((2, 2, 3)), np.zeros((2, 3, 3))]):
-        with pytest.raises(DataError, match="one size"):
-            contact_sheet(bad)
-    with pytest.raises(DataError, match="0 columns"):
-        contact_sheet(images, columns=0)
+        refused(DataError, "one size", contact_sheet, bad)
+    refused(DataError, "0 columns", contact_sheet, images, columns=0)
 
 
 def test_atomic_write_leaves_nothing_on_failure(tmp_path):
@@ -82,7 +79,6 @@ def test_atomic_write_does_not_replace_what_appeared_meanwhile(tmp_path):
             temporary.write_text("ours")
             target.write_text("theirs")
 
-    with pytest.raises(UsageError, match="--overwrite"):
-        race()
+    refused(UsageError, "--overwrite", race)
     assert target.read_text() == "theirs"
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

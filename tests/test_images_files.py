@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.cameras.sets import default_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.images import read_exr, read_png, write_exr, write_png
@@ -60,11 +61,9 @@ def test_exr_of_another_program(tmp_path):
     np.testing.assert_array_equal(image[..., :3], rgb)
     assert (image[..., 3] == 1).all()
     OpenEXR.File({}, {"Z": rgb[..., 0].copy()}).write(str(tmp_path / "z.exr"))
-    with pytest.raises(DataError, match="channels Z; expected R, G, B, A"):
-        read_exr(tmp_path / "z.exr")
+    refused(DataError, "channels Z; expected R, G, B, A", read_exr, tmp_path / "z.exr")
     OpenEXR.File({"vvgt.camera": '{"fx": 1}'}, {"RGB": rgb}).write(str(tmp_path / "bad.exr"))
-    with pytest.raises(DataError, match=r"vvgt\.camera; expected a camera"):
-        read_exr(tmp_path / "bad.exr")
+    refused(DataError, r"vvgt\.camera; expected a camera", read_exr, tmp_path / "bad.exr")
 
 
 @pytest.mark.parametrize("keep", [0, 3, 40, 200, -20])
@@ -74,18 +73,15 @@ def test_cut_or_foreign_files_are_data_errors(tmp_path, keep):
     for name, read in (("a.exr", read_exr), ("a.png", read_png)):
         path = tmp_path / name
         path.write_bytes(path.read_bytes()[:keep])
-        with pytest.raises(DataError, match=name):
-            read(path)
-        with pytest.raises(DataError, match="no such file"):
-            read(tmp_path / ("none_" + name))
+        refused(DataError, name, read, path)
+        refused(DataError, "no such file", read, tmp_path / ("none_" + name))
 
 
 def test_sizes_that_the_file_cannot_hold_are_refused(tmp_path):
     header = struct.pack(">IIBBBBB", 16000, 16000, 8, 6, 0, 0, 0)
     chunk = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
     (tmp_path / "huge.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
-    with pytest.raises(DataError, match=r"huge\.png: (claims 16000 x 16000|not an image)"):
-        read_png(tmp_path / "huge.png")
+    refused(DataError, r"huge\.png: (claims 16000 x 16000|not an image)", read_png, tmp_path / "huge.png")
     write_exr(tmp_path / "a.exr", np.zeros((2, 3, 4)))
     lie = (
         (tmp_path / "a.exr")
@@ -93,8 +89,7 @@ def test_sizes_that_the_file_cannot_hold_are_refused(tmp_path):
         .replace(struct.pack("<4i", 0, 0, 2, 1), struct.pack("<4i", 0, 0, 15999, 15999))
     )
     (tmp_path / "huge.exr").write_bytes(lie)
-    with pytest.raises(DataError, match=r"huge\.exr: claims 16000 x 16000"):
-        read_exr(tmp_path / "huge.exr")
+    refused(DataError, r"huge\.exr: claims 16000 x 16000", read_exr, tmp_path / "huge.exr")
 
 
 def test_png_rgb_round_trip_is_exact_in_8_bits(tmp_path):
@@ -106,8 +101,7 @@ def test_png_rgb_round_trip_is_exact_in_8_bits(tmp_path):
 
 
 def test_png_stores_straight_alpha(tmp_path):
-    rng = np.random.default_rng(3)
-    straight = rng.integers(0, 256, (8, 9, 4))
+    straight = np.random.default_rng(3).integers(0, 256, (8, 9, 4))
     straight[0, 0] = (255, 0, 0, 1)  # would be lost if alpha were applied in 8 bits on the way
     premultiplied = straight / 255
     premultiplied[..., :3] *= premultiplied[..., 3:]
@@ -121,8 +115,7 @@ def test_png_stores_straight_alpha(tmp_path):
 
 def _decode(path):
     """The stored bytes of an 8-bit RGBA PNG, by an independent decoder."""
-    pillow = pytest.importorskip("PIL.Image")
-    image = pillow.open(path)
+    image = pytest.importorskip("PIL.Image").open(path)
     assert image.mode == "RGBA"
     return np.asarray(image).astype(int)
 
@@ -144,8 +137,7 @@ def test_same_image_same_bytes(tmp_path):
 def test_nothing_is_replaced_unasked(tmp_path, name, write):
     path = tmp_path / name
     path.write_text("mine")
-    with pytest.raises(UsageError, match="--overwrite"):
-        write(path, rgba())
+    refused(UsageError, "--overwrite", write, path, rgba())
     assert path.read_text() == "mine"
     write(path, rgba(), overwrite=True)
     assert path.read_bytes()[:4] != b"mine"
@@ -155,6 +147,5 @@ def test_nothing_is_replaced_unasked(tmp_path, name, write):
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (0, 4, 4), (4, 4, 5)])
 def test_wrong_shapes_are_refused(tmp_path, shape):
     for name, write in (("a.png", write_png), ("a.exr", write_exr)):
-        with pytest.raises(DataError, match="expected"):
-            write(tmp_path / name, np.zeros(shape))
+        refused(DataError, "expected", write, tmp_path / name, np.zeros(shape))
     assert not list(tmp_path.iterdir())

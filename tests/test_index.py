@@ -1,7 +1,5 @@
 """The index beside several files of Gaussians: one form for frames, functions and labels, read by view and info."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -59,8 +57,7 @@ FACTS = {
 @pytest.mark.parametrize("kind", LINES)
 def test_what_an_index_says(vvgt, at, kind, blocks):
     out = ("-o", "x_{}.ply", *HOW, *blocks)
-    done = vvgt("convert", *LINES[kind], *out)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", *LINES[kind], *out)
     index = json.loads(Path("x_index.json").read_text())
     assert (index["format"], index["schema"], index["kind"]) == ("vvgt-clouds", 1, kind)
     assert index["volume"] == LINES[kind][0].removesuffix(".npy" if kind == "labels" else "-")
@@ -71,11 +68,9 @@ def test_what_an_index_says(vvgt, at, kind, blocks):
         assert 15 < row["psnr"] < 80
     last = index["files"][-1]
     assert {key: last[key] for key in FACTS[kind]} == FACTS[kind]
-    shown = vvgt("view", "x_index.json", "-o", "page.html")
-    assert shown.code == 0, shown.err
+    vvgt.ok("view", "x_index.json", "-o", "page.html")
     assert list(clouds(Path("page.html"))) == SHOWN.get(kind, [name for name, _ in NAMES[kind]])
-    told = vvgt("info", "x_index.json")
-    assert told.code == 0, told.err
+    told = vvgt.ok("info", "x_index.json")
     assert f"index of {kind}" in told.out.decode()
     assert all(name in told.out.decode() for name, _ in NAMES[kind])
 
@@ -88,20 +83,19 @@ def test_an_existing_index_is_reported_before_the_work(vvgt, at, kind):
     assert "closed form" not in done.err
     assert Path("x_index.json").read_text() == "mine"
     assert not list(at.glob("*.ply"))
-    done = vvgt("convert", *LINES[kind], "-o", "x_{}.ply", *HOW, "--overwrite")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", *LINES[kind], "-o", "x_{}.ply", *HOW, "--overwrite")
     assert json.loads(Path("x_index.json").read_text())["kind"] == kind
 
 
 def test_parts_of_a_series_leave_the_index_of_all(vvgt, at):
     line = ("convert", *LINES["frames"], "-o", "x_{}.ply", *HOW)
-    assert vvgt(*line, "--shard", "1/2").code == 0  # frames 0 and 2; the other part has the dark one
+    vvgt.ok(*line, "--shard", "1/2")  # frames 0 and 2; the other part has the dark one
     first = Path("x_index.json").read_bytes()
     assert [row["frame"] for row in json.loads(first)["files"]] == [0, 2]
-    assert vvgt(*line, "--shard", "2/2").code == 0
+    vvgt.ok(*line, "--shard", "2/2")
     assert Path("x_index.json").read_bytes() == first
     Path("x_index.json").unlink()
-    assert vvgt(*line, "--shard", "1/2").code == 0  # all is done: it says so again
+    vvgt.ok(*line, "--shard", "1/2")  # all is done: it says so again
     assert Path("x_index.json").read_bytes() == first
 
 
@@ -121,8 +115,7 @@ def test_an_index_that_is_none_is_a_line(vvgt, at):
     for text in ("{", '"files": []}', '"schema": 1, "kind": "frames", "files": [{"name": "a", "file": "../a.ply"}]}'):
         Path("bad.json").write_text('{"format": "vvgt-clouds", ' + text)
         for command in (("info", "bad.json"), ("view", "bad.json", "-o", "p.html")):
-            done = vvgt(*command)
-            assert (done.code, "not an index of 'vvgt convert'" in done.error) == (1, True)
+            assert "not an index of 'vvgt convert'" in vvgt.fails(1, *command)
     good = '"schema": 1, "kind": "frames", "files": [{"name": "a", "file": "a.ply"}]}'
     Path("bad.json").write_text('{"format": "vvgt-clouds", ' + good)
     assert "a.ply is missing" in vvgt("view", "bad.json", "-o", "p.html").error

@@ -1,7 +1,5 @@
 """Blender's add-on in Blender itself: imported points in their places and colours, and a Volume object by its ramp."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -39,8 +37,7 @@ def grid() -> Gaussians:
     means = np.stack([x, 0 * x, z], 1)
     colors = np.random.default_rng(5).uniform(0, 1, (16, 3))
     shapes = np.log(np.tile([0.12, 0.02, 0.08], (16, 1)))
-    turns = np.tile([1.0, 0, 0, 0], (16, 1))
-    arrays = (means, shapes, turns, np.full(16, 9.0), colors)
+    arrays = (means, shapes, np.tile([1.0, 0, 0, 0], (16, 1)), np.full(16, 9.0), colors)
     return Gaussians(*(a.astype(np.float32) for a in arrays))
 
 

@@ -1,7 +1,5 @@
 """The widget in JupyterLab, in a real browser: its traits follow the page, and the page follows them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

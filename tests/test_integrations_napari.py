@@ -1,7 +1,5 @@
 """napari: layers saved through its own File > Save, by the manifest of the package."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.refused import refused
 from tests.test_integrations_slicer import heaviest
 from tests.vtk_scenes import camera_at, psnr
 from vvgt_cli.conversion.gaussian_files import open_gaussians
@@ -72,8 +71,7 @@ def test_an_image_keeps_its_place_unit_and_colours(viewer, tmp_path) -> None:
     assert heaviest(tmp_path / "a.splats.ply") == pytest.approx(world, abs=0.01)
     assert header.length_unit == "um"
     assert header.function == "GFP"
-    nodes = json.loads(header.legend)["nodes"]
-    x, opacity, colour = min(nodes, key=lambda node: abs(node[0] - 50))
+    x, opacity, colour = min(json.loads(header.legend)["nodes"], key=lambda node: abs(node[0] - 50))
     assert x == pytest.approx(50, abs=2.6)
     assert opacity == pytest.approx(((x - 10) / 80) ** 0.7, abs=0.02)
     assert [int(colour[k : k + 2], 16) for k in (0, 2, 4)] == pytest.approx(255 * middle[:3], abs=16)
@@ -151,11 +149,9 @@ def test_what_napari_draws_otherwise_is_named_once(viewer, tmp_path, recwarn) ->
 @pytest.mark.long
 def test_what_cannot_be_saved_says_why(viewer, tmp_path) -> None:
     viewer.add_image(np.zeros((8, 8, 3), np.uint8), rgb=True, name="photo")
-    with pytest.raises(vvgt_cli.UsageError, match="photo: an RGB image; expected z, y, x"):
-        saved(viewer, tmp_path / "a.html")
+    refused(vvgt_cli.UsageError, "photo: an RGB image; expected z, y, x", saved, viewer, tmp_path / "a.html")
     viewer.add_image(point(), visible=False)
-    with pytest.raises(vvgt_cli.UsageError, match="no visible layer"):
-        saved(viewer, tmp_path / "a.html")
+    refused(vvgt_cli.UsageError, "no visible layer", saved, viewer, tmp_path / "a.html")
 
 
 @pytest.mark.long
@@ -164,11 +160,9 @@ def test_layers_apart_are_whole_and_unlit(viewer, tmp_path) -> None:
     labels = np.zeros((20, 18, 16), np.uint8)
     labels[2:5, 3:8, 4:9] = 1
     viewer.add_labels(labels, opacity=1)
-    layer = viewer.add_image(point(), name="far", contrast_limits=(0, 90), translate=(0, 0, 40))
-    world = at(layer)
+    world = at(viewer.add_image(point(), name="far", contrast_limits=(0, 90), translate=(0, 0, 40)))
     gaussians, header = read_ply(saved(viewer, tmp_path / "a.splats.ply"))
-    away = np.linalg.norm(gaussians.means / header.scale + header.centre - world, axis=1)
-    assert (away < 2).any()
+    assert (np.linalg.norm(gaussians.means / header.scale + header.centre - world, axis=1) < 2).any()
     assert header.light is None
 
 

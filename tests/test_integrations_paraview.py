@@ -1,7 +1,5 @@
 """ParaView's plugin and the Catalyst script, in ParaView itself."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -84,7 +82,6 @@ def series_file(folder: Path) -> Path:
 def ours(path: Path, said: str) -> np.ndarray:
     """Draw a file at the camera that it states, with ParaView's up."""
     gaussians, facts = open_gaussians(str(path))
-    assert facts.camera is not None
     up = [float(v) for v in re.search(r"^up (.*)$", said, re.M)[1].split()]  # type: ignore[index]
     camera = camera_at(facts.camera[:3], facts.camera[3:6], up, facts.camera[6], facts, 300)
     return render(gaussians, camera, rule_of("inria"))
@@ -168,9 +165,7 @@ def test_the_nearest_source_that_is_shown_is_taken(monkeypatch: pytest.MonkeyPat
         ("scaled", ("Representation.Scale=[1.5,1.5,1.5]",), 42),
     ],
 )
-def test_beside_paraviews_own_picture(
-    case: str, given: tuple[str, ...], least: float, display: str, tmp_path: Path
-) -> None:
+def test_beside_paraviews_own_picture(case, given, least, display, tmp_path) -> None:
     """The same camera; colours in Lab, opacity with midpoints, a unit distance, the representation's place."""
     name = tmp_path / "a.splats.ply"
     theirs, said = paraview(display, volume_file(tmp_path / "lump.vti"), name, *FEW, *given)

@@ -1,7 +1,5 @@
 """`vvgt plugin`: every adapter is listed, short, and says how it is enabled."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 
@@ -29,9 +27,7 @@ def test_one_prints_its_file_and_how_it_is_enabled(vvgt, name: str) -> None:
 
 
 def test_an_unknown_one_is_refused(vvgt) -> None:
-    result = vvgt("plugin", "slicr")
-    assert result.code == 2
-    assert result.error.startswith("vvgt: error: no plugin 'slicr'; expected one of ")
+    assert vvgt.fails(2, "plugin", "slicr").startswith("vvgt: error: no plugin 'slicr'; expected one of ")
 
 
 def test_adapters_are_listed_and_packaged() -> None:

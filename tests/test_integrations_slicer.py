@@ -1,7 +1,5 @@
 """3D Slicer: the command as its CLI module, and the scene's nodes through the adapter in Slicer's own Python."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy
@@ -26,9 +24,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_xml_describes_the_command_by_its_own_options(vvgt) -> None:
-    result = vvgt("--xml")
-    assert result.code == 0
-    found = ElementTree.fromstring(result.out)
+    found = ElementTree.fromstring(vvgt.ok("--xml").out)
     assert found.tag == "executable"
     parameters = [node for group in found.findall("parameters") for node in group if node.find("name") is not None]
     named = {node.findtext("name"): node for node in parameters}
@@ -50,8 +46,7 @@ def test_arguments_are_taken_as_slicer_gives_them(vvgt, tmp_path) -> None:
         '{"points": [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 90, "opacity": 0.5, "rgb": [1, 1, 0]}]}'
     )
     words = ("--tf", tmp_path / "tf.json", "--layer", tmp_path / "b.npy", "--max_gaussians", 300, "--size", 64)
-    result = vvgt("--slicer", *words, tmp_path / "a.npy", tmp_path / "out_1.ply")
-    assert result.code == 0, result.err
+    result = vvgt.ok("--slicer", *words, tmp_path / "a.npy", tmp_path / "out_1.ply")
     header = read_ply(tmp_path / "out_1.ply")[1]
     assert header.made_for == 64
     assert 100 < header.count <= 300

@@ -1,7 +1,5 @@
 """The Snakemake rule of `examples`: made once, then taken from the cache; made again, the same bytes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

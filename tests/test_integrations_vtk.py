@@ -1,7 +1,5 @@
 """What is taken from a VTK scene: the functions of a volume property, the volume's place, camera and lights."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -80,8 +78,7 @@ def test_logarithmic_axes():
     prop, piecewise, color = made([(0.01, 0.1, 0.5, 0), (10, 0.9, 0.5, 0)], [(0.01, 0, 0, 0), (10, 1, 1, 1)])
     piecewise.SetUseLogScale(True)
     color.SetScaleToLog10()
-    x = np.geomspace(0.012, 9.7, 50)
-    agrees(prop, piecewise, color, x, within=1e-4)
+    agrees(prop, piecewise, color, np.geomspace(0.012, 9.7, 50), within=1e-4)
 
 
 def test_the_rest_of_a_property_is_taken_or_named():
@@ -190,7 +187,6 @@ def test_hidden_voxels_are_those_that_planes_cut_off():
     mapper.SetCroppingRegionPlanes(*(v for c in centre for v in (c - 1, c + 1)))
     mapper.SetCroppingRegionFlagsToFence()
     mask = drawn(volume).mask
-    assert mask is not None
     assert 0 < mask.sum() < mask.size
     for k, kept in enumerate(mask.ravel()):
         place = np.array(data.GetPoint(k))
@@ -285,7 +281,6 @@ def test_a_kept_process_runs_commands_one_after_another(monkeypatch, capsys):
     with pytest.raises(RuntimeError, match=r"^no such file"):
         kept.run(["info", "no such file"])
     kept.run(["--version"])
-    assert first is not None
     assert kept.process is first
     first.kill()
     first.wait()

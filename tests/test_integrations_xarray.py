@@ -1,7 +1,5 @@
 """The accessor of xarray: what `vvgt_cli.convert` does, on the array; registered by an import alone."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Compiled kernels: the same bytes cold and warm, what their code is kept under, damaged and read-only folders."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -303,8 +301,7 @@ def test_files_hold_machine_code_and_the_names_of_symbols():
       %z = fadd double %y, %x
       ret double %z
     }"""
-    whole = llvm.parse_assembly(text).as_bitcode()
-    left = llvm.parse_bitcode(symbols_of(whole))
+    left = llvm.parse_bitcode(symbols_of(llvm.parse_assembly(text).as_bitcode()))
     assert [f.name for f in left.functions if not f.is_declaration] == ["f$2"]
     assert [v.name for v in left.global_variables if not v.is_declaration] == ["env.<1>"]
     assert "fadd" not in str(left)
@@ -397,8 +394,7 @@ def test_without_a_home(tmp_path):
     shutil.copytree(ROOT / "vvgt_cli", package, ignore=shutil.ignore_patterns("__pycache__"))
     (package / "__pycache__").write_bytes(b"")  # cannot be a folder
     own = {"HOME": "/nonexistent/at/all", "XDG_CACHE_HOME": str(tmp_path / "user"), "PYTHONPATH": str(tmp_path)}
-    done = python("-c", STEP, cwd=tmp_path, folder=None, PYTHONDONTWRITEBYTECODE="1", **own)
-    assert done.stderr == ""
+    assert python("-c", STEP, cwd=tmp_path, folder=None, PYTHONDONTWRITEBYTECODE="1", **own).stderr == ""
     assert len(kernels(tmp_path / "user")) == 1
 
 

@@ -1,7 +1,5 @@
 """What the package uses of numba without a promise that it stays: each piece is where it was, with its arguments."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Loops that threads share: every turn once, the same numbers on any number of threads, failures said."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Memory that is asked for ahead of time: an instruction, and no other effect."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -23,8 +21,7 @@ def total(rows, order):
 
 def test_a_line_is_asked_for_and_nothing_else_changes():
     rows = np.arange(30, dtype=np.float32).reshape(10, 3)
-    order = np.array([9, 0, 4], np.int32)
-    assert total(rows, order) == 28 + 1 + 13
+    assert total(rows, np.array([9, 0, 4], np.int32)) == 28 + 1 + 13
     assert any("llvm.prefetch" in code for code in total.inspect_llvm().values())
     assert np.array_equal(rows, np.arange(30).reshape(10, 3))
 

@@ -1,7 +1,5 @@
 """What commands have compiled, and what runs where numba is off."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -35,15 +33,14 @@ def test_view_has_harmonics_compiled_where_there_are_some(vvgt, tmp_path: Path, 
     monkeypatch.setattr(Run, "compile", lambda run, kernels, volume=None: asked.append(tuple(kernels)))
     for degree in (0, 2):
         write_ply(str(tmp_path / "a.ply"), some(degree=degree))
-        done = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"a{degree}.spz")
-        assert done.code == 0, done.err
+        vvgt.ok("view", tmp_path / "a.ply", "-o", tmp_path / f"a{degree}.spz")
     assert asked == [ahead.DRAW, ahead.for_degree(ahead.DRAW, 2)]
 
 
 def test_drawing_runs_as_python_where_numba_is_off(vvgt, tmp_path: Path) -> None:
     write_ply(str(tmp_path / "a.ply"), some())
     line = ("render", tmp_path / "a.ply", "--orbit", "2", "--size", "24", "-o")
-    assert vvgt(*line, tmp_path / "compiled").code == 0
+    vvgt.ok(*line, tmp_path / "compiled")
     plain = as_python(*line, tmp_path / "plain")
     assert plain.returncode == 0, plain.stderr
     for name in ("orbit_000.png", "orbit_001.png"):

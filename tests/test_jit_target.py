@@ -1,7 +1,5 @@
 """What machine kernels are compiled for, and who may call them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

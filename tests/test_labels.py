@@ -1,7 +1,5 @@
 """Label maps: tables of five programs, recognised volumes, one file a label; RGB and channels are in test_layers."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as library
+from tests.refused import refused
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr.layers import grid_of
 from vvgt_cli.errors import DataError, UsageError
@@ -95,9 +94,7 @@ def test_a_function_of_whole_numbers() -> None:
     ],
 )
 def test_faulty_tables(tmp_path: Path, text: str, name: str, said: str) -> None:
-    with pytest.raises(DataError, match=said) as error:
-        read_labels(table(tmp_path, text, name))
-    assert "\n" not in str(error.value)
+    refused(DataError, said, read_labels, table(tmp_path, text, name))
 
 
 def test_names_of_several_words_and_long_tables(tmp_path: Path) -> None:
@@ -126,12 +123,9 @@ def test_recognised_by_type_name_and_number() -> None:
 
 def test_labels_are_data_values_and_whole() -> None:
     assert labels_in(Volume(balls(), slope=2.0, intercept=1.0)) == [1, 3, 7]
-    holes = np.where(balls() == 3, np.nan, balls())
-    assert labels_in(Volume(holes)) == [0, 1]
-    with pytest.raises(DataError, match=r"such as 0\.5; expected a label map"):
-        labels_in(Volume(balls() / 2))
-    many = np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)
-    assert len(labels_in(Volume(many))) == 65_536
+    assert labels_in(Volume(np.where(balls() == 3, np.nan, balls()))) == [0, 1]
+    refused(DataError, r"such as 0\.5; expected a label map", labels_in, Volume(balls() / 2))
+    assert len(labels_in(Volume(np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)))) == 65_536
 
 
 # ---- the command line
@@ -140,8 +134,7 @@ def test_labels_are_data_values_and_whole() -> None:
 def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
     labels = table(tmp_path, JSON, "a.json")
     ply = tmp_path / "a.ply"
-    done = vvgt("convert", seg, "--labels", labels, *SMALL, "-o", ply, "--report", tmp_path / "a-r.json")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", seg, "--labels", labels, *SMALL, "-o", ply, "--report", tmp_path / "a-r.json")
     assert "a.json" in done.err
     gaussians, _ = read_ply(str(ply))
     report = json.loads((tmp_path / "a-r.json").read_text())
@@ -150,11 +143,10 @@ def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
     own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-conditions", "--step", 0.5, "--json", "-q")
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
     views = ("--views", 2, "--test-views", 1, "--size", 32, "-q", "-o", tmp_path / "views")
-    assert vvgt("render-views", seg, "--labels", labels, *views).code == 0
+    vvgt.ok("render-views", seg, "--labels", labels, *views)
     again = vvgt("render-views", seg, "--labels", "auto", *views)
     assert "another run" in again.error or "function" in again.error
-    lit = vvgt("init", seg, "--labels", labels, "--light", "headlight", *SMALL[:4], "-o", tmp_path / "lit.ply")
-    assert lit.code == 0, lit.err
+    vvgt.ok("init", seg, "--labels", labels, "--light", "headlight", *SMALL[:4], "-o", tmp_path / "lit.ply")
 
 
 def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) -> None:
@@ -169,8 +161,7 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
     np.testing.assert_allclose(grid, grid_of(load(other).layers, shown.volume))
     both = ("--layer", f"{seg},labels={none}", "-o", tmp_path / "x.ply")
     for more in (("-o", tmp_path / "x.ply"), both, ("--split-labels", "-o", tmp_path / "x_{}.ply")):
-        done = vvgt("convert", seg, "--labels", none, *SMALL, *more)
-        assert (done.code, "none of its labels is visible" in done.error) == (1, True), done.error
+        assert "none of its labels is visible" in vvgt.fails(1, "convert", seg, "--labels", none, *SMALL, *more)
 
 
 def test_a_recognised_label_map_is_reported_and_none_reads_scalars(vvgt, tmp_path: Path, seg: Path) -> None:
@@ -208,8 +199,7 @@ def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
 
 def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
     labels = table(tmp_path, JSON, "a.json")
-    done = vvgt("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
     index = json.loads((tmp_path / "p_index.json").read_text())
     assert [(row["label"], row["file"]) for row in index["files"]] == [(1, "p_1-skin.ply"), (3, "p_3-inner-core.ply")]
     assert sum(row["gaussians"] for row in index["files"]) <= 300
@@ -241,9 +231,9 @@ def test_extinctions_of_labels_add_up_to_the_whole() -> None:
 )
 def test_labels_that_do_not_fit_are_one_line(vvgt, tmp_path: Path, values, text: str, said: str) -> None:
     np.save(tmp_path / "v.npy", values)
-    done = vvgt("init", tmp_path / "v.npy", "--labels", table(tmp_path, text, "t.ctbl"), "-o", tmp_path / "a.ply")
-    assert done.code == 1
-    assert said in done.error
+    given = ("--labels", table(tmp_path, text, "t.ctbl"), "-o", tmp_path / "a.ply")
+    done = vvgt.fails(1, "init", tmp_path / "v.npy", *given)
+    assert said in done
 
 
 def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
@@ -255,9 +245,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):
-        done = vvgt("convert", seg, *out, *options)
-        assert done.code == 2, options
-        assert said in done.error
+        assert said in vvgt.fails(2, "convert", seg, *out, *options)
     np.save(tmp_path / "empty_seg.npy", balls() * 0)
     assert (
         "no label other than 0"
@@ -269,8 +257,7 @@ def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> No
     for k in range(2):
         np.save(tmp_path / f"run_seg_{k}.npy", np.where(balls() == 3, 3 if k else 1, balls()).astype(np.uint8))
     look = ("--labels", "auto", "--light", "none")
-    done = vvgt("convert", tmp_path / "run_seg_*.npy", *look, *SMALL, "-o", tmp_path / "o_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "run_seg_*.npy", *look, *SMALL, "-o", tmp_path / "o_{}.ply")
     first, second = (read_ply(str(tmp_path / f"o_{k}.ply"))[0].colors for k in range(2))
     wanted = distinct([1]).labels[0].color
     np.testing.assert_allclose(np.median(first, axis=0), wanted, atol=0.05)
@@ -284,10 +271,8 @@ def test_in_python() -> None:
     _, images = library.render_views(balls(), library.Look(labels=entries), cameras=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
     assert images[..., 1].max() == 0
-    with pytest.raises(DataError, match="no entry"):
-        library.convert(balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
-    with pytest.raises(UsageError, match="no such file"):
-        library.convert(balls(), library.Look(labels="nowhere.ctbl"))
+    refused(DataError, "no entry", library.convert, balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
+    refused(UsageError, "no such file", library.convert, balls(), library.Look(labels="nowhere.ctbl"))
     assert isinstance(distinct([1]), LabelTable)
 
 
@@ -317,8 +302,7 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     solid = grid[2, 2, 2, 3]
     np.testing.assert_allclose(grid[..., 3], solid * ((a > 0).astype(int) + (b > 0)), rtol=1e-6)
     np.testing.assert_allclose(grid[..., :3], solid * np.stack([a == 1, b == 2, b == 1], axis=-1), rtol=1e-6)
-    done = vvgt("convert", path, "--split-labels", "--light", "none", *SMALL, "-o", tmp_path / "p_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", path, "--split-labels", "--light", "none", *SMALL, "-o", tmp_path / "p_{}.ply")
     index = json.loads((tmp_path / "p_index.json").read_text())
     assert [(row["name"], row["file"]) for row in index["files"]] == [
         ("liver", "p_0-1-liver.ply"), ("lesion", "p_1-1-lesion.ply"), ("vein", "p_2-vein.ply")
@@ -329,14 +313,10 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
         assert np.median(colors @ color) > 0.7
         assert np.abs(colors[:, np.array(color) == 0]).max() < 1e-6
     assert json.loads(vvgt("info", path, "--json").out)["segment_layers"] == 2
-    layer = vvgt("init", "example:blob:8", "--layer", path, *SMALL[:4], "-o", tmp_path / "l.ply")
-    assert layer.code == 0, layer.err
+    vvgt.ok("init", "example:blob:8", "--layer", path, *SMALL[:4], "-o", tmp_path / "l.ply")
     for options in (("--tf", "gray"), ("--labels", "none")):
-        done = vvgt("init", path, *options, "-o", tmp_path / "n.ply")
-        assert done.code == 2
-        assert "2 layers of segments that overlap" in done.error
-    one = vvgt("init", path, "--component", 1, *SMALL[:4], "-o", tmp_path / "c.ply")
-    assert one.code == 0, one.err
+        assert "2 layers of segments that overlap" in vvgt.fails(2, "init", path, *options, "-o", tmp_path / "n.ply")
+    vvgt.ok("init", path, "--component", 1, *SMALL[:4], "-o", tmp_path / "c.ply")
     series = vvgt("convert", tmp_path / "*.seg.nrrd", *SMALL, "-o", tmp_path / "s_{}.ply")
     assert "convert such frames one by one" in series.error
     path.write_bytes(path.read_bytes().replace(b"Segment0_Layer:=0", b"Segment0_Layer:=7"))
@@ -348,8 +328,7 @@ def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> No
     far = np.where(balls() == 3, 2_000_000_000, balls()).astype(np.int32)
     for k in range(2):
         np.save(tmp_path / f"run_seg_{k}.npy", far)
-    done = vvgt("convert", tmp_path / "run_seg_*.npy", "--light", "none", *SMALL, "-o", tmp_path / "o_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "run_seg_*.npy", "--light", "none", *SMALL, "-o", tmp_path / "o_{}.ply")
     colors = read_ply(str(tmp_path / "o_1.ply"))[0].colors
     near = np.abs(colors[:, None] - [e.color for e in distinct([1, 2_000_000_000]).labels]).max(axis=2).min(axis=1)
     assert np.median(near) < 0.1
@@ -368,15 +347,14 @@ def test_tables_are_listed_and_distinguished_from_functions(vvgt, tmp_path: Path
             ("init", "example:blob:8", "--tf", path, "-o", "b.ply"),
         ):
             assert "a table of labels; expected a transfer function: give the table to --labels" in vvgt(*call).error
-    with pytest.raises(DataError, match="not a transfer function"):
-        library.convert(balls(), table(tmp_path, '{"range": 1}', "b.json"))
+    refused(DataError, "not a transfer function", library.convert, balls(), table(tmp_path, '{"range": 1}', "b.json"))
     (tmp_path / "notes.txt").write_text("nothing of the kind")
     assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
 
 
 def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> None:
     ply, labels = tmp_path / "a.ply", table(tmp_path, JSON, "a.json")
-    assert vvgt("init", seg, "--labels", labels, *SMALL[:4], "-o", ply).code == 0
+    vvgt.ok("init", seg, "--labels", labels, *SMALL[:4], "-o", ply)
     again = table(
         tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
     )
@@ -388,10 +366,8 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
         (("--labels", "none"), True),
         (("--labels", labels, "--layer", "example:blob:8,tf=gray"), True),
     ):
-        done = vvgt(*asked[:-1], *options)
-        assert done.code == 0, done.err
-        assert ("made with other labels, functions or layers" in done.err) is others, options
-    assert vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "s.ply").code == 0
+        assert ("made with other labels, functions or layers" in vvgt.ok(*asked[:-1], *options).err) is others, options
+    vvgt.ok("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "s.ply")
     assert read_ply(str(tmp_path / "s.ply"))[1].optics is None  # of scalars the header is what it was
     header = read_ply(str(ply))[1]
     assert layout_of(header).optics == header.optics

@@ -1,7 +1,5 @@
 """Crops, masks, colours, channels and layers: what adds up, where it lies, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 import tifffile
 
 import vvgt_cli as library
+from tests.refused import refused
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
@@ -48,8 +47,7 @@ def test_a_crop_keeps_its_place_in_the_world() -> None:
 
 @pytest.mark.parametrize("text", ["1:2", "1:2,3:4,5", "2:2,:,:", "5:3,:,:", "a:b,:,:", "-1:3,:,:", "1:2,3:4,5:6,7:8"])
 def test_crops_that_are_none(text: str) -> None:
-    with pytest.raises(UsageError, match="--crop"):
-        ReadOptions(crop=text)
+    refused(UsageError, "--crop", ReadOptions, crop=text)
 
 
 def test_a_mask_hides_and_must_have_the_size() -> None:
@@ -63,8 +61,7 @@ def test_a_mask_hides_and_must_have_the_size() -> None:
     np.testing.assert_array_equal(part.data[1], volume.data[1])
     with pytest.raises(DataError, match=r"--mask m: 4 x 3 x 1 voxels; expected the 4 x 3 x 2 of v"):
         masked(volume, Volume(keep[:1], name="m"))
-    with pytest.raises(DataError, match="all of it is 0"):
-        masked(volume, Volume(keep * 0))
+    refused(DataError, "all of it is 0", masked, volume, Volume(keep * 0))
     big = replace(volume, data=volume.data.astype(np.int32) * 1000003)
     np.testing.assert_array_equal(masked(big, Volume(keep)).data[1], big.data[1])
 
@@ -79,16 +76,12 @@ def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None
     )
     np.testing.assert_allclose(part.affine @ [0, 0, 0, 1], whole.affine @ [0, 6, 0, 1])
     out = tmp_path / "a.ply"
-    done = vvgt(
-        "init", tmp_path / "v.nii", "--tf", "gray", "--crop", ":,6:18,:", *SMALL[:4], "--frame", "world", "-o", out
-    )
-    assert done.code == 0, done.err
+    vvgt.ok("init", tmp_path / "v.nii", "--tf", "gray", "--crop", ":,6:18,:", *SMALL[:4], "--frame", "world", "-o", out)
     _, header = read_ply(str(out))
     np.testing.assert_allclose(np.reshape(header.affine, (3, 4)), part.affine[:3], atol=1e-6)
     for options in (("--tf", "gray"), ("--labels", "auto")):
         mask = ("--mask", tmp_path / "m.nii", "--overwrite")
-        done = vvgt("init", tmp_path / "v.nii", *options, *mask, *SMALL[:4], "-o", out)
-        assert done.code == 0, done.err
+        vvgt.ok("init", tmp_path / "v.nii", *options, *mask, *SMALL[:4], "-o", out)
         means, frame = library.read_ply(out)[0].means, whole.unit_frame()
         world = means / frame.scale + frame.centre
         index = np.round((np.linalg.inv(whole.affine) @ np.c_[world, np.ones(len(world))].T).T[:, :3]).astype(int)
@@ -118,8 +111,7 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
         assert (read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=-300)).data == 40).sum() == head.sum()
     with pytest.raises(DataError, match="--keep-largest 300: no voxel lies above"):
         read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=300))
-    with pytest.raises(UsageError, match="--keep-largest nan: expected a finite"):
-        ReadOptions(keep_largest=float("nan"))
+    refused(UsageError, "--keep-largest nan: expected a finite", ReadOptions, keep_largest=float("nan"))
     whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
     assert whole.gaussians.means[:, 0].max() < 0.2
     runs = {"a": (), "b": ("--blocks", 16), "c": ("--blocks", 16, "--workers", 2), "live": ("--live",)}
@@ -202,24 +194,12 @@ def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int)
 
 def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
-    given = (
-        "convert",
-        tmp_path / "a.nrrd",
-        "--max-gaussians",
-        100,
-        "--size",
-        40,
-        "--steps",
-        0,
-        "-o",
-        tmp_path / "a.ply",
-    )
+    given = ("convert", tmp_path / "a.nrrd", "--max-gaussians 100 --size 40 --steps 0 -o", tmp_path / "a.ply")
     for more in ((), ("--blocks", 16), ("--component", "color")):
-        done = vvgt(*given, "--keep-largest", 10, *more)
-        assert (done.code, "a.nrrd has colours; expected scalars: give a --mask" in done.error) == (2, True)
-    with pytest.raises(UsageError, match="has colours"):
-        library.convert(str(tmp_path / "a.nrrd"), keep_largest=10)
-    assert vvgt(*given, "--keep-largest", 10, "--component", 0).code == 0
+        done = vvgt.fails(2, *given, "--keep-largest", 10, *more)
+        assert "a.nrrd has colours; expected scalars: give a --mask" in done
+    refused(UsageError, "has colours", library.convert, str(tmp_path / "a.nrrd"), keep_largest=10)
+    vvgt.ok(*given, "--keep-largest", 10, "--component", 0)
     for more in (("--overwrite",), ("--overwrite", "--blocks", 16)):
         with pytest.warns(UserWarning, match="--keep-largest 10: hides"):
             done = vvgt(*given, "--keep-largest", 10, "--component", "all", *more)
@@ -229,20 +209,16 @@ def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvg
 def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
     assert '"colors": "RGB"' in vvgt("info", tmp_path / "a.nrrd", "--json").out.decode()
-    done = vvgt("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply")
-    assert done.code == 0, done.err
-    assert "opacity by luminance" in done.err
+    assert "opacity by luminance" in vvgt.ok("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply").err
     made, _ = read_ply(str(tmp_path / "a.ply"))
     order = np.argsort(made.means[:, 0])
     assert np.polyfit(made.means[order, 0], made.colors[order, 0], 1)[0] > 0.3  # red grows along x
     np.save(tmp_path / "f.npy", colors().astype(np.float32))
     assert "component" in vvgt("init", tmp_path / "f.npy", "-o", tmp_path / "b.ply").error
-    one = vvgt("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
-    assert one.code == 0, one.err
+    vvgt.ok("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
     asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
     assert "one component; expected several: omit --component color" in asked.error
-    table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
-    assert "several components" in table.error
+    assert "several components" in vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply").error
 
 
 def test_names_of_labels_are_kept_beside_other_layers(vvgt, tmp_path: Path) -> None:
@@ -253,9 +229,8 @@ def test_names_of_labels_are_kept_beside_other_layers(vvgt, tmp_path: Path) -> N
     (tmp_path / "t.json").write_text(json.dumps(table))
     given = (tmp_path / "v.nii", "--tf", "gray", "--layer", f"{tmp_path / 'l.nii'},labels={tmp_path / 't.json'}")
     for options, out in (((), "a.ply"), (("--live",), "b.ply")):
-        done = vvgt("init" if not options else "convert", *given, *SMALL[:4], *options, "-o", tmp_path / out)
-        assert done.code == 0, done.err
-    assert vvgt("recolor", tmp_path / "b.ply", "-o", tmp_path / "c.ply").code == 0
+        vvgt.ok("init" if not options else "convert", *given, *SMALL[:4], *options, "-o", tmp_path / out)
+    vvgt.ok("recolor", tmp_path / "b.ply", "-o", tmp_path / "c.ply")
     for out in ("a.ply", "c.ply"):
         legend = json.loads(library.read_ply(tmp_path / out)[1].legend)
         assert [name for name, _ in legend["labels"]] == names
@@ -304,24 +279,10 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     unsure = vvgt("init", tmp_path / "a.ome.tif", "--tf", "hot", "-o", tmp_path / "a.ply")
     assert unsure.code == 2  # one, or all
     assert "--channel 0 to 1, a name, all" in unsure.error
-    done = vvgt("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
-    assert done.code == 0, done.err
+    vvgt.ok("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
     layer = f"{tmp_path / 'a.ome.tif'},channel=cyan,tf=gray"
-    done = vvgt(
-        "init",
-        tmp_path / "a.ome.tif",
-        "--channel",
-        0,
-        "--tf",
-        "hot",
-        "--layer",
-        layer,
-        *SMALL[:4],
-        "-o",
-        tmp_path / "b.ply",
-    )
-    assert done.code == 0, done.err
-    assert "gray" in done.err
+    how = ("--channel 0 --tf hot --layer", layer, *SMALL[:4], "-o", tmp_path / "b.ply")
+    assert "gray" in vvgt.ok("init", tmp_path / "a.ome.tif", *how).err
 
 
 # ---- layers
@@ -384,11 +345,9 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     with pytest.raises(DataError, match="lies beside cloud in the world"):
         common_grid([Layer(first, ramp(0, 1), 1.0), Layer(far, ramp(0, 1), 1.0)])
     tiny = cloud((4, 4, 4), spacing=(0.05, 0.05, 0.05))
-    with pytest.raises(DataError, match="20 times finer"):
-        common_grid([Layer(first, ramp(0, 1), 1.0), Layer(tiny, ramp(0, 1), 1.0)])
+    refused(DataError, "20 times finer", common_grid, [Layer(first, ramp(0, 1), 1.0), Layer(tiny, ramp(0, 1), 1.0)])
     for text in ("", "a.nii,hue=3", "a.nii,time=x", "a.nii,tf="):
-        with pytest.raises(UsageError, match="--layer"):
-            parse_layer(text)
+        refused(UsageError, "--layer", parse_layer, text)
     asked = SourceRequest("a,b.nii", tf="hot:0.2,0.8", labels="none")
     assert parse_layer("a,b.nii,tf=hot:0.2,0.8,labels=none") == asked
     gone = vvgt("init", "example:blob:8", "--layer", tmp_path / "no.nii", "-o", tmp_path / "a.ply")
@@ -414,22 +373,20 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
     layer = f"{tmp_path / 'organ_seg.nii.gz'},labels={tmp_path / 't.json'}"
     asked = ("--tf", "gray:0.5,1:0.05", "--layer", layer)
     out, report = tmp_path / "a.ply", tmp_path / "a.json"
-    done = vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, "-o", out, "--report", report)
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, "-o", out, "--report", report)
     assert "32 x 32 x 32" in done.err
     made, _ = read_ply(str(out))
     red = made.colors[:, 0] - made.colors[:, 1] > 0.5
     assert red.sum() > 5
     assert np.abs(made.means[red]).max() < 0.35 < np.abs(made.means[~red]).max()
     assert len(json.loads(report.read_text())["transfer_function"]["layers"]) == 2
-    own = vvgt(
-        "evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, "--no-conditions", "--step", 0.5, "--json", "-q"
-    )
+    how = "--no-conditions --step 0.5 --json -q"
+    own = vvgt("evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, how)
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(
         json.loads(report.read_text())["scores"]["psnr"], abs=1
     )
     kept = ("--checkpoint", tmp_path / "kept", "--overwrite")
-    assert vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, *kept, "-o", tmp_path / "b.ply").code == 0
+    vvgt.ok("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, *kept, "-o", tmp_path / "b.ply")
     assert out.read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
@@ -463,8 +420,7 @@ def test_several_functions_over_colours_channels_and_layers(vvgt, tmp_path: Path
         ("scan.npy", layer),
     ):
         functions = ("--tf", "gray:0.2,0.8:0.3", "--tf", "viridis:0.1,0.5:0.9", "--overwrite")
-        done = vvgt("convert", tmp_path / volume, *options, *functions, *SMALL, "-o", tmp_path / "o_{}.ply")
-        assert done.code == 0, done.err
+        vvgt.ok("convert", tmp_path / volume, *options, *functions, *SMALL, "-o", tmp_path / "o_{}.ply")
         made = [read_ply(str(path)) for path in sorted(tmp_path.glob("o_*.ply"))]
         assert len(made) == 2
         assert not np.array_equal(made[0][0].opacity_logits, made[1][0].opacity_logits)

@@ -1,7 +1,5 @@
 """The library: the same as the commands, for files and for what is in memory."""
 
-from __future__ import annotations
-
 import doctest
 import html
 import json
@@ -19,6 +17,7 @@ import xarray
 
 import vvgt_cli as vvgt
 from tests.headers import uncertified
+from tests.refused import refused
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
 
@@ -66,8 +65,7 @@ def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
     path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", HOW, **read)
     assert saved(path, tmp_path / "c.ply") == written
     header = written[: written.index(b"end_header")].decode()
-    world = saved_world(converted, tmp_path / "w.ply")
-    assert "frame world" in world
+    assert "frame world" in saved_world(converted, tmp_path / "w.ply")
     assert "frame unit" in header
 
 
@@ -98,8 +96,7 @@ def test_masked_values_are_nan(field):
     read = np.asarray(vvgt.read_volume(masked).data)
     assert np.array_equal(np.isnan(read), masked.mask)
     assert np.array_equal(read[~masked.mask], masked.compressed())
-    whole = np.ma.masked_array(np.ones((4, 4, 4), np.uint8))
-    assert vvgt.read_volume(whole).data.dtype == np.uint8
+    assert vvgt.read_volume(np.ma.masked_array(np.ones((4, 4, 4), np.uint8))).data.dtype == np.uint8
 
 
 def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):
@@ -150,8 +147,7 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     cameras, volume = vvgt.render_views(field, TF, vvgt.default_views("test", size=48)[4:5], spacing=SPACING)
     assert np.sqrt(np.mean((volume[0] - image) ** 2)) < 0.05
     np.testing.assert_array_equal(converted.render(cameras[0]), image)
-    sheet = converted.preview(32)
-    assert sheet.shape == (3 * 32, 3 * 32, 3)
+    assert converted.preview(32).shape == (3 * 32, 3 * 32, 3)
     assert converted._repr_png_().startswith(b"\x89PNG")
     frame = converted._repr_html_()
     assert re.match(r'<iframe title="volume, [0-9]+ x [0-9]+ x [0-9]+" sandbox="allow-scripts allow-downloads" ', frame)
@@ -202,17 +198,14 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
     ],
 )
 def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
-    with pytest.raises(vvgt.VvgtError, match=words):
-        vvgt.read_volume(volume, **reading)
+    refused(vvgt.VvgtError, words, vvgt.read_volume, volume, **reading)
 
 
 def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     small = converted.save(tmp_path / "a.ply")
     assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
-    with pytest.raises(vvgt.UsageError, match="exists"):
-        converted.save(tmp_path / "a.ply", overwrite=False)
-    with pytest.raises(vvgt.UsageError, match="expected a name ending in"):
-        converted.save(tmp_path / "x.obj")
+    refused(vvgt.UsageError, "exists", converted.save, tmp_path / "a.ply", overwrite=False)
+    refused(vvgt.UsageError, "expected a name ending in", converted.save, tmp_path / "x.obj")
     assert not (tmp_path / "x.obj").exists()
 
 

@@ -1,7 +1,5 @@
 """Light: what is asked for, how samples are shaded and what arrives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -154,8 +152,7 @@ def test_the_grid_of_shadows_converges_to_rays_from_every_place():
     faint = function([0.0, 0.3, 0.5, 1.0], [0, 0, 0.1, 0.05])  # of what is thick no grid shows the first half voxel
     scene = Scene.build(thick.volume, faint, 1.0)
     directions, rng = cone(np.array(SLANTED), ANGLE, 3), np.random.default_rng(0)
-    tops = np.array(scene.volume.dims)
-    points = rng.uniform(0.2, 0.8, (60, 3)) * tops
+    points = rng.uniform(0.2, 0.8, (60, 3)) * np.array(scene.volume.dims)
     exact = brute_force(scene, points, directions, 1.5)
     assert exact.min() < 0.5
     assert exact.max() > 0.9
@@ -183,8 +180,7 @@ def test_an_opaque_wall_throws_a_shadow():
     data = np.zeros((24, 24, 24), np.float32)
     data[16:19, :, :12] = 1.0  # a shelf over half of a block
     data[2:8] = 0.6
-    tf = function([0, 0.4, 0.5, 1], [0, 0, 1, 1])
-    scene = Scene.build(Volume(data), tf, 1.0)
+    scene = Scene.build(Volume(data), function([0, 0.4, 0.5, 1], [0, 0, 1, 1]), 1.0)
     above = scene.lit(Lighting(False, (ABOVE,), 0.0, 1.0, 0.0, shadows=True))
     shade = above.light.shade[0]
     assert shade[8, 12, 5] < 0.01
@@ -201,13 +197,11 @@ def test_a_thin_sheet_right_behind_empty_bricks_throws_its_shadow(thick):
     """A leap over what is empty ends at the sheet's brick, however far from the place the ray begins."""
     data = np.zeros((40, 24, 24), np.float32)
     data[16 : 16 + thick] = 1.0
-    tf = function([0, 0.5, 1], [0, 0, 0.9])
-    scene = Scene.build(Volume(data), tf, 1.0)
+    scene = Scene.build(Volume(data), function([0, 0.5, 1], [0, 0, 0.9]), 1.0)
     directions = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96]])
     points = np.array([[12.0, 12.0, z] for z in (3.0, 5.0, 8.0)])
     for offset in (1.5, 4.0):
-        grid = transmittance(scene, directions, 1, step=0.125, offset=offset)
-        found = grid_values(grid, points)
+        found = grid_values(transmittance(scene, directions, 1, step=0.125, offset=offset), points)
         np.testing.assert_allclose(found, brute_force(scene, points, directions, offset), atol=0.03)
         assert found.max() < 0.6
 

@@ -1,7 +1,5 @@
 """How VTK's mappers shade, beside ours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -42,8 +40,7 @@ def distant():
 def smooth_ball(long=1):
     """A ball with a soft edge: values far from zero gradients where it is seen; the box is ``long`` times as high."""
     z, y, x = np.meshgrid(np.linspace(-long, long, 32 * long), *[np.linspace(-1, 1, 32)] * 2, indexing="ij")
-    data = (1.2 - np.sqrt(x * x + y * y + z * z)).astype(np.float32)
-    return Scene.build(Volume(data), SHELL, 1.0)
+    return Scene.build(Volume((1.2 - np.sqrt(x * x + y * y + z * z)).astype(np.float32)), SHELL, 1.0)
 
 
 def both():

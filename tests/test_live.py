@@ -1,7 +1,5 @@
 """Gaussians that carry values, and their look under any function."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
 from tests.live_stream import from_bytes
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.gaussian_samples import (
@@ -102,7 +101,6 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
     some = replace(cloud(), log_scales=np.repeat(np.linspace(-4, -1.6, 40), 3).reshape(40, 3))
-    assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
     shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
@@ -215,7 +213,6 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == facts()
     assert [name for name in header.dtype.names or ()][-6:] == list(COLUMNS)
-    assert back.live is not None
     np.testing.assert_array_equal(back.live[:, :3], some.live[:, :3])  # type: ignore[index]
     axes = [np.sort(np.abs(g.live[:, AXIS])) for g in (back, some)]  # type: ignore[index]
     np.testing.assert_allclose(*axes, atol=1e-6)
@@ -223,8 +220,7 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live values", b"live valuez", 1))
-    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
-        read_ply(tmp_path / "c.ply")
+    refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
 
 
 def test_a_function_that_json_cannot_hold_is_sampled() -> None:
@@ -297,26 +293,24 @@ def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_recolor_shows_other_functions_without_the_volume(vvgt, live_file, tmp_path) -> None:
-    assert vvgt("recolor", live_file, "--tf", "viridis", "-o", tmp_path / "v.ply").code == 0
+    vvgt.ok("recolor", live_file, "--tf", "viridis", "-o", tmp_path / "v.ply")
     ordinary, header = read_ply(tmp_path / "v.ply")
     assert header.live is None
     assert ordinary.live is None
     assert header.unit_distance_label == "paraview"
     scores = []
     for file in (live_file, tmp_path / "v.ply"):
-        done = vvgt(
-            "evaluate", file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--json", "--no-conditions"
-        )
+        done = vvgt("evaluate", file, "--volume example:marschner-lobb:20 --tf viridis --json --no-conditions")
         scores.append(json.loads(done.out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
     assert scores[0] > 20
-    done = vvgt("recolor", tmp_path / "v.ply", "--tf", "viridis", "-o", tmp_path / "w.ply")
-    assert (done.code, "carry no values" in done.error) == (1, True)
+    done = vvgt.fails(1, "recolor", tmp_path / "v.ply", "--tf", "viridis", "-o", tmp_path / "w.ply")
+    assert "carry no values" in done
     assert not (tmp_path / "w.ply").exists()
     nothing = {"points": [{"x": 7, "rgb": [1, 0, 0], "opacity": 0}, {"x": 8, "rgb": [0, 1, 0], "opacity": 0.8}]}
     (tmp_path / "tf.json").write_text(json.dumps(nothing))
-    done = vvgt("recolor", live_file, "--tf", tmp_path / "tf.json", "-o", tmp_path / "w.ply")
-    assert (done.code, "nothing is visible" in done.error) == (1, True)
+    done = vvgt.fails(1, "recolor", live_file, "--tf", tmp_path / "tf.json", "-o", tmp_path / "w.ply")
+    assert "nothing is visible" in done
 
 
 def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
@@ -327,22 +321,19 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
     assert under["function"].startswith("viridis")
     assert under["hidden"] + under["gaussians"] == plain["gaussians"]
     for name, more in (("a", ()), ("b", ("--tf", "viridis"))):
-        assert vvgt("render", live_file, *more, "--orbit", 1, "--size", 32, "-o", tmp_path / name).code == 0
+        vvgt.ok("render", live_file, *more, "--orbit", 1, "--size", 32, "-o", tmp_path / name)
     pictures = [next((tmp_path / name).glob("*.png")).read_bytes() for name in "ab"]
     assert pictures[0] != pictures[1]
-    assert (
-        vvgt("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c").code == 0
-    )
+    vvgt.ok("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c")
     assert next((tmp_path / "c").glob("*.png")).read_bytes() not in pictures  # of its own function
     with pytest.warns(UserWarning, match="cannot store values for other functions"):
-        assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
+        vvgt.ok("view", live_file, "-o", tmp_path / "one.spz")
 
 
 def test_a_live_page_is_not_read_back(vvgt, tmp_path) -> None:
     """It computes look and light anew: its columns alone are another picture."""
     for name, told in (("a.html", False), ("a.spz", True)):
-        done = vvgt("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
-        assert done.code == 0
+        done = vvgt.ok("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
         assert ("read back" in done.err) == told
 
 
@@ -353,16 +344,13 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         ("--target-psnr", 30),
         ("--no-comments",),
     ):
-        done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
-        assert done.code == 2
-        assert option[0] in done.error
+        done = vvgt.fails(2, "convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
+        assert option[0] in done
     for other, line in ((("--dry-run",), "--dry-run with --live"), (("--tf", "viridis", "--tf", "magma"), "one --tf")):
-        done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
-        assert (done.code, line in done.error) == (2, True)
+        assert line in vvgt.fails(2, "convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
     np.save(tmp_path / "four.npy", np.random.default_rng(0).random((2, 6, 7, 8)))
     for source in (tmp_path / "four.npy", tmp_path / "*.npy"):
-        done = vvgt("convert", source, "--live", "-o", tmp_path / "a.html", *SMALL)
-        assert done.code == 2, done.err
+        vvgt.fails(2, "convert", source, "--live", "-o", tmp_path / "a.html", *SMALL)
     assert not (tmp_path / "a.html").exists()
     assert not (tmp_path / "a.ply").exists()
 
@@ -372,15 +360,14 @@ def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
     for k in range(2):
         np.save(tmp_path / f"f{k}.npy", np.random.default_rng(k).random((6, 7, 8)).astype(np.float32))
     source = ("convert", tmp_path / "f?.npy", "--tf", "viridis", "-o", tmp_path / "o_{}.ply", "--max-gaussians", 90)
-    assert vvgt(*source, "--size", 48, "--live").code == 0
+    vvgt.ok(*source, "--size", 48, "--live")
     for k in range(2):
         gaussians, header = read_ply(tmp_path / f"o_{k}.ply")
         assert header.live is not None
         assert gaussians.live is not None
-        assert vvgt("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply").code == 0
+        vvgt.ok("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply")
     assert json.loads((tmp_path / "o_index.json").read_text())["files"][1]["file"] == "o_1.ply"
-    done = vvgt(*source, "--size", 48)
-    assert (done.code, "live" in done.error) == (2, True), done.error
+    assert "live" in vvgt.fails(2, *source, "--size", 48)
 
 
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
@@ -422,7 +409,7 @@ def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
     for number, blocks in enumerate(((), ("--blocks", 16))):
         out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
         source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
-        assert vvgt("convert", *source, "-o", out, "--report", report).code == 0
+        vvgt.ok("convert", *source, "-o", out, "--report", report)
         scores.append(json.loads(report.read_text())["scores"]["psnr"])
         facts.append(read_ply(out)[1].live)
     assert scores[0] == pytest.approx(scores[1], abs=0.02)
@@ -441,5 +428,4 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     magma = vvgt_library.recolor(live_file, "magma")
     assert len(magma.gaussians) > 100
     assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
-    with pytest.raises(vvgt_library.DataError, match="carry no values"):
-        other.recolor("magma")
+    refused(vvgt_library.DataError, "carry no values", other.recolor, "magma")

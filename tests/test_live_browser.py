@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Labels, layers and light of live pages in a real browser, by clicking, dragging and typing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -67,7 +65,6 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def table(file: Path, folder: Path, shown: set[int]) -> str:
     header = read_ply(file)[1]
-    assert header.live is not None
     entries = {
         str(e.number): {"name": e.name, "color": e.color, "opacity": e.opacity if e.number in shown else 0}
         for e in header.live.labels
@@ -84,10 +81,8 @@ def test_a_page_begins_with_the_files_light_and_the_ball_moves_it(lit: Path, tmp
     ball: Actions = [{"click": "#live summary"}, {"drag": "#live .light svg", "by": [-20, -12]}]
     for window in (DESK, PHONE):
         actions = ball if window == DESK else [{"click": "#live .fold"}, *ball]
-        dragged = after(lit, actions, tmp_path, window)
-        assert psnr(head, dragged) < 35
-        undone = after(lit, [*actions, {"key": "Control+z"}], tmp_path, window)
-        assert psnr(head, undone) > 45
+        assert psnr(head, after(lit, actions, tmp_path, window)) < 35
+        assert psnr(head, after(lit, [*actions, {"key": "Control+z"}], tmp_path, window)) > 45
 
 
 def test_labels_are_switched_off_shown_alone_and_searched(labels: Path, tmp_path: Path) -> None:
@@ -116,16 +111,8 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
         ball = np.exp(-(((x - 5 * k) / 6) ** 2 + (y / 4) ** 2 + (z / 7) ** 2)).astype(np.float32)
         np.save(tmp_path / f"f{k}.npy", ball)
     source = [
-        "convert",
-        str(tmp_path / "f?.npy"),
-        "--tf",
-        "viridis",
-        "--live",
-        "--max-gaussians",
-        "6000",
-        "--size",
-        "300",
-    ]
+        "convert", str(tmp_path / "f?.npy"), "--tf", "viridis", "--live", "--max-gaussians", "6000", "--size", "300",
+    ]  # fmt: skip
     assert run([*source, "--quiet", "-o", str(tmp_path / "all.html")]) == 0
     assert run([*source, "--quiet", "-o", str(tmp_path / "f_{}.ply")]) == 0
     wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]

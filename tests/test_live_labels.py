@@ -1,7 +1,5 @@
 """Gaussians that carry the label under them, and their look under any table."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +9,7 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.live_stream import from_bytes
+from tests.refused import refused
 from tests.test_live import SMALL, cloud
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import labels_and_gradients
@@ -33,7 +32,6 @@ LABELS = (
 
 def labels_cloud(labels: tuple[Label, ...] = LABELS) -> Gaussians:
     some = cloud()
-    assert some.live is not None
     row = np.arange(len(some)) % len(labels)
     return replace(some, live=np.column_stack([np.zeros((len(some), 2)), some.live[:, 2:], row]))
 
@@ -73,7 +71,6 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     back, header = read_ply(tmp_path / "a.ply")
     assert header.live == facts()
     assert header.dtype["label"] == np.uint8
-    assert back.live is not None
     np.testing.assert_array_equal(back.live[:, [0, 1, 2, LABEL_ROW]], some.live[:, [0, 1, 2, LABEL_ROW]])  # type: ignore[index]
     many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
     row = np.full(len(some), 299.0)
@@ -83,11 +80,9 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     assert read_ply(tmp_path / "b.ply")[0].live[0, LABEL_ROW] == 299  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
-    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
-        read_ply(tmp_path / "c.ply")
+    refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
     (tmp_path / "d.ply").write_bytes(whole[:-1] + b"\x09")
-    with pytest.raises(vvgt_library.DataError, match="row 9"):
-        read_ply(tmp_path / "d.ply")
+    refused(vvgt_library.DataError, "row 9", read_ply, tmp_path / "d.ply")
 
 
 def test_labels_in_the_header_of_a_file_without_their_column_are_ignored(tmp_path: Path) -> None:
@@ -186,7 +181,6 @@ def test_cells_do_not_straddle_labels() -> None:
         halves(), vvgt_library.Look(labels="auto"), {"max_gaussians": 800, "size": 48}, live=True
     )
     live, means = result.gaussians.live, result.gaussians.means
-    assert live is not None
     assert set(live[:, LABEL_ROW]) == {0, 1}
     right = (means[:, 0] > 0) == (live[:, LABEL_ROW] == 1)
     assert right.mean() > 0.97
@@ -208,7 +202,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     (tmp_path / "t.json").write_text(json.dumps(table))
     whole = read_ply(label_file)[0]
     look = ("--labels", tmp_path / "t.json", "--light", "none")
-    assert vvgt("recolor", label_file, *look, "-o", tmp_path / "a.ply").code == 0
+    vvgt.ok("recolor", label_file, *look, "-o", tmp_path / "a.ply")
     found, header = read_ply(tmp_path / "a.ply")
     assert header.live is None
     assert len(found) == (whole.live[:, LABEL_ROW] == 0).sum()  # type: ignore[index]
@@ -222,8 +216,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     told = json.loads(vvgt("info", label_file, "--json").out)["live_labels"]
     assert [entry["label"] for entry in told] == [1, 2]
     assert sum(entry["gaussians"] for entry in told) == len(whole)
-    again = vvgt_library.recolor(label_file, labels=tmp_path / "t.json")
-    assert len(again.gaussians) == len(found)
+    assert len(vvgt_library.recolor(label_file, labels=tmp_path / "t.json").gaussians) == len(found)
 
 
 def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tmp_path) -> None:
@@ -232,15 +225,13 @@ def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tm
     volume, first = label_file.parent / "map_label.npy", tmp_path / "first.ply"
     for more in ((), ("--blocks", 16)):
         source = (volume, "--labels", tmp_path / "t.json", "--live", *more, "-o", first, "--overwrite")
-        assert vvgt("convert", *source, *SMALL).code == 0
+        vvgt.ok("convert", *source, *SMALL)
         gaussians, header = read_ply(first)
-        assert header.live is not None
         assert [label.opacity for label in header.live.labels] == [1, 0]
-        assert gaussians.live is not None
         counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(int))
         assert 0.05 < counts[1] / counts.sum() < 0.5
         assert gaussians.opacity_logits[gaussians.live[:, LABEL_ROW] == 1].max() < -10
-        assert vvgt("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite").code == 0
+        vvgt.ok("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite")
         assert len(read_ply(tmp_path / "a.ply")[0]) == len(gaussians)
 
 
@@ -258,22 +249,17 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):
-        done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
-        assert (done.code, said in done.error) == (code, True), done.error
-    done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
-    assert (done.code, "replace --tf-range" in done.error) == (2, True), done.error
+        assert said in vvgt.fails(code, "recolor", label_file, *more, "-o", tmp_path / "a.ply")
+    done = vvgt.fails(2, "render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
+    assert "replace --tf-range" in done
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 
 def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
     volume, found = label_file.parent / "map_label.npy", []
-    assert (
-        vvgt("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL).code
-        == 0
-    )
+    vvgt.ok("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL)
     for file in (label_file, tmp_path / "b.ply"):
         gaussians = read_ply(file)[0]
-        assert gaussians.live is not None
         found.append(
             (gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, LABEL_ROW].astype(int)) / len(gaussians))
         )

@@ -1,7 +1,5 @@
 """Live files of several layers or channels: each Gaussian carries its layer's number, and its value or label."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
+from tests.refused import refused
 from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, WINDOW, cloud
 from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
@@ -54,7 +53,6 @@ def test_each_layer_is_looked_up_in_its_own_table() -> None:
 def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None:
     """Values over one range, values over another one, and labels."""
     some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
-    assert some.live is not None
     some.live[:, LAYER_ID] = np.arange(60) % 3
     some.live[some.live[:, LAYER_ID] < 2, LABEL_ROW] = 0
     some.live[:, LABEL_ROW] %= len(LABELS)
@@ -81,11 +79,9 @@ def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
     )  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(whole[:-1] + b"\x07")
-    with pytest.raises(vvgt_library.DataError, match="layer number 7"):
-        read_ply(tmp_path / "b.ply")
+    refused(vvgt_library.DataError, "layer number 7", read_ply, tmp_path / "b.ply")
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live layer 0.25", b"live layer zero", 1))
-    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
-        read_ply(tmp_path / "c.ply")
+    refused(vvgt_library.DataError, "expected one that vvgt writes", read_ply, tmp_path / "c.ply")
     scalars = replace(several(), others=(replace(values(RAMP), name="pet", distance=1.0),))
     live = some.live.copy()  # type: ignore[union-attr]
     live[:, LABEL_ROW] = 0
@@ -145,11 +141,9 @@ def test_layers_lie_where_they_are_in_the_world(pair: Path) -> None:
     """In memory and in blocks."""
     for name in ("live.ply", "blocked.ply"):
         some, header = read_ply(pair / name)
-        assert header.live is not None
         assert [layer.name for layer in header.live.layers] == ["left", "right", "top_label"]
         assert [len(layer.labels) for layer in header.live.layers] == [0, 0, 1]
         live = some.live
-        assert live is not None
         number = live[:, LAYER_ID].astype(int)
         assert (np.bincount(number) > 40).all()
         bright = [np.flatnonzero((number == k) & (live[:, 0] > 0.6)) for k in (0, 1)]
@@ -160,26 +154,24 @@ def test_layers_lie_where_they_are_in_the_world(pair: Path) -> None:
 
 def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     live = pair / "live.ply"
-    assert vvgt("recolor", live, "-o", tmp_path / "own.ply").code == 0
+    vvgt.ok("recolor", live, "-o", tmp_path / "own.ply")
     nothing = {"points": [{"x": 0.9, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.01}]}
     (tmp_path / "n.json").write_text(json.dumps(nothing))
-    assert vvgt("recolor", live, "--layer", f"left,tf={tmp_path / 'n.json'}", "-o", tmp_path / "r.ply").code == 0
+    vvgt.ok("recolor", live, "--layer", f"left,tf={tmp_path / 'n.json'}", "-o", tmp_path / "r.ply")
     own, less = read_ply(tmp_path / "own.ply")[0], read_ply(tmp_path / "r.ply")[0]
     assert 0.3 * len(own) < len(less) < 0.9 * len(own)
-    again = vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")})
-    assert len(again.gaussians) == len(less)
+    assert len(vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")}).gaussians) == len(less)
     (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
     (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
     hidden, dark = f"2,labels={tmp_path / 'none.json'}", f"tf={tmp_path / 'dark.json'}"
-    assert vvgt("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply").code == 0
-    assert vvgt("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply").code == 0
+    vvgt.ok("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply")
+    vvgt.ok("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply")
     without = [len(read_ply(tmp_path / f"{name}.ply")[0]) for name in "hd"]
     seen = [int((read_ply(live)[0].live[:, LAYER_ID] == number).sum()) for number in (2, 0)]  # type: ignore[index]
     for left, gone in zip(without, seen, strict=True):
         assert len(own) - gone <= left < len(own)
     every = ("--layer", hidden, "--layer", f"0,{dark}", "--layer", f"1,{dark}")
-    done = vvgt("recolor", live, *every, "-o", tmp_path / "x.ply")
-    assert (done.code, "not one of" in done.error) == (1, True), done.error
+    assert "not one of" in vvgt.fails(1, "recolor", live, *every, "-o", tmp_path / "x.ply")
     for more, said in (
         (("--tf", "viridis"), "3 layers, each with its own look"),
         (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),
@@ -187,13 +179,12 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
         (("--layer", "2,tf=viridis"), "carry labels, not values"),
         (("--layer", "0"), "expected LAYER,tf=TF"),
     ):
-        done = vvgt("recolor", live, *more, "-o", tmp_path / "x.ply")
-        assert (done.code, said in done.error) == (2, True), done.error
+        assert said in vvgt.fails(2, "recolor", live, *more, "-o", tmp_path / "x.ply")
     told = json.loads(vvgt("info", live, "--json").out)["live_layers"]
     assert [row["name"] for row in told] == ["left", "right", "top_label"]
     under = json.loads(vvgt("info", live, "--json", "--layer", "1,tf=viridis").out)
     assert "viridis" in under["function"]
-    assert vvgt("render", live, "--layer", "2,labels=auto", "--orbit", 1, "--size", 32, "-o", tmp_path / "p").code == 0
+    vvgt.ok("render", live, "--layer", "2,labels=auto", "--orbit", 1, "--size", 32, "-o", tmp_path / "p")
 
 
 def test_layers_are_near_their_volume(vvgt, pair) -> None:
@@ -201,11 +192,10 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     source += ("--layer", f"{pair / 'right.nii'},tf={pair / 'tf.json'}")
     source += ("--layer", f"{pair / 'top_label.nii'},labels={pair / 't.json'}")
     for name in ("live.ply", "blocked.ply"):
-        done = vvgt("evaluate", pair / name, *source, "--json", "--no-conditions")
-        assert done.code == 0, done.err
+        done = vvgt.ok("evaluate", pair / name, *source, "--json", "--no-conditions")
         assert json.loads(done.out)["scores"]["psnr"] > 21
-    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
-    assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
+    done = vvgt.fails(2, "evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
+    assert "the Gaussians carry values, values, labels" in done
 
 
 def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tmp_path) -> None:
@@ -216,27 +206,24 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
     source = (pair / "left.nii", "--tf", pair / "tf.json", "--layer", f"{pair / 'right.nii'},{dark}")
     one = (*source, "--layer", f"{pair / 'top_label.nii'},{hidden}")
     looks = ("--layer", f"1,{dark}", "--layer", f"2,{hidden}")
-    assert vvgt("recolor", pair / "live.ply", *looks, "-o", tmp_path / "r.ply").code == 0
+    vvgt.ok("recolor", pair / "live.ply", *looks, "-o", tmp_path / "r.ply")
     for blocks in ((), ("--blocks", "16")):
         scores = []
         for file in (pair / "live.ply", tmp_path / "r.ply"):
-            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
-            assert done.code == 0, done.err
+            done = vvgt.ok("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
             scores.append(json.loads(done.out)["scores"]["psnr"])
         assert scores[0] == pytest.approx(scores[1], abs=0.01)
         assert scores[0] > 22
-        assert vvgt("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite").code == 0
+        vvgt.ok("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite")
         number = read_ply(tmp_path / "l.ply")[0].live[:, LAYER_ID]  # type: ignore[index]
         assert (np.bincount(number.astype(int)) > 40).all()
     every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
-    done = vvgt("evaluate", pair / "live.ply", "--volume", *every)
-    assert (done.code, "nothing is visible" in done.error) == (1, True), done.error
+    assert "nothing is visible" in vvgt.fails(1, "evaluate", pair / "live.ply", "--volume", *every)
 
 
 def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
-    assert vvgt("view", pair / "live.ply", "-o", tmp_path / "a.html").code == 0
+    vvgt.ok("view", pair / "live.ply", "-o", tmp_path / "a.html")
     found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)
-    assert found is not None
     layers = json.loads(found[1])["live"]["layers"]
     assert [(layer["title"], layer["row"], len(layer["labels"])) for layer in layers] == [
         ("left", 0, 0),
@@ -253,7 +240,6 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
     saved = cloud.with_layers(sent)
     facts = saved.options.live
-    assert facts is not None
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
     assert facts.layers[2].labels[0].opacity == 0.25
     assert facts.layers[2].labels[0].name == "top"
@@ -274,7 +260,6 @@ def test_channels_in_python(tmp_path) -> None:
     tifffile.imwrite(tmp_path / "c.ome.tif", data, metadata={"axes": "ZCYX"}, ome=True)
     with pytest.warns(UserWarning, match="2 channels"):
         result = vvgt_library.convert(str(tmp_path / "c.ome.tif"), None, {"max_gaussians": 400, "size": 48}, live=True)
-    assert result.ply.live is not None
     assert len(result.ply.live.layers) == 2
     other = result.recolor(layers={1: "magma"})
     assert other.ply.function is not None

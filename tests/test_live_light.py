@@ -1,7 +1,5 @@
 """Light on Gaussians that carry values, without the volume."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -47,8 +45,7 @@ def exact(color: np.ndarray, n: np.ndarray, d: np.ndarray, light: Lighting) -> n
 @pytest.mark.parametrize("light", [HEAD, SIDE, replace(HEAD, specular=0.0), replace(SIDE, specular=0.0)])
 def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lighting) -> None:
     """Of a share of the matter that faces along the axis; the rest faces all directions."""
-    rng = np.random.default_rng(2)
-    axis, share = rng.normal(size=(5, 3)), np.array([1.0, 0.8, 0.5, 0.2, 0.01])
+    axis, share = np.random.default_rng(2).normal(size=(5, 3)), np.array([1.0, 0.8, 0.5, 0.2, 0.01])
     axis *= (share / np.linalg.norm(axis, axis=1))[:, None]
     shaded, everywhere = relight(grey(axis), axis, light), sphere(2000)
     assert shaded.degree == (2 if light.depends_on_view else 0)
@@ -76,7 +73,6 @@ def test_a_light_turns_with_its_gaussians() -> None:
     some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN), np.array([2.0, -1.0, 0.7])
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
-        assert gaussians.live is not None
         return relight(apply_look(gaussians, table), gaussians.live[:, AXIS], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
@@ -102,7 +98,7 @@ def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_pa
     assert (header.light, header.sh_degree) == (Lighting(), 2)
     found = {}
     for name, more in {"as": (), "none": ("--light", "none"), "x": ("--light", "x", "--specular", 0)}.items():
-        assert vvgt("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply").code == 0
+        vvgt.ok("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply")
         found[name] = read_ply(tmp_path / f"{name}.ply")
     assert found["as"][1].light == header.light
     assert found["none"][1].light is None
@@ -117,19 +113,18 @@ def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_pa
         shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
         scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--size", 48).out)["scores"]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
-    assert vvgt("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a").code == 0
-    assert vvgt("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b").code == 0
+    vvgt.ok("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a")
+    vvgt.ok("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b")
     assert next((tmp_path / "a").glob("*.png")).read_bytes() != next((tmp_path / "b").glob("*.png")).read_bytes()
 
 
 def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> None:
     for more in (("--light", "x", "--shadows"), ("--light", "headlight", "--ambient-occlusion")):
-        done = vvgt("convert", "example:blob:12", "--live", *more, "-o", tmp_path / "a.ply", *SMALL)
-        assert (done.code, more[2] in done.error) == (2, True)
+        assert more[2] in vvgt.fails(2, "convert", "example:blob:12", "--live", *more, "-o", tmp_path / "a.ply", *SMALL)
     with pytest.raises(vvgt_library.UsageError, match="need the volume"):
         vvgt_library.recolor(lit_file, light=LightOptions(("x",), shadows=True))
-    done = vvgt("recolor", lit_file, "--ambient", "0.5", "--light", "none", "-o", tmp_path / "a.ply")
-    assert (done.code, "there is no light" in done.error) == (2, True)
+    done = vvgt.fails(2, "recolor", lit_file, "--ambient", "0.5", "--light", "none", "-o", tmp_path / "a.ply")
+    assert "there is no light" in done
     assert not list(tmp_path.iterdir())
 
 

@@ -1,7 +1,5 @@
 """Live files of a time series: one function and one range for all frames, in files, in Python, and in one page."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -43,8 +41,8 @@ def scene_of(page: bytes) -> dict:
 def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) -> None:
     """And so do the files of the frames; each frame's bytes are those of its file."""
     source = ("convert", frames / "f?.npy", "--tf", "viridis", "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
-    assert vvgt(*source, "-o", tmp_path / "f_{}.ply").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
+    vvgt.ok(*source, "-o", tmp_path / "f_{}.ply")
     content = (tmp_path / "p.html").read_bytes()
     scene = scene_of(content)
     live = scene["live"]
@@ -53,16 +51,13 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
     largest = []
     for k in range(3):
         some, header = read_ply(tmp_path / f"f_{k}.ply")
-        assert header.live is not None
         assert [header.live.lo, header.live.hi] == live["layers"][0]["values"]
         assert list(header.live.histogram) == live["layers"][0]["histogram"]
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
-        assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
         stream = np.zeros((len(some), BYTES), np.uint8)
         stream[:, :ROW] = planes.T
         back = from_bytes(stream, live)
-        assert some.live is not None
         span = live["layers"][0]["values"][1] - live["layers"][0]["values"][0]
         np.testing.assert_allclose(np.sort(back[:, 0]), np.sort(some.live[:, 0]), atol=span / 500)
         np.testing.assert_allclose(np.sort(back[:, 2]), np.sort(some.live[:, 2]), rtol=0.03)
@@ -100,13 +95,12 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
         data[:, :, 5:] = numbers[1]
         np.save(tmp_path / f"map_label_{k}.npy", data)
     source = ("convert", tmp_path / "map_label_?.npy", "--labels", "auto", "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
     content = (tmp_path / "p.html").read_bytes()
     live = scene_of(content)["live"]
     assert [label["number"] for label in live["layers"][0]["labels"]] == [1, 7, 9]
     for k, rows in enumerate(({0, 1}, {0, 2})):
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
-        assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(BYTES, -1)
         assert set(planes[ROW].tolist()) == rows
 
@@ -119,8 +113,8 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
     np.save(tmp_path / "map.npy", map_)
     layer = ("--layer", f"{tmp_path / 'map.npy'},labels=auto")
     source = ("convert", frames / "f?.npy", "--tf", "viridis", *layer, "--live", *SMALL)
-    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
-    assert vvgt(*source, "-o", tmp_path / "f_{}.ply").code == 0
+    vvgt.ok(*source, "-o", tmp_path / "p.html")
+    vvgt.ok(*source, "-o", tmp_path / "f_{}.ply")
     content = (tmp_path / "p.html").read_bytes()
     live = scene_of(content)["live"]
     assert [(one["row"], [label["number"] for label in one["labels"]]) for one in live["layers"]] == [
@@ -140,19 +134,13 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
 
 def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
-    ball, low = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32), (z < -0.5).astype(np.uint8)
+    ball = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32)
     for k in range(3):
         np.save(tmp_path / f"f{k}.npy", ball * (k != 1))
-    np.save(tmp_path / "low.npy", low)
+    np.save(tmp_path / "low.npy", (z < -0.5).astype(np.uint8))
     (tmp_path / "tf.json").write_text(json.dumps(TF))
-    source = (
-        "convert",
-        tmp_path / "f?.npy",
-        "--tf",
-        tmp_path / "tf.json",
-        "--layer",
-        f"{tmp_path / 'low.npy'},labels=auto",
-    )
+    low = f"{tmp_path / 'low.npy'},labels=auto"
+    source = ("convert", tmp_path / "f?.npy", "--tf", tmp_path / "tf.json", "--layer", low)
     done = vvgt(*source, "--live", *SMALL, "-o", tmp_path / "f_{}.ply")
     assert (done.code, "skipped: f1 (only background)" in done.err) == (0, True), done.err
     for k, numbers in enumerate(([0, 1], [1], [0, 1])):
@@ -165,7 +153,6 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     value, named = several().layers
     first, second = (replace(value, others=(replace(named, labels=some),)) for some in (LABELS[:2], LABELS[1:]))
     both = shared_facts([first, second])
-    assert both is not None
     assert both.layers == (value, replace(named, labels=LABELS))
     for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
         assert shared_facts([first, other]) is None
@@ -173,7 +160,6 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
     assert with_shared_labels(layered(4), second, both).live[:, LABEL_ROW].tolist() == [0, 1, 0, 2]  # type: ignore[index]
     other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
     both = shared_facts([first, replace(value, others=(other,))])
-    assert both is not None
     assert [(label.number, label.name) for label in both.others[0].labels] == [
         (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
     ]  # fmt: skip

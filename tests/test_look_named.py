@@ -1,7 +1,5 @@
 """Named functions and contours of densities: what they are over, where they lie on data, in memory and in blocks."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable
@@ -47,7 +45,7 @@ def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, 
     assert function.opacity_unit_share == 1 / 256
     assert max(function.opacity_nodes.y) <= 0.5
     assert (function.otherwise is not None) == name.startswith("ct-")
-    assert vvgt("tf", "convert", name, tmp_path / "own.json").code == 0
+    vvgt.ok("tf", "convert", name, tmp_path / "own.json")
     again = read_transfer_function(str(tmp_path / "own.json"))
     for one, other in ((function, again), (function.otherwise, again.otherwise)):
         if one is not None:
@@ -124,8 +122,7 @@ def test_densities_are_contoured_when_no_function_is_given(tmp_path: Path, sign:
     shown = from_histogram(numbers, density=volume.density)
     assert shown.name == f"automatic ({name})"
     high, low = values.max(), values.min()
-    noise = np.array([0.1])
-    assert shown.opacity(noise) == 0
+    assert shown.opacity(np.array([0.1])) == 0
     assert shown.opacity(np.array([high])) > 0.2
     assert (shown.opacity(np.array([low])) > 0.2) == (sign < 0)
     assert fitting(numbers, volume) == name
@@ -289,8 +286,7 @@ def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt: Callable, 
     for name, blocks in (("whole", ()), ("wide", ("--blocks", 32)), ("fine", ("--blocks", 16))):
         given = () if tf is None else ("--tf", tf)
         files.append(tmp_path / f"{name}.ply")
-        done = vvgt("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
-        assert done.code == 0, done.err
+        vvgt.ok("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
     whole, wide, fine = (path.read_bytes() for path in files)
     assert wide == fine
     facts = [json.loads(vvgt("info", path, "--json").out) for path in files]

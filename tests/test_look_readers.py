@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.look import read_transfer_function
 
@@ -112,10 +113,7 @@ def test_log_scale_is_kept(file):
 )
 def test_faulty_presets_are_one_clear_line(file, fields, message):
     path = file([changed(PRESET, **fields)])
-    with pytest.raises(DataError, match=message) as caught:
-        read_transfer_function(path)
-    assert path in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert path in refused(DataError, message, read_transfer_function, path)
 
 
 def test_minimal_json_on_data_values(file):
@@ -162,10 +160,7 @@ def test_minimal_json_on_percentiles(file):
 )
 def test_faulty_minimal_files_are_one_clear_line(file, fields, message):
     path = file(changed(MINIMAL, **fields))
-    with pytest.raises(DataError, match=message) as caught:
-        read_transfer_function(path)
-    assert path in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert path in refused(DataError, message, read_transfer_function, path)
 
 
 @pytest.mark.parametrize(
@@ -181,22 +176,17 @@ def test_faulty_minimal_files_are_one_clear_line(file, fields, message):
     ],
 )
 def test_other_files_are_data_errors(file, content, message):
-    with pytest.raises(DataError, match=message):
-        read_transfer_function(file(content))
+    refused(DataError, message, read_transfer_function, file(content))
 
 
 def test_binary_and_huge_files_are_data_errors(tmp_path):
     (tmp_path / "a.json").write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(DataError, match="not text"):
-        read_transfer_function(str(tmp_path / "a.json"))
+    refused(DataError, "not text", read_transfer_function, str(tmp_path / "a.json"))
     with (tmp_path / "b.json").open("wb") as huge:
         huge.truncate(2**24 + 1)
-    with pytest.raises(DataError, match="at most 16 MiB"):
-        read_transfer_function(str(tmp_path / "b.json"))
-    with pytest.raises(UsageError, match="is a folder"):
-        read_transfer_function(str(tmp_path))
-    with pytest.raises(UsageError, match="no such file"):
-        read_transfer_function(str(tmp_path / "none.json"))
+    refused(DataError, "at most 16 MiB", read_transfer_function, str(tmp_path / "b.json"))
+    refused(UsageError, "is a folder", read_transfer_function, str(tmp_path))
+    refused(UsageError, "no such file", read_transfer_function, str(tmp_path / "none.json"))
 
 
 def test_byte_order_mark_is_accepted(tmp_path):
@@ -234,8 +224,7 @@ def test_colormap_names():
     ],
 )
 def test_bad_names_are_usage_errors(source, message):
-    with pytest.raises(UsageError, match=message):
-        read_transfer_function(source)
+    refused(UsageError, message, read_transfer_function, source)
 
 
 JSON_VALUES = st.recursive(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look import (
     ColorMap,
@@ -89,16 +90,14 @@ def test_unit_nodes_on_data_that_reach_a_little_beyond_are_data_values(values):
 
 
 def test_unit_nodes_on_unit_data_are_data_values(recwarn):
-    inside = statistics([0.2, 0.9])
-    assert resolve(function(x=(0, 0.5, 1)), inside).node_range() == (0, 1)
+    assert resolve(function(x=(0, 0.5, 1)), statistics([0.2, 0.9])).node_range() == (0, 1)
     assert resolve(function(x=(0, 0.5, 1)), DATA, "0,1").node_range() == (0, 1)
     assert not recwarn.list
 
 
 @pytest.mark.parametrize("spec", ["all", "1", "1,2,3", "2,1", "1,1", "nan,1", "0,inf", "", (1,)])
 def test_bad_ranges_are_usage_errors(spec):
-    with pytest.raises(UsageError, match="--tf-range"):
-        resolve(function(), DATA, spec)
+    refused(UsageError, "--tf-range", resolve, function(), DATA, spec)
 
 
 def test_fractions_follow_the_data_or_the_range():
@@ -107,26 +106,21 @@ def test_fractions_follow_the_data_or_the_range():
     assert resolve(tf, DATA).domain == "data"
     assert resolve(tf, DATA, "rescale").opacity_nodes.x.tolist() == [0, 200]
     assert resolve(tf, DATA, "0,8").opacity_nodes.x.tolist() == [2, 6]
-    constant = statistics(np.full(10, 7.0))
-    assert resolve(tf, constant).opacity(np.array([7.0])).tolist() == [1]
+    assert resolve(tf, statistics(np.full(10, 7.0))).opacity(np.array([7.0])).tolist() == [1]
 
 
 def test_percentiles_follow_the_histogram():
-    rng = np.random.default_rng(0)
-    values = rng.exponential(10, 100_000)
+    values = np.random.default_rng(0).exponential(10, 100_000)
     tf = function(x=(0, 0.5, 0.9), y=(0, 0.1, 1), domain="percentile")
     resolved = resolve(tf, statistics(values))
     expected = np.quantile(values, [0, 0.5, 0.9])
     np.testing.assert_allclose(resolved.breakpoints(), expected, atol=(values.max() - values.min()) / 256)
-    with pytest.raises(UsageError, match="omit --tf-range"):
-        resolve(tf, statistics(values), "rescale")
+    refused(UsageError, "omit --tf-range", resolve, tf, statistics(values), "rescale")
 
 
 def test_a_function_of_one_position_cannot_be_stretched():
-    with pytest.raises(DataError, match="two positions"):
-        resolve(function(x=(5,), y=(1,)), DATA, "rescale")
-    with pytest.raises(DataError, match="cannot stretch"):
-        resolve(function(), statistics([3.0, 3.0]), "rescale")
+    refused(DataError, "two positions", resolve, function(x=(5,), y=(1,)), DATA, "rescale")
+    refused(DataError, "cannot stretch", resolve, function(), statistics([3.0, 3.0]), "rescale")
 
 
 def test_unit_distance_by_paraview_and_by_spacing():
@@ -164,8 +158,7 @@ def test_unit_distance_of_flat_volumes():
 
 @pytest.mark.parametrize("spec", ["0", "-1", "nan", "inf", "vtk", 0.0])
 def test_bad_unit_distances_are_usage_errors(spec):
-    with pytest.raises(UsageError, match="--opacity-unit-distance"):
-        unit_distance(spec, Volume(np.zeros((2, 2, 2), np.uint8)))
+    refused(UsageError, "--opacity-unit-distance", unit_distance, spec, Volume(np.zeros((2, 2, 2), np.uint8)))
 
 
 def test_support_is_where_opacity_is_above_zero():
@@ -192,8 +185,7 @@ def test_support_of_steps_and_bumps_beyond_the_ends():
 def test_nothing_visible_is_an_error_with_both_ranges():
     with pytest.raises(DataError, match=r"the data lie in \[-100, 300\], opacity is above 0 in \[400, inf\]"):
         check_visible(function(x=(0, 400, 500), y=(0, 0, 1)), DATA)
-    with pytest.raises(DataError, match="nowhere"):
-        check_visible(function(y=(0, 0, 0)), DATA)
+    refused(DataError, "nowhere", check_visible, function(y=(0, 0, 0)), DATA)
     check_visible(function(), DATA)
     check_visible(function(x=(0, 299, 500), y=(0, 0, 1)), DATA)
 
@@ -205,8 +197,7 @@ def test_data_without_finite_voxels_are_an_error():
         lambda: check_visible(function(), empty),
         lambda: from_histogram(empty),
     ):
-        with pytest.raises(DataError, match="no finite voxel"):
-            use()
+        refused(DataError, "no finite voxel", use)
 
 
 def ct_values(air=60_000):
@@ -243,8 +234,7 @@ def test_automatic_function_hides_the_background_and_shows_the_rest(name, values
     assert tf.opacity(np.array([numbers.hi]))[0] == pytest.approx(0.5)
     depth = 256 * -np.log1p(-tf.opacity(values)).mean()  # along the longest edge, on average
     assert 1 < depth < 4.5
-    again = from_histogram(statistics(values))
-    assert again.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
+    assert from_histogram(statistics(values)).opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
 
 
 def test_automatic_function_shows_both_sides_of_an_ambient_value():
@@ -268,8 +258,7 @@ def test_automatic_function_of_hounsfield_units_shows_tissue_by_them():
         assert 0 < fat < organ < 0.006 < 0.29 < bone
     crop = statistics(ct_values(air=0))
     assert from_histogram(crop).name == "automatic (histogram)"
-    told = from_histogram(crop, hounsfield=True)
-    assert told.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
+    assert from_histogram(crop, hounsfield=True).opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
     dark = statistics(np.linspace(-2000, -900, 1000))
     assert from_histogram(dark, hounsfield=True).name == "automatic (histogram)"
 
@@ -290,8 +279,7 @@ def test_automatic_function_shows_the_whole_of_a_crop_without_air():
 
 
 def test_automatic_function_of_labels_shows_no_others_between_them():
-    labels = np.repeat([0.0, 1, 2, 3, 4], [90_000, 6000, 50, 3000, 950])
-    tf = from_histogram(statistics(labels))
+    tf = from_histogram(statistics(np.repeat([0.0, 1, 2, 3, 4], [90_000, 6000, 50, 3000, 950])))
     at = tf.opacity(np.arange(5.0))
     assert at[0] == 0
     assert at[[2, 4]] == pytest.approx(0.5, rel=0.02)  # rare ones are thick; within half a bin
@@ -321,8 +309,7 @@ def test_drawing_shows_the_colors_and_is_written_whole(tmp_path):
     picture = read_png(tmp_path / "a.png")[..., :3]
     assert ((picture - (1, 0, 0)) ** 2).sum(-1).min() < 1e-6
     assert (np.abs(picture - (1, 0, 0)).max(-1) < 0.02).mean() > 0.4
-    with pytest.raises(UsageError, match="--overwrite"):
-        draw(red, DATA, tmp_path / "a.png")
+    refused(UsageError, "--overwrite", draw, red, DATA, tmp_path / "a.png")
     before = (tmp_path / "a.png").read_bytes()
     draw(red, DATA, tmp_path / "a.png", overwrite=True)
     assert (tmp_path / "a.png").read_bytes() == before
@@ -333,9 +320,6 @@ def test_drawing_shows_the_colors_and_is_written_whole(tmp_path):
 
 
 def test_node_positions_of_other_domains_lie_in_the_unit_interval():
-    with pytest.raises(DataError, match="for a fraction"):
-        function(domain="fraction")
-    with pytest.raises(DataError, match="node domain 'log'"):
-        function(domain="log")
-    with pytest.raises(DataError, match="unit distance -1"):
-        function(opacity_unit_distance=-1)
+    refused(DataError, "for a fraction", function, domain="fraction")
+    refused(DataError, "node domain 'log'", function, domain="log")
+    refused(DataError, "unit distance -1", function, opacity_unit_distance=-1)

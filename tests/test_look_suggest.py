@@ -16,8 +16,7 @@ from vvgt_cli.volume import Volume, statistics
 
 
 def of(values, count=10, voxels=64.0):
-    values = np.asarray(values)
-    numbers = statistics(Volume(values.reshape(-1, 1, 1)))
+    numbers = statistics(Volume(np.asarray(values).reshape(-1, 1, 1)))
     return numbers, suggest(numbers, count, voxels, 0.5)
 
 
@@ -80,9 +79,7 @@ def test_colours_are_told_apart(count):
 
 
 def test_files_are_functions_and_the_same_ones_again(vvgt, tmp_path):
-    first = vvgt("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "a")
-    assert first.code == 0
-    paths = first.out.decode().split()
+    paths = vvgt.ok("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "a").out.decode().split()
     assert paths == [str(tmp_path / "a" / f"band_{k}.json") for k in (1, 2, 3)]
     vvgt("tf", "suggest", "example:marschner-lobb:24", "-n", 3, "-o", tmp_path / "b")
     for path in (tmp_path / "a").iterdir():
@@ -98,7 +95,7 @@ def test_files_are_functions_and_the_same_ones_again(vvgt, tmp_path):
 
 @pytest.mark.parametrize("volume", ["example:marschner-lobb:32", "example:random:32", "example:blob:32"])
 def test_pictures_are_neither_empty_nor_a_silhouette(vvgt, tmp_path, volume):
-    assert vvgt("tf", "suggest", volume, "-n", 4, "-o", tmp_path / "a").code == 0
+    vvgt.ok("tf", "suggest", volume, "-n", 4, "-o", tmp_path / "a")
     camera = default_views("test", size=48)[4]
     for path in (tmp_path / "a").iterdir():
         scene = load(SourceRequest(volume, tf=str(path))).scene()
@@ -112,13 +109,11 @@ def test_what_cannot_be_suggested(vvgt, tmp_path):
     with pytest.raises(DataError, match="every value of the data is 7"):
         suggest(numbers, 3, 2.0, 1.0)
     call = ("tf", "suggest", "example:blob:8", "-o", tmp_path / "a", "-n", 2)
-    assert vvgt(*call).code == 0
+    vvgt.ok(*call)
     (tmp_path / "a" / "band_1.json").write_text("mine")
-    again = vvgt(*call)
-    assert again.code == 2
-    assert "--overwrite" in again.error
+    assert "--overwrite" in vvgt.fails(2, *call)
     assert (tmp_path / "a" / "band_1.json").read_text() == "mine"
-    assert vvgt(*call, "--overwrite").code == 0
+    vvgt.ok(*call, "--overwrite")
     assert (tmp_path / "a" / "band_1.json").read_text() != "mine"
     assert "no directory" in vvgt("tf", "suggest", "example:blob:8", "-o", tmp_path / "b" / "c").error
     assert "is a file" in vvgt("tf", "suggest", "example:blob:8", "-o", tmp_path / "a" / "band_1.json").error

@@ -5,6 +5,7 @@ import pytest
 from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
 from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import SPACES, ColorMap, PiecewiseOpacity
 
@@ -78,14 +79,10 @@ def test_nodes_are_sorted_and_equal_ones_keep_their_order():
     ],
 )
 def test_bad_nodes_are_named(x, y, message):
-    with pytest.raises(DataError, match=message):
-        PiecewiseOpacity(x, y)
+    refused(DataError, message, PiecewiseOpacity, x, y)
 
 
 def test_bad_colors_are_named():
-    with pytest.raises(DataError, match="colour space 'XYZ'; expected one of RGB"):
-        ColorMap([0], [[0, 0, 0]], space="XYZ")
-    with pytest.raises(DataError, match="colour 2"):
-        ColorMap([0], [[0, 2, 0]])
-    with pytest.raises(DataError, match="shape"):
-        ColorMap([0, 1], [[0, 0, 0]])
+    refused(DataError, "colour space 'XYZ'; expected one of RGB", ColorMap, [0], [[0, 0, 0]], space="XYZ")
+    refused(DataError, "colour 2", ColorMap, [0], [[0, 2, 0]])
+    refused(DataError, "shape", ColorMap, [0, 1], [[0, 0, 0]])

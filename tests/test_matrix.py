@@ -1,7 +1,5 @@
 """Every feature with a volume in memory and in blocks: it works, and the errors of the two agree."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -101,8 +99,7 @@ ROWS = {
 def converted(vvgt, volume, options, out: Path, *more):
     """The report of a conversion."""
     report = out.with_suffix(".report.json")
-    found = vvgt("convert", volume, *SMALL, *options, *more, "-o", out, "--report", report, "--overwrite")
-    assert found.code == 0, found.err
+    vvgt.ok("convert", volume, *SMALL, *options, *more, "-o", out, "--report", report, "--overwrite")
     return json.loads(report.read_text())
 
 
@@ -136,7 +133,7 @@ def test_a_feature_works_in_memory_and_in_blocks_and_errors_agree(vvgt, at, tmp_
 @pytest.mark.parametrize("row", ["directions", "layers"])
 def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, row):
     volume, options = ROWS[row]
-    assert vvgt("init", volume, *options, *FEWEST[:4], "-o", tmp_path / "a.ply").code == 0
+    vvgt.ok("init", volume, *options, *FEWEST[:4], "-o", tmp_path / "a.ply")
     shared = ("evaluate", tmp_path / "a.ply", "--volume", volume, *options, "--step", "1", "--json")
     memory, blocks = (json.loads(vvgt(*shared, *more).out) for more in ((), BLOCKS))
     assert memory["reference_psnr"] == pytest.approx(blocks["reference_psnr"], abs=CLOSER)
@@ -160,8 +157,7 @@ def test_the_bytes_do_not_depend_on_the_blocks(vvgt, at, tmp_path, blocks_of_16,
 
 @pytest.mark.parametrize("ending", SUFFIXES[1:])
 def test_every_format_in_blocks(vvgt, at, tmp_path, ending):
-    found = vvgt("convert", "scalars.nii", "--tf", "tf.json", *FEWEST, *BLOCKS, "-o", tmp_path / f"x{ending}")
-    assert found.code == 0, found.err
+    found = vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *FEWEST, *BLOCKS, "-o", tmp_path / f"x{ending}")
     assert "the format costs" in found.err
     assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
 
@@ -171,11 +167,8 @@ class TestEitherWay:
     """What has no error of its own to compare."""
 
     def test_preview_and_checkpoint(self, vvgt, at, tmp_path, blocks):
-        found = vvgt(
-            "convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / "x.ply",
-            "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept",
-        )  # fmt: skip
-        assert found.code == 0, found.err
+        more = ("-o", tmp_path / "x.ply", "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept")
+        vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, *more)
         picture = read_png(tmp_path / "x.png")
         assert picture.shape[:2] == (3 * 64, 3 * 64)
         assert picture[:, :64].max() > 0.5
@@ -183,18 +176,14 @@ class TestEitherWay:
 
     def test_time_budget_and_dry_run(self, vvgt, at, tmp_path, blocks):
         base = ("convert", "scalars.nii", "--tf", "tf.json", *FEWEST[:4], *blocks)
-        found = vvgt(*base, "--time-budget", "60", "-o", tmp_path / "x.ply")
-        assert found.code == 0, found.err
-        found = vvgt(*base, "--dry-run", "-o", tmp_path / "y.ply")
-        assert found.code == 0, found.err
-        assert b"closed form" in found.out
+        vvgt.ok(*base, "--time-budget", "60", "-o", tmp_path / "x.ply")
+        assert b"closed form" in vvgt.ok(*base, "--dry-run", "-o", tmp_path / "y.ply").out
         assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]
 
     def test_several_functions(self, vvgt, at, tmp_path, blocks):
         both = ("--tf", "tf.json", "--tf", "other.json")
-        assert vvgt("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply").code == 0
-        found = vvgt("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x.html")
-        assert found.code == 0, found.err
+        vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
+        vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x.html")
         names = ["x.html", "x_index.json", "x_other.ply", "x_tf.ply"]
         assert sorted(path.name for path in tmp_path.iterdir()) == names
         rows = json.loads((tmp_path / "x_index.json").read_text())["files"]
@@ -211,8 +200,7 @@ class TestEitherWay:
         ids=["scalars", "lit", "labels", "colours"],
     )
     def test_a_series(self, vvgt, at, tmp_path, blocks, volume, options):
-        found = vvgt("convert", volume, *options, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
-        assert found.code == 0, found.err
+        vvgt.ok("convert", volume, *options, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
         assert {"x_0.ply", "x_1.ply"} <= {path.name for path in tmp_path.iterdir()}
         index = json.loads((tmp_path / "x_index.json").read_text())
         assert [(row["frame"], row["file"], row["psnr"] > 15) for row in index["files"]] == [
@@ -220,14 +208,12 @@ class TestEitherWay:
         ]  # fmt: skip
 
     def test_a_series_as_a_page(self, vvgt, at, tmp_path, blocks):
-        found = vvgt("convert", "four.nii", "--tf", "tf.json", *FEWEST, *blocks, "-o", tmp_path / "x.html")
-        assert found.code == 0, found.err
+        vvgt.ok("convert", "four.nii", "--tf", "tf.json", *FEWEST, *blocks, "-o", tmp_path / "x.html")
         assert [path.name for path in tmp_path.iterdir()] == ["x.html"]
 
     @pytest.mark.parametrize("light", [(), ("--light", "headlight")], ids=["unlit", "lit"])
     def test_labels_one_by_one(self, vvgt, at, tmp_path, blocks, light):
-        found = vvgt("convert", "labels.nii", "--split-labels", *light, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
-        assert found.code == 0, found.err
+        vvgt.ok("convert", "labels.nii", "--split-labels", *light, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
         index = json.loads((tmp_path / "x_index.json").read_text())
         assert [row["label"] for row in index["files"]] == [1, 2, 3]
 
@@ -235,27 +221,22 @@ class TestEitherWay:
     def test_the_closed_form_alone(self, vvgt, at, tmp_path, blocks, row):
         volume, options = ROWS[row]
         fit = FEWEST[:4]
-        found = vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
-        assert found.code == 0, found.err
-        assert vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz").code == 0
+        vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
+        vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz")
 
     def test_the_closed_form_alone_under_the_light_of_the_functions_file(self, vvgt, at, tmp_path, blocks):
         base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)
-        assert vvgt(*base, "-o", tmp_path / "x.ply").code == 0
+        vvgt.ok(*base, "-o", tmp_path / "x.ply")
         assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
-        assert vvgt(*base, "-o", tmp_path / "y" / "lod-meta.json").code == 0
-        assert vvgt(*base, "--light", "none", "-o", tmp_path / "z" / "lod-meta.json").code == 0
+        vvgt.ok(*base, "-o", tmp_path / "y" / "lod-meta.json")
+        vvgt.ok(*base, "--light", "none", "-o", tmp_path / "z" / "lod-meta.json")
         lit, plain = (vvgt_cli.read_ply(tmp_path / name / "lod-meta.json")[0] for name in "yz")
         assert np.abs(lit.colors.mean(axis=0) - plain.colors.mean(axis=0)).max() > 0.05
 
     @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
         volume, options = ROWS[row]
-        found = vvgt(
-            "render-views", volume, *options, *blocks, "--views", "3", "--test-views", "1", "--size", "48",
-            "-o", tmp_path / "views",
-        )  # fmt: skip
-        assert found.code == 0, found.err
+        vvgt.ok("render-views", volume, *options, *blocks, "--views 3 --test-views 1 --size 48 -o", tmp_path / "views")
         assert [path.name for path in tmp_path.iterdir()] == ["views"]
 
 
@@ -264,8 +245,7 @@ def test_pictures_of_blocks_are_those_of_memory(vvgt, at, tmp_path, row):
     volume, options = ROWS[row]
     for name, blocks in (("memory", ()), ("blocks", BLOCKS)):
         few = ("--views", "2", "--test-views", "1", "--size", "48")
-        found = vvgt("render-views", volume, *options, *blocks, *few, "-o", tmp_path / name)
-        assert found.code == 0, found.err
+        vvgt.ok("render-views", volume, *options, *blocks, *few, "-o", tmp_path / name)
     for path in sorted((tmp_path / "memory").glob("t*/*.exr")):
         one, other = (read_exr(tmp_path / name / path.parent.name / path.name)[0] for name in ("memory", "blocks"))
         assert one.max() > 0.3

@@ -1,7 +1,5 @@
 """glTF and USD in metres: a point picked there maps to the scanner's millimetres, and files are read back."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct

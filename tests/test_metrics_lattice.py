@@ -1,7 +1,5 @@
 """The number for a lattice: found where there is one, at its amplitude; and how much of one the closed form has."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -6,6 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.images.metrics import CAP, score_view, score_views
 
@@ -76,8 +77,7 @@ def test_identical_views_and_json():
     assert (scores.psnr, scores.psnr_white, scores.psnr_foreground) == (CAP, CAP, CAP)
     assert scores.ssim == pytest.approx(1, abs=1e-6)
     assert scores.flip == 0
-    record = json.loads(json.dumps(asdict(scores), allow_nan=False))
-    assert record["per_view"][1]["psnr"] == CAP
+    assert json.loads(json.dumps(asdict(scores), allow_nan=False))["per_view"][1]["psnr"] == CAP
 
 
 def test_perceptual_scores_are_none_when_not_requested_or_impossible():
@@ -99,22 +99,16 @@ def test_views_are_read_one_at_a_time():
             held.append(len(held))
             yield view
 
-    lazily = score_views((v for v in reference), render())
-    assert lazily == score_views(reference, reference)
+    assert score_views((v for v in reference), render()) == score_views(reference, reference)
     assert len(held) == 4
 
 
 def test_views_that_do_not_fit_are_refused():
     reference = views(2)
-    with pytest.raises(DataError, match="more reference views"):
-        score_views(reference, reference[:1])
-    with pytest.raises(DataError, match="fewer reference views"):
-        score_views(reference[:1], reference)
-    with pytest.raises(DataError, match="same"):
-        score_views(reference, reference[..., :3])
-    with pytest.raises(DataError, match="no views"):
-        score_views([], [])
+    refused(DataError, "more reference views", score_views, reference, reference[:1])
+    refused(DataError, "fewer reference views", score_views, reference[:1], reference)
+    refused(DataError, "same", score_views, reference, reference[..., :3])
+    refused(DataError, "no views", score_views, [], [])
     broken = reference.copy()
     broken[1, 2, 3, 0] = np.nan
-    with pytest.raises(DataError, match="our view: 1 values are not finite"):
-        score_views(reference, broken)
+    refused(DataError, "our view: 1 values are not finite", score_views, reference, broken)

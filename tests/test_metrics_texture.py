@@ -1,7 +1,5 @@
 """Texture on smooth areas: made pictures of which the answer is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The shipped model: what its card says, and that it helps on a volume that no training has seen."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

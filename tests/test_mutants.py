@@ -1,7 +1,5 @@
 """Which changes `tests/mutants.py` makes to a source file."""
 
-from __future__ import annotations
-
 import ast
 import textwrap
 from pathlib import Path

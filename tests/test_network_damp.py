@@ -1,7 +1,5 @@
 """Steps are halved as long as that lowers the error of views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Slopes of the image error in each Gaussian's own frame: against differences, and what each column says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from network_models import scene
@@ -79,8 +77,7 @@ def test_what_no_view_shows_has_neither_slope_nor_error():
 def test_halved_views_show_what_whole_ones_do():
     gaussians, _, _ = scene(count=50)
     cameras = default_views("train", 2, size=64)
-    views = np.stack([render(gaussians, camera) for camera in cameras])
-    few, small, rule = halved(cameras, views)
+    few, small, rule = halved(cameras, np.stack([render(gaussians, camera) for camera in cameras]))
     assert small.shape == (2, 32, 32, 4)
     assert rule.dilation == DILATION / 4
     for camera, view in zip(few, small, strict=True):

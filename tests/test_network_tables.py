@@ -1,7 +1,5 @@
 """Curves, windows, pooling and neighbours against plain Python; what the network is given, against the cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.random_clouds import extreme_cloud, random_cloud
+from tests.random_clouds import extreme_cloud, random_cloud, turns
+from tests.refused import refused
 from vvgt_cli.cameras import default_views, farthest_cameras
 from vvgt_cli.cameras.quaternions import quaternion
 from vvgt_cli.errors import DataError, UsageError
@@ -45,8 +44,7 @@ def test_hilbert_visits_every_cell_once_and_never_jumps(bits):
     cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     codes = hilbert(cells, bits)
     assert sorted(codes) == list(range(side**3))
-    path = cells[np.argsort(codes)]
-    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+    assert (np.abs(np.diff(cells[np.argsort(codes)], axis=0)).sum(axis=1) == 1).all()
 
 
 def test_transposed_curves_swap_two_axes():
@@ -137,17 +135,10 @@ def test_matrices_project_as_the_cameras_do():
 def test_poses_hold_translation_rotation_and_field_of_view():
     camera = default_views("check")[1]
     pose = view_arrays([camera])["poses"][0]
-    w, x, y, z = pose[3:7]
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    assert np.allclose(rotation, camera.rotation, atol=1e-6)
-    assert w >= 0
+    assert np.allclose(turns(pose[None, 3:7])[0], camera.rotation, atol=1e-6)
+    assert pose[3] >= 0
     assert np.allclose(pose[7:], np.radians(40))
-    half_turn = np.diag([-1.0, 1.0, -1.0])
-    assert np.allclose(np.abs(quaternion(half_turn)), [0, 0, 1, 0], atol=1e-12)
+    assert np.allclose(np.abs(quaternion(np.diag([-1.0, 1.0, -1.0]))), [0, 0, 1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("old", "new"), [(10, 10), (32, 14), (7, 28), (400, 224)])
@@ -157,8 +148,7 @@ def test_resizing_keeps_constants_and_ramps(old, new):
     ramp = weights @ ((np.arange(old) + 0.5) / old).astype(np.float32)
     inner = slice(1 + new // old, -1 - new // old)  # the edge is clamped
     assert np.allclose(ramp[inner], ((np.arange(new) + 0.5) / new)[inner], atol=0.02)
-    image = np.ones((old, old + 3, 4), np.float32)
-    assert np.allclose(resize(image, new), 1, atol=1e-5)
+    assert np.allclose(resize(np.ones((old, old + 3, 4), np.float32), new), 1, atol=1e-5)
 
 
 def test_far_apart_views_are_chosen_whatever_their_order():
@@ -167,8 +157,7 @@ def test_far_apart_views_are_chosen_whatever_their_order():
     assert len(set(chosen)) == 6
     assert farthest_cameras(cameras, 30) == list(range(24))
     order = np.random.default_rng(0).permutation(24)
-    mixed = farthest_cameras([cameras[i] for i in order], 6)
-    assert sorted(order[mixed]) == chosen
+    assert sorted(order[farthest_cameras([cameras[i] for i in order], 6)]) == chosen
     eyes = np.array([camera.position for camera in cameras])[chosen]
     gaps = np.linalg.norm(eyes[:, None] - eyes[None], axis=2) + 10 * np.eye(6)
     assert gaps.min() > 2  # on a sphere of radius 3
@@ -182,7 +171,6 @@ def test_scene_arrays_hold_what_the_switches_ask_for():
     prepared = prepare(gaussians, cameras, images, config)
     assert prepared.views["images"].shape == (2, 8, 28, 28)
     assert prepared.views["images"][:, 4:].max() > 0.01  # the rendering
-    assert prepared.gradients is not None
     assert prepared.gradients.shape == (40, SLOPES)
     flipped = replace(gaussians, quaternions=-2 * gaussians.quaternions)
     assert np.allclose(prepare(flipped, cameras, images, config).gradients, prepared.gradients, atol=1e-4)
@@ -190,8 +178,7 @@ def test_scene_arrays_hold_what_the_switches_ask_for():
     assert (prepared.gradients[:, 10:13] >= 0).all()
     assert prepared.gradients[:, 10:13].max() > 0.9
     assert np.abs(prepared.gradients[:, :13]).max() <= 1 + 1e-6
-    restored = prepared.restore(prepared.rows)
-    assert np.array_equal(restored.means, gaussians.means)
+    assert np.array_equal(prepared.restore(prepared.rows).means, gaussians.means)
 
 
 ONE_PLACE = replace(random_cloud(500), means=np.zeros((500, 3)))
@@ -231,18 +218,12 @@ def test_configs_survive_the_way_through_plain_values():
 def test_a_config_that_makes_no_network_is_refused(change, message):
     values = SMALL.to_dict()
     change(values)
-    with pytest.raises(DataError, match=message):
-        NetworkConfig.from_dict(values)
+    refused(DataError, message, NetworkConfig.from_dict, values)
 
 
 def test_other_values_are_refused():
-    with pytest.raises(UsageError, match="wo_everything"):
-        NetworkConfig(variant="wo_everything")
-    with pytest.raises(DataError, match="multiple"):
-        GeometryConfig(heads=(3, 3, 3, 3, 3))
-    with pytest.raises(DataError, match="4 a head"):
-        ImageConfig(width=150)
-    with pytest.raises(DataError, match="no Gaussians"):
-        prepare(scene(0), [], np.zeros((0, 8, 8, 4)), SMALL)
-    with pytest.raises(DataError, match="no views"):
-        prepare(scene(3), [], np.zeros((0, 8, 8, 4)), SMALL)
+    refused(UsageError, "wo_everything", NetworkConfig, variant="wo_everything")
+    refused(DataError, "multiple", GeometryConfig, heads=(3, 3, 3, 3, 3))
+    refused(DataError, "4 a head", ImageConfig, width=150)
+    refused(DataError, "no Gaussians", prepare, scene(0), [], np.zeros((0, 8, 8, 4)), SMALL)
+    refused(DataError, "no views", prepare, scene(3), [], np.zeros((0, 8, 8, 4)), SMALL)

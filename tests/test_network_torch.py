@@ -1,7 +1,5 @@
 """The network in torch: identity at the start, symmetries, attention against a naive twin, gradients everywhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 
@@ -72,8 +70,7 @@ def test_gradients_reach_every_parameter(config):
     gaussians, cameras, images = scene()
     model = network(config).train()
     out = model(tensors(prepare(gaussians, cameras, images, config).arrays()))
-    weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(0))
-    (out * weights).sum().backward()
+    (out * torch.randn(out.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
         assert torch.isfinite(parameter.grad).all(), name
@@ -126,8 +123,7 @@ def naive_epipolar(module, x, points, matrices, eyes, maps):
                 logits.append(query[token] @ sampled[: module.inner] / module.inner**0.5 + bias[view, token])
                 values.append(sampled[module.inner :])
         if logits:
-            weights = torch.softmax(torch.stack(logits), dim=0)
-            out[token] = module.out(weights @ torch.stack(values))
+            out[token] = module.out(torch.softmax(torch.stack(logits), dim=0) @ torch.stack(values))
     return out
 
 
@@ -158,8 +154,7 @@ def test_the_bias_orders_views_by_distance():
         for raw in (-3.0, 0.0, 3.0):
             module.raw_beta.fill_(raw)
             bias = module.bias(points, eyes, seen)[:, 0]
-            nearest_first = torch.argsort((eyes - points).norm(dim=1))
-            assert (bias[nearest_first].diff() < 0).all()
+            assert (bias[torch.argsort((eyes - points).norm(dim=1))].diff() < 0).all()
         beta = torch.nn.functional.softplus(torch.tensor(3.0))
         assert torch.allclose(bias, -beta * (eyes - points).norm(dim=1) / 3**0.5, atol=1e-5)
 

@@ -1,7 +1,5 @@
 """Labels and layers as nodes of one file: the tree, measures in the world, and the Gaussians of the whole."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path
@@ -82,8 +80,7 @@ def middle(path: Path, node: dict) -> np.ndarray:
 
 
 def test_a_node_of_each_label_where_it_is_in_the_world(vvgt, atlas) -> None:
-    done = vvgt("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "-o", "a.glb")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "-o", "a.glb")
     nodes = tree(atlas / "a.glb")
     assert {name: above for name, (above, _) in nodes.items()} == {
         "Left-Hippocampus": ("Splats", "Left"),
@@ -108,8 +105,8 @@ def test_the_nodes_together_are_the_file_without_nodes(vvgt, atlas, monkeypatch,
         pytest.importorskip("pxr")
     monkeypatch.setattr(HiddenCells, "meet_label", lambda *_: False)  # a few voxels inside are hidden by others
     line = ("convert", "aseg.nii", "--labels", "lut.txt", *blocks)
-    assert vvgt(*line, *SMALL, "-o", f"a{ending}").code == 0
-    assert vvgt(*line, *SMALL[:-1], "-o", "b.ply").code == 0
+    vvgt.ok(*line, *SMALL, "-o", f"a{ending}")
+    vvgt.ok(*line, *SMALL[:-1], "-o", "b.ply")
     (ours, header), (whole, alone) = read_splats(f"a{ending}"), read_splats("b.ply")
     assert header.facts()["affine"] == alone.facts()["affine"]
     columns = [np.column_stack([one.means, one.quaternions, one.colors, one.log_scales]) for one in (ours, whole)]
@@ -129,8 +126,7 @@ def test_usd_has_the_same_tree_and_measures(vvgt, atlas) -> None:
         }
     (atlas / "t.json").write_text(json.dumps(table))
     for ending in (".usdc", ".usdz", ".glb"):
-        done = vvgt("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", f"a{ending}")
-        assert done.code == 0, done.err
+        vvgt.ok("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", f"a{ending}")
     for ending in (".usdc", ".usdz"):
         stage = usd.Stage.Open(f"a{ending}")
         prims = {prim.GetDisplayName(): prim for prim in stage.Traverse()}
@@ -164,39 +160,34 @@ def test_layers_are_nodes_in_one_frame(vvgt, atlas) -> None:
     nib.save(nib.Nifti1Image(ball, np.diag([8.0, 8, 8, 1])), "ct.nii")
     layer = ("--layer", "aseg.nii,labels=lut.txt")
     line = ("convert", "ct.nii", "--tf", "ct-bone", *layer, *SMALL)
-    done = vvgt(*line, "-o", "both.glb")
-    assert done.code == 0, done.err
+    vvgt.ok(*line, "-o", "both.glb")
     nodes = tree(atlas / "both.glb")
     assert nodes["ct"][0] == ("Splats",)
     assert nodes["ctx-lh-superiorfrontal"][0] == ("Splats", "aseg", "Left", "Left cortex")
     for name, centre in (("ct", (44, 44, 44)), ("Left-Hippocampus", CENTRES[17]), ("Right-Hippocampus", CENTRES[53])):
         assert np.abs(middle(atlas / "both.glb", nodes[name][1]) - centre).max() < 4, name
-    each = vvgt(*line, "-o", "x_{}.glb")
-    assert (each.code, "each layer has a frame of its own" in each.error) == (2, True)
-    assert vvgt(*line, "-o", "both.html").code == 0
+    assert "each layer has a frame of its own" in vvgt.fails(2, *line, "-o", "x_{}.glb")
+    vvgt.ok(*line, "-o", "both.html")
 
 
 def test_layers_of_one_name_stay_apart_and_units_must_agree(vvgt, atlas) -> None:
     (atlas / "more").mkdir()
     (atlas / "more/aseg.nii").write_bytes((atlas / "aseg.nii").read_bytes())
     line = ("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "-o", "both.glb", "--overwrite")
-    done = vvgt(*line, "--layer", "more/aseg.nii,labels=lut.txt")
-    assert done.code == 0, done.err
+    vvgt.ok(*line, "--layer", "more/aseg.nii,labels=lut.txt")
     groups = [above[1] for above, _ in tree(atlas / "both.glb").values()]
     assert sorted(set(groups)) == ["aseg", "aseg 2"]
     assert len(groups) == 2 * len(CENTRES)  # no name twice
     np.save("plain_label.npy", np.eye(28, dtype=np.uint8)[None].repeat(28, 0))
-    refused = vvgt(*line, "--layer", "plain_label.npy,labels=auto")
-    assert refused.code == 1
-    assert "plain_label: its lengths are in no stated unit, those of aseg in mm" in refused.error
+    refused = vvgt.fails(1, *line, "--layer", "plain_label.npy,labels=auto")
+    assert "plain_label: its lengths are in no stated unit, those of aseg in mm" in refused
 
 
 def test_a_label_without_a_name_is_no_root(vvgt, atlas) -> None:
     table = {"17": {"name": "", "color": [1, 0, 0]}, "53": {"name": "b", "color": [0, 1, 0]}}
     table |= {number: {"name": number, "color": [0, 0, 1]} for number in ("16", "1028")}
     (atlas / "t.json").write_text(json.dumps(table))
-    done = vvgt("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", "a.glb")
-    assert done.code == 0, done.err
+    vvgt.ok("convert", "aseg.nii", "--labels", "t.json", *SMALL, "-o", "a.glb")
     assert {"label 17", "b"} <= set(tree(atlas / "a.glb"))
 
 
@@ -208,15 +199,14 @@ def test_functions_are_nodes_without_paths(vvgt, tmp_path, monkeypatch) -> None:
         points = [{"x": 0.1, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 1, "opacity": opacity, "rgb": [1, 1, 0]}]
         Path(f"{name}.json").write_text(json.dumps({"points": points}))
     line = ("convert", "ball.npy", "--tf", tmp_path / "bone.json", "--tf", tmp_path / "skin.json", *SMALL[:6])
-    assert vvgt(*line, "-o", "x.glb").code == 0
+    vvgt.ok(*line, "-o", "x.glb")
     assert list(tree(tmp_path / "x.glb")) == ["bone", "skin"]
     assert str(tmp_path).encode() not in (tmp_path / "x.glb").read_bytes()
-    refused = vvgt(*line, "-o", "y.glb", "--preview", "y.png")
-    assert "--preview with one file of several clouds" in refused.error
+    assert "--preview with one file of several clouds" in vvgt(*line, "-o", "y.glb", "--preview", "y.png").error
 
 
 def test_no_comments_no_measures(vvgt, atlas) -> None:
-    assert vvgt("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "--no-comments", "-o", "a.glb").code == 0
+    vvgt.ok("convert", "aseg.nii", "--labels", "lut.txt", *SMALL, "--no-comments", "-o", "a.glb")
     assert [node for _, node in tree(atlas / "a.glb").values() if "extras" in node] == []
 
 
@@ -254,13 +244,13 @@ def test_a_label_that_itk_snap_switches_off_is_there_switched_off(vvgt, atlas, r
     rows = [f'{number} 10 20 30 0.5 {int(number != 16)} 1 "part {number}"' for number in sorted(CENTRES)]
     (atlas / "t.label").write_text("\n".join(rows) + "\n")
     line = ("convert", "aseg.nii", "--labels", "t.label", *SMALL)
-    assert vvgt(*line, "-o", "a_{}.spz").code == 0
+    vvgt.ok(*line, "-o", "a_{}.spz")
     assert [str(one.message) for one in recwarn if "hides" in str(one.message)] == []  # it is in its file
     with pytest.warns(UserWarning, match=r"t.label hides 1 of its labels \(opacity 0\): 16 \(part 16\)"):
-        assert vvgt(*line[:-1], "-o", "a.ply").code == 0
+        vvgt.ok(*line[:-1], "-o", "a.ply")
     (atlas / "u.label").write_text((atlas / "t.label").read_text().replace('0.5 1 1 "part 53', '0 1 1 "part 53'))
     with pytest.warns(UserWarning, match=r"u.label hides 1 of its labels \(opacity 0\): 53 \(part 53\)"):
-        assert vvgt(*line[:3], "u.label", *SMALL, "-o", "b_{}.spz").code == 0
+        vvgt.ok(*line[:3], "u.label", *SMALL, "-o", "b_{}.spz")
     index = {row["label"]: row for row in json.loads((atlas / "a_index.json").read_text())["files"]}
     assert index[16]["visible"] is False
     assert index[16]["opacity"] == 0.5

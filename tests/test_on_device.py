@@ -1,7 +1,5 @@
 """Views and steps on a CUDA device: what of them runs on the CPU against its twins there; all of it where a GPU is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numba as nb

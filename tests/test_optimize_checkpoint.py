@@ -1,13 +1,12 @@
 """A run that is interrupted and goes on ends with the bytes of one that was not."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
 import pytest
 from random_clouds import random_cloud
 
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.refine import OptimizeOptions, optimize
@@ -65,8 +64,7 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
     run(path, after(2))
     before = path.read_bytes()
     for other in ({"steps": 31}, {"start": cloud(seed=3)}, {"method": "adam"}):
-        with pytest.raises(UsageError, match=r"run\.npz"):
-            run(path, **other)
+        refused(UsageError, r"run\.npz", run, path, **other)
     assert path.read_bytes() == before
 
 
@@ -74,11 +72,9 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
 def test_a_damaged_checkpoint_is_refused(content, tmp_path):
     path = tmp_path / "run.npz"
     path.write_bytes(content)
-    with pytest.raises(DataError, match="not a checkpoint"):
-        run(path)
+    refused(DataError, "not a checkpoint", run, path)
     np.savez(path, other=np.zeros(3))
-    with pytest.raises(DataError, match="not a checkpoint"):
-        run(path)
+    refused(DataError, "not a checkpoint", run, path)
 
 
 @pytest.mark.parametrize(
@@ -98,8 +94,7 @@ def test_arrays_that_the_kernels_do_not_take_are_refused(change, tmp_path):
         arrays = dict(file)
     change(arrays)
     np.savez(path, **arrays)
-    with pytest.raises(DataError, match="not a checkpoint"):
-        run(path)
+    refused(DataError, "not a checkpoint", run, path)
 
 
 def test_a_packed_checkpoint_is_refused(tmp_path):
@@ -107,5 +102,4 @@ def test_a_packed_checkpoint_is_refused(tmp_path):
     run(path, after(2))
     with np.load(path) as file:
         np.savez_compressed(path, **dict(file))
-    with pytest.raises(DataError, match="compressed entries"):
-        run(path)
+    refused(DataError, "compressed entries", run, path)

@@ -1,7 +1,5 @@
 """3DGS' density control: limits hold, pictures stay close, what a Gaussian has learned goes with it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

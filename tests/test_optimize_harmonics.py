@@ -1,7 +1,5 @@
 """Descent on harmonics: it finds a view-dependent colour that degree 0 cannot show, and loses none on the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,13 +1,12 @@
 """Refinement as a whole: it gets nearer, never returns less than it was given, stops when told, repeats to the byte."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from random_clouds import random_cloud
 
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
@@ -253,8 +252,7 @@ def test_steps_leave_the_input_alone(scene):
 
 def test_factors_and_back_keep_the_covariance():
     g = truth(200)
-    back = OwnAxes(g, CAMERAS).gaussians()
-    np.testing.assert_allclose(covariances(back), covariances(g), atol=1e-6)
+    np.testing.assert_allclose(covariances(OwnAxes(g, CAMERAS).gaussians()), covariances(g), atol=1e-6)
     flat = Gaussians(
         g.means, np.where([True, True, False], g.log_scales, -11), g.quaternions, g.opacity_logits, g.colors
     )
@@ -263,16 +261,13 @@ def test_factors_and_back_keep_the_covariance():
 
 def test_no_gaussians_stay_none(scene):
     _, images, check = scene
-    none = truth(0)
-    assert len(optimize(none, CAMERAS, images, OptimizeOptions(steps=2), check)[0]) == 0
+    assert len(optimize(truth(0), CAMERAS, images, OptimizeOptions(steps=2), check)[0]) == 0
 
 
 def test_wrong_views_and_options_are_refused(scene):
     start, images, check = scene
-    with pytest.raises(DataError, match="5 training images for 6 cameras"):
-        optimize(start, CAMERAS, images[:5])
-    with pytest.raises(DataError, match="check view"):
-        optimize(start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
+    refused(DataError, "5 training images for 6 cameras", optimize, start, CAMERAS, images[:5])
+    refused(DataError, "check view", optimize, start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
     for wrong in (
         {"method": "sgd"},
         {"steps": -1},

@@ -1,7 +1,5 @@
 """Gradients of the loss: against central differences, and SSIM's value against a plain float64 twin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +18,7 @@ from vvgt_cli.refine.texture import SMOOTH, add_texture_gradient
 
 def pictures(height=31, width=26, seed=0):
     rng = np.random.default_rng(seed)
-    smooth = np.cumsum(rng.normal(0, 0.1, (height, width, 4)), axis=1)
-    image = np.clip(0.5 + smooth, 0, 1)
+    image = np.clip(0.5 + np.cumsum(rng.normal(0, 0.1, (height, width, 4)), axis=1), 0, 1)
     return image, np.clip(image + rng.normal(0, 0.2, image.shape), 0, 1)
 
 

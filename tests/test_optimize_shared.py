@@ -1,7 +1,5 @@
 """Steps in common: what is known of Gaussians, the regression on it, and the kernel against a twin in float64."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Nothing that is not finite, whatever the scene and the rates: 100 steps on every change, 10,000 with --long."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Pages by keyboard and for screen readers: axe-core and the Tab key in a real browser."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterator

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Planes and boxes that cut live pages, dragged in the picture by mouse and by touch, in a real browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +42,11 @@ def test_a_face_of_the_box_is_dragged_and_nothing_shows_beyond_it(
     assert sorted(faces) == sorted(f"face {letter}" for letter in "RLAPSI")
     assert np.abs(person.picture(tmp_path, "box.png") - whole).mean() < 1e-3  # all of it is within
     unit = person.size[0] / 8
-    state = drag(person, "face S", (0, 1.2 * unit))
-    assert state["kind"] == "box"
+    assert drag(person, "face S", (0, 1.2 * unit))["kind"] == "box"
     place = person("eval", HANDLES)["face S"][1]
     np.testing.assert_allclose(place - faces["face S"][1], 1.2 * unit, atol=4)
     person.picture(tmp_path, "face.png", bare=False)
-    cut = person.picture(tmp_path, "cut.png")
-    rows = cut.max(axis=-1).mean(axis=1)
+    rows = person.picture(tmp_path, "cut.png").max(axis=-1).mean(axis=1)
     beyond, within = rows[: int(place) - 8].max(), rows[int(place) + 8 : int(place) + 16].mean()
     print(f"{person.size}: light of a row beyond the face {beyond:.4f}, within {within:.3f}")
     assert within > 0.02

@@ -1,7 +1,5 @@
 """What files say of where they are, and what the page's program makes of it."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -39,8 +37,7 @@ def one() -> Gaussians:
 
 def test_a_page_states_the_extent_of_visible_gaussians() -> None:
     """Of all of its clouds, in the viewer's axes; not what is too faint to be seen."""
-    rng = np.random.default_rng(3)
-    means = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
+    means = np.random.default_rng(3).uniform(-1, 1, (500, 3)).astype(np.float32)
     some = replace(splats_of(one(), PlyOptions()), means=means, logits=np.full(500, -2.0, np.float32))
     far = replace(some, means=means[:2] + 5, logits=np.array([3.0, -6.0], np.float32))
     places = np.array(outermost([some, far]))
@@ -56,8 +53,7 @@ def test_a_page_states_the_extent_of_visible_gaussians() -> None:
 
 
 def test_a_round_body_fits_from_every_side() -> None:
-    rng = np.random.default_rng(4)
-    means = rng.normal(size=(4000, 3))
+    means = np.random.default_rng(4).normal(size=(4000, 3))
     ball = (means / np.linalg.norm(means, axis=1)[:, None]).astype(np.float32)
     points = np.array(
         outermost([replace(splats_of(one(), PlyOptions()), means=ball, logits=np.zeros(4000, np.float32))])
@@ -136,9 +132,8 @@ def test_a_page_opens_at_the_camera_of_the_file(up: str, frame: str) -> None:
 
 @pytest.mark.parametrize("text", ["1,2,3,4,5,6", "1,2,3,1,2,3,40", "1,2,3,4,5,6,180", "1,2,3,4,5,x,40"])
 def test_a_camera_that_is_none_is_refused(vvgt, text: str, tmp_path: Path) -> None:
-    done = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
-    assert done.code == 2
-    assert "expected eye, target" in done.err
+    done = vvgt.fails(2, "convert", "example:blob:8", "-o", tmp_path / "a.html", "--camera", text)
+    assert "expected eye, target" in done
 
 
 def test_files_without_an_anatomical_space_use_the_volume_axes(tmp_path: Path) -> None:
@@ -198,10 +193,8 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     stream = io.BytesIO()
     write_ply(stream, one(), PlyOptions(legend=text))
     stream.seek(0)
-    header = read_ply(stream)[1]
-    assert header.legend == text
-    facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
-    found = facts["legend"]
+    assert read_ply(stream)[1].legend == text
+    found = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]["legend"]
     assert (found["values"], found["unit"], found["quantity"]) == ([0, 60], "HU", "density")
     assert [(n["x"], n["y"]) for n in found["nodes"]] == [(0, 0), (10, 0), (30, 0.5), (30, 1), (60, 1)]
     np.testing.assert_allclose(found["nodes"][-1]["rgb"], (0, 0.5, 0.5), atol=3e-3)
@@ -255,9 +248,7 @@ def test_a_legend_of_labels_names_those_that_are_shown() -> None:
 
 def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     def listed(name: str) -> dict[str, Any]:
-        done = vvgt("info", tmp_path / name, "--sharing", "--json")
-        assert done.code == 0, done.err
-        return json.loads(done.out)
+        return json.loads(vvgt.ok("info", tmp_path / name, "--sharing", "--json").out)
 
     values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
     nibabel.save(nibabel.Nifti1Image(values, np.diag([2, 2, 2, 1])), tmp_path / "Doe_John.nii")
@@ -266,7 +257,7 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     quick = ("--steps", 0)
     kinds = {"a.ply": quick, "live.ply": ("--live",), "n.ply": ("--no-comments", *quick), "a.html": ("--live",)}
     for name, more in kinds.items():
-        assert vvgt("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name).code == 0
+        vvgt.ok("convert", tmp_path / "Doe_John.nii", *given, *more, "-o", tmp_path / name)
         assert "Doe" not in json.dumps(listed(name))
     plain, live, bare, page = map(listed, ("a.ply", "live.ply", "n.ply", "a.html"))
     assert {"title", "function", "names", "command", "checksum", "place", "picture"} <= set(plain)
@@ -285,7 +276,7 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
         )
     np.save(tmp_path / "v.npy", values)
     camera = ("--camera", "9,0,0,0,0,0,30")
-    assert vvgt("convert", tmp_path / "v.npy", *given, *quick, *camera, "-o", tmp_path / "w.ply").code == 0
+    vvgt.ok("convert", tmp_path / "v.npy", *given, *quick, *camera, "-o", tmp_path / "w.ply")
     assert listed("w.ply")["camera"] == "eye and target in the world"
     assert "camera" not in plain
     assert plain["place"].endswith("in the scanner")

@@ -1,7 +1,5 @@
 """Pages at their limits, in a real browser: many labels and frames, one value, no WebGL 2, damaged data."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -86,8 +84,7 @@ def test_a_volume_of_one_value(someone: Person, tmp_path: Path) -> None:
 
 def test_three_hundred_labels(someone: Person, tmp_path: Path) -> None:
     z, y, x = np.mgrid[:21, :21, :21] // 3
-    numbers = (1 + x + 7 * y + 49 * z).clip(0, 300)
-    np.save(tmp_path / "many.npy", numbers.astype(np.uint16))
+    np.save(tmp_path / "many.npy", (1 + x + 7 * y + 49 * z).clip(0, 300).astype(np.uint16))
     names = {n: {"name": f"<b>part</b> & {n}", "color": (n % 7 / 6, n % 5 / 4, 1)} for n in range(1, 301)}
     (tmp_path / "names.json").write_text(json.dumps(names))
     how = ["--labels", str(tmp_path / "names.json"), "--live", "--max-gaussians", "3000", "--size", "100", "--quiet"]

@@ -1,7 +1,5 @@
 """The page of Gaussians that carry values: what it holds, and its program's arithmetic against ours."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -42,7 +40,6 @@ def page_of(gaussians: Gaussians, options: PlyOptions, name: str = "a.html") -> 
     assert known is not None
     content = encoded(known, gaussians, options, name)
     found = re.search(rb'id="scene">(.*?)</script>', content, re.S)
-    assert found is not None
     return content, json.loads(found[1])
 
 
@@ -88,7 +85,6 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     live = scene["live"]
     [layer] = live["layers"]
     held = re.search(rb'id="values-0">([^<]+)<', content)
-    assert held is not None
     planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(ROW, -1)
     stream = np.zeros((600, BYTES), np.uint8)
     stream[:, :ROW] = planes.T
@@ -98,7 +94,6 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     assert sorted(order.tolist()) == list(range(600))
     assert away.min(axis=0).max() < 2e-3
     carried = wanted.take(order).live
-    assert carried is not None
     found = from_bytes(stream, live)
     np.testing.assert_allclose(found[:, 0], carried[:, 0], atol=0.51 * (HI - LO) / 255)
     np.testing.assert_allclose(np.log(found[:, 2]), np.log(carried[:, 2]), atol=0.01)
@@ -145,20 +140,23 @@ def test_nodes_are_those_of_the_function(tf: TransferFunction) -> None:
     np.testing.assert_allclose(colors, tf.color(x), atol=5e-2 if tf is LAB else 2e-4)
 
 
-@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
-def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
+def by_the_page(tf: TransferFunction, folder: Path, names: str, code: str) -> str:
+    """Run code with functions of the page's table in node; return what it prints."""
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
     _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
     program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
-    (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
-    (tmp_path / "run.mjs").write_text(
-        f"import {{ sumsOf, texelsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
-        "const all = JSON.parse(fs.readFileSync('live.json')), live = { ...all, ...all.layers[0] };\n"
-        "const sums = sumsOf(live.nodes, live);\n"
-        "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
+    (folder / "run.mjs").write_text(
+        f"import {{ {names} }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
+        f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n{code}\n"
     )
-    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
+    return subprocess.check_output(["node", "run.mjs"], cwd=folder, timeout=120, text=True)
+
+
+@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
+def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
+    write = "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));"
+    by_the_page(tf, tmp_path, "sumsOf, texelsOf", f"const sums = sumsOf(live.nodes, live);\n{write}")
     wanted = Table.of_function(tf, LO, HI, 0.05, GRAIN).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums, wanted, atol=2e-4 * wanted[..., 3].max())
@@ -169,19 +167,11 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
 def test_the_pages_program_exposes_an_x_ray_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
-    if not shutil.which("node"):
-        pytest.skip("node is not on the path")
-    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
-    program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
-    (tmp_path / "run.mjs").write_text(
-        f"import {{ exposed, sumsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
-        f"const all = {json.dumps(scene['live'])}, live = {{ ...all, ...all.layers[0] }};\n"
-        "const found = exposed(live.nodes, live);\n"
-        "fs.writeFileSync('sums', sumsOf(live.nodes, found));\nconsole.log(found.unit_distance);\n"
-    )
-    done = subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120, capture_output=True)
+    told = "const found = exposed(live.nodes, live);\nconsole.log(found.unit_distance);"
+    write = "fs.writeFileSync('sums', sumsOf(live.nodes, found));"
+    found = by_the_page(tf, tmp_path, "exposed, sumsOf", f"{told}\n{write}")
     distance = exposed_distance(tf, facts(tf).statistics(), 2.0)
-    assert float(done.stdout) == pytest.approx(distance, rel=1e-6)
+    assert float(found) == pytest.approx(distance, rel=1e-6)
     wanted = Table.of_function(tf, LO, HI, distance, NO_GRAIN * facts(tf).grain).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums[..., 3:], wanted[..., 3:], atol=2e-3 * wanted[..., 3].max())
@@ -199,7 +189,6 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
         pytest.skip("node is not on the path")
     content, scene = page_of(some, laid)
     held = re.search(rb'id="values-0">([^<]+)<', content)
-    assert held is not None
     assert laid.live is not None
     planes, own = gzip.decompress(base64.b64decode(held[1])), planes_of(laid.live)
     wanted = turn(some, "z").take(morton_order(turn(some, "z").means))
@@ -207,8 +196,6 @@ def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> No
     stream[:, :own] = np.frombuffer(planes, np.uint8).reshape(own, -1).T
     carried = wanted.live
     wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
-    assert carried is not None
-    assert wanted.live is not None
     np.testing.assert_array_equal(wanted.live[:, LABEL_ROW:], carried[:, LABEL_ROW:])
     axes = rotations(wanted.quaternions.astype(float)) * np.exp(wanted.log_scales.astype(float))[:, None, :]
     flip = np.array([-1.0, -1, 1])  # the viewer has PLY (x, y, z) at (-x, -y, z)

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Rulers, angles and notes in a real browser: measured, listed, removed, in the link and the saved page."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

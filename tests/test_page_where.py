@@ -1,7 +1,5 @@
 """Letters, scale bar, ruler, legend, link and picture of pages, in a real browser, as a person uses it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -48,7 +46,6 @@ class Person:
 
     def __call__(self, what: str, *rest: Any) -> Any:
         """One step; its answer. Nothing may be asked for, nothing break."""
-        assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(json.dumps([what, *rest]) + "\n")
         self.process.stdin.flush()
@@ -244,7 +241,6 @@ def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: P
         person("click", "#tools .measure")
         for channel in (0, 2):
             place, _ = found(picture, channel)
-            assert place is not None
             person("click", *place.tolist())
         person.picture(tmp_path, f"ruler-{flat}.png", bare=False)
         text, drawn = person(
@@ -272,7 +268,6 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     person("press", "y")
     person("eval", f"window.vvgt.where.lens.set({pose})")
     mark, _ = found(person.picture(tmp_path, "front.png"), 0)
-    assert mark is not None
     person("click", *mark.tolist())
     on_mark = person("eval", "window.vvgt.where.clicked")
     across, down = person("eval", MIDDLE)

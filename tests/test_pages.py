@@ -1,7 +1,5 @@
 """Several clouds in one page: frames of a series, functions, labels, files; each with its name, as alone."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -53,9 +51,8 @@ def steps(tmp_path):
 
 def test_a_file_of_several_steps_is_a_page_of_them(vvgt, steps):
     page, how = steps / "four.html", ("--tf", steps / "tf.json", *HOW)
-    done = vvgt("convert", steps / "four.nii", "-o", page, *how)
-    assert done.code == 0, done.err
-    assert vvgt("convert", steps / "four.nii", "-o", steps / "f_{}.ply", *how).code == 0
+    done = vvgt.ok("convert", steps / "four.nii", "-o", page, *how)
+    vvgt.ok("convert", steps / "four.nii", "-o", steps / "f_{}.ply", *how)
     held = clouds(page)
     assert list(held) == ["frame 0", "frame 2"]  # the other one shows nothing
     assert same(held["frame 0"], steps / "f_0.ply")
@@ -64,26 +61,24 @@ def test_a_file_of_several_steps_is_a_page_of_them(vvgt, steps):
     assert "2 clouds" in done.err
     one = vvgt("convert", steps / "four.nii", "--time", "2", "-o", steps / "one.html", *how)
     assert (one.code, list(clouds(steps / "one.html"))) == (0, ["volume, 12 x 12 x 12"])
-    again = vvgt("convert", steps / "four.nii", "-o", page, *how)
-    assert (again.code, "four.html" in again.error) == (2, True)
-    assert vvgt("convert", steps / "four.nii", "-o", page, "--overwrite", "--light", "headlight", *how).code == 0
+    assert "four.html" in vvgt.fails(2, "convert", steps / "four.nii", "-o", page, *how)
+    vvgt.ok("convert", steps / "four.nii", "-o", page, "--overwrite", "--light", "headlight", *how)
     assert list(clouds(page)) == list(held)
 
 
 def test_a_glob_of_volumes_is_a_page_and_one_of_slices_a_volume(vvgt, steps):
-    done = vvgt("convert", str(steps / "run_*.npy"), "--tf", steps / "tf.json", "-o", steps / "run.html", *HOW)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", str(steps / "run_*.npy"), "--tf", steps / "tf.json", "-o", steps / "run.html", *HOW)
     assert list(clouds(steps / "run.html")) == ["frame 0", "frame 1"]
     import tifffile
 
     for k in range(6):
         tifffile.imwrite(steps / f"slice_{k}.tif", np.full((8, 9), 40 * k, np.uint8))
-    assert vvgt("convert", str(steps / "slice_*.tif"), "-o", steps / "stack.html", *HOW).code == 0
+    vvgt.ok("convert", str(steps / "slice_*.tif"), "-o", steps / "stack.html", *HOW)
     assert list(clouds(steps / "stack.html")) == ["volume, 9 x 8 x 6"]
     for k in range(6):
         tifffile.imwrite(steps / f"color_{k}.tif", np.full((8, 9, 3), 40 * k, np.uint8), photometric="rgb")
-    assert vvgt("convert", str(steps / "color_*.tif"), "-o", steps / "color.html", *HOW).code == 0
-    assert vvgt("convert", str(steps / "run_0*.npy"), "--tf", steps / "tf.json", "-o", steps / "r.html", *HOW).code == 0
+    vvgt.ok("convert", str(steps / "color_*.tif"), "-o", steps / "color.html", *HOW)
+    vvgt.ok("convert", str(steps / "run_0*.npy"), "--tf", steps / "tf.json", "-o", steps / "r.html", *HOW)
     assert list(clouds(steps / "r.html")) == ["frame 0"]
     assert not list(steps.glob(".*"))
 
@@ -91,12 +86,9 @@ def test_a_glob_of_volumes_is_a_page_and_one_of_slices_a_volume(vvgt, steps):
 def test_functions_and_labels_have_their_names(vvgt, steps):
     (steps / "other.json").write_text((steps / "tf.json").read_text().replace("0.6", "0.1"))
     two = ("--tf", steps / "tf.json", "--tf", steps / "other.json")
-    assert vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW).code == 0
-    big = vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-size", "1")
-    assert (big.code, "the limit is for one cloud" in big.error) == (
-        2,
-        True,
-    )
+    vvgt.ok("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW)
+    big = vvgt.fails(2, "convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-size", "1")
+    assert "the limit is for one cloud" in big
     held = clouds(steps / "two.html")
     assert list(held) == ["tf", "other"]
     assert held["tf"].mean() > held["other"].mean()
@@ -104,9 +96,8 @@ def test_functions_and_labels_have_their_names(vvgt, steps):
     labels[3:6, 3:9, 3:9], labels[6:9, 3:9, 3:9] = 1, 2
     np.save(steps / "map.npy", labels)
     how = ("--labels", "auto", "--split-labels", *HOW)
-    assert vvgt("convert", steps / "map.npy", *how, "-o", steps / "map.html").code == 0
-    index = vvgt("convert", steps / "map.npy", *how, "-o", steps / "map_{}.ply")
-    assert index.code == 0
+    vvgt.ok("convert", steps / "map.npy", *how, "-o", steps / "map.html")
+    vvgt.ok("convert", steps / "map.npy", *how, "-o", steps / "map_{}.ply")
     files = json.loads((steps / "map_index.json").read_text())["files"]
     held = clouds(steps / "map.html")
     assert list(held) == [row["name"] for row in files]
@@ -117,9 +108,8 @@ def test_files_are_joined(vvgt, steps):
     files = []
     for k, budget in enumerate((40, 60)):
         files.append(steps / f"<b>{k}.ply")
-        assert vvgt("init", "example:blob:12", "--max-gaussians", budget, "-o", files[-1]).code == 0
-    done = vvgt("view", *files, "-o", steps / "both.html")
-    assert done.code == 0, done.err
+        vvgt.ok("init", "example:blob:12", "--max-gaussians", budget, "-o", files[-1])
+    vvgt.ok("view", *files, "-o", steps / "both.html")
     held = clouds(steps / "both.html")
     assert list(held) == ["<b>0.ply", "<b>1.ply"]
     assert all(same(cloud, file) for cloud, file in zip(held.values(), files, strict=True))
@@ -133,30 +123,27 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         done = vvgt("convert", "four.nii", "-o", "four.html", *extra, *how)
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "with one file of several clouds" in done.error
-    done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
-    assert (done.code, "--max-size with one file of several clouds" in done.error) == (2, True)
+    done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
+    assert "--max-size with one file of several clouds" in done
     for without in ("--no-live", "--no-slices"):
-        done = vvgt("convert", "four.nii", "-o", "four.html", without, *how)
-        assert (done.code, f"{without} with one file of several clouds" in done.error) == (2, True)
-        done = vvgt("convert", "four.nii", "-o", "four_{}.ply", without, *how)
-        assert (done.code, "are for a page" in done.error) == (2, True)
+        done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", without, *how)
+        assert f"{without} with one file of several clouds" in done
+        assert "are for a page" in vvgt.fails(2, "convert", "four.nii", "-o", "four_{}.ply", without, *how)
     white = {"rgb": [1, 1, 1]}
     dark = json.dumps({"points": [{"x": 900, "opacity": 0, **white}, {"x": 901, "opacity": 1, **white}]})
     Path("dark.json").write_text(dark)
-    done = vvgt("convert", "four.nii", "-o", "four.html", "--tf", "dark.json", *HOW)
-    assert (done.code, "shows nothing in any of 3 frames" in done.error) == (1, True)
+    done = vvgt.fails(1, "convert", "four.nii", "-o", "four.html", "--tf", "dark.json", *HOW)
+    assert "shows nothing in any of 3 frames" in done
     assert not list(steps.glob("*.html"))
     assert not list(steps.glob(".*"))
-    assert vvgt("convert", "four.nii", "-o", "four.html", *how).code == 0
+    vvgt.ok("convert", "four.nii", "-o", "four.html", *how)
     for command in (
         ("evaluate", "four.html", "--volume", "run_0.npy"),
         ("render", "four.html", "--orbit", "1", "-o", "o"),
     ):
-        done = vvgt(*command)
-        assert (done.code, "a page of 2 clouds of Gaussians; expected one" in done.error) == (1, True)
-    assert vvgt("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply").code == 0
-    done = vvgt("view", "a.ply", "a.ply", "-o", "b.spz")
-    assert (done.code, "expected a page (.html), which holds several" in done.error) == (2, True)
+        assert "a page of 2 clouds of Gaussians; expected one" in vvgt.fails(1, *command)
+    vvgt.ok("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply")
+    assert "expected a page (.html), which holds several" in vvgt.fails(2, "view", "a.ply", "a.ply", "-o", "b.spz")
 
 
 def held_bytes(page: Path) -> bytes:
@@ -170,22 +157,22 @@ def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path):
     np.save(tmp_path / "Mueller_Hans.npy", np.exp(-3 * (x**2 + y**2 + z**2)))
     np.save(tmp_path / "Mueller_Eva.npy", np.exp(-3 * (x**2 + 2 * y**2 + z**2)))
     source = tmp_path / "Mueller_Hans.npy"
-    assert vvgt("convert", source, "-o", tmp_path / "a.ply", *HOW).code == 0
+    vvgt.ok("convert", source, "-o", tmp_path / "a.ply", *HOW)
     done = vvgt("convert", source, "-o", tmp_path / "a.html", *HOW)
     assert (
         "a.html holds Gaussians, data values, their histogram, slices of the volume (14 x 14 x 14 voxels)" in done.err
     )
     assert "a checksum of the volume; its title is" in done.err
-    assert vvgt("view", source, "-o", tmp_path / "b.html").code == 0
-    assert vvgt("convert", tmp_path / "Mueller_*.npy", "-o", tmp_path / "c.html", *HOW).code == 0
+    vvgt.ok("view", source, "-o", tmp_path / "b.html")
+    vvgt.ok("convert", tmp_path / "Mueller_*.npy", "-o", tmp_path / "c.html", *HOW)
     for name in ("a.ply", "a.html", "b.html", "c.html"):
         content = held_bytes(tmp_path / name)
         assert b"Mueller" not in content, name
         assert b"volume, 14 x 14 x 14" in content, name
     assert list(clouds(tmp_path / "c.html")) == ["frame 0", "frame 1"]
-    assert vvgt("convert", source, "-o", tmp_path / "d.html", "--title", "Case <17>", *HOW).code == 0
+    vvgt.ok("convert", source, "-o", tmp_path / "d.html", "--title", "Case <17>", *HOW)
     assert b"<title>Case &lt;17&gt;</title>" in (tmp_path / "d.html").read_bytes()
-    assert vvgt("view", tmp_path / "a.ply", "--title", "other", "-o", tmp_path / "e.html").code == 0
+    vvgt.ok("view", tmp_path / "a.ply", "--title", "other", "-o", tmp_path / "e.html")
     assert b"<title>other</title>" in (tmp_path / "e.html").read_bytes()
 
 
@@ -194,9 +181,8 @@ def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path
     np.save(tmp_path / "v.npy", values)
     np.save(tmp_path / "rgb.npy", np.stack([values] * 3, axis=-1))
 
-    def scene(name: str, *args: str, code: int = 0) -> dict:
-        done = vvgt("convert", tmp_path / args[0], "-o", tmp_path / name, "--overwrite", *HOW, *args[1:])
-        assert done.code == code, done.err
+    def scene(name: str, *args: str) -> dict:
+        done = vvgt.ok("convert", tmp_path / args[0], "-o", tmp_path / name, "--overwrite", *HOW, *args[1:])
         text = (tmp_path / name).read_text("utf-8")
         assert ("no function editor" in done.err) == ("why" in name)
         return dict(json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1]))
@@ -205,7 +191,7 @@ def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path
     assert both["converted"]["held"] == "splats-0"
     assert both["frames"][0]["held"] == "live-0"
     assert len(both["live"]["layers"][0]["nodes"]) > 1
-    assert vvgt("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW).code == 0
+    vvgt.ok("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW)
     assert same(np.sort(read_splats(tmp_path / "both.html")[0].opacity_logits), tmp_path / "v.ply")
     assert not {"live", "converted"} & set(scene("no.html", "v.npy", "--no-live"))
     lit = ("--light", "1,0,0", "--shadows")

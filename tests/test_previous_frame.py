@@ -1,7 +1,5 @@
 """Frames of a series that go on from the one before: what stays stays bit for bit, in files, pages and pictures."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -160,8 +158,7 @@ def test_descent_moves_what_is_free():
     images = np.stack([render(replace(g, colors=1 - g.colors), camera) for camera in cameras])
     free = np.arange(60) % 3 == 0
     found, _ = optimize(g, cameras, images, OptimizeOptions(steps=6), free=free)
-    moved = (found.colors != g.colors).any(axis=1)
-    np.testing.assert_array_equal(moved, free)
+    np.testing.assert_array_equal((found.colors != g.colors).any(axis=1), free)
     np.testing.assert_allclose(covariances(found)[~free], covariances(g)[~free], rtol=1e-4, atol=1e-9)
 
 
@@ -182,7 +179,7 @@ def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.previous_frame.VIEWS", 12)
     for k, radius in enumerate((0.2, 0.208, 0.2, 0.2, 0.208)):
         np.save(beat / f"v_{k}.npy", body(radius))
-    assert vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply").code == 0
+    vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     index = json.loads((beat / "f_index.json").read_text())["files"]
     assert [row.get("moved", 0) > 20 for row in index] == [False, True, True, False, True]
     assert index[2]["psnr"] > index[0]["psnr"] - 0.1
@@ -190,8 +187,7 @@ def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
 
 
 def test_patches():
-    rng = np.random.default_rng(2)
-    base = rng.integers(0, 256, 5000, np.uint8)
+    base = np.random.default_rng(2).integers(0, 256, 5000, np.uint8)
     other = base.copy()
     for at in (0, 700, 710, 3000, 4990):
         other[at : at + 10] += 1
@@ -221,8 +217,7 @@ def test_frames_share_what_stands_still_whatever_their_comments_say():
 @pytest.mark.parametrize("more", [(), ("--light", "headlight"), ("--blocks", "16")], ids=" ".join)
 def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
     run = ("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more)
-    done = vvgt(*run, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    vvgt.ok(*run, "-o", beat / "f_{}.ply")
     files = [rows(beat / f"f_{k}.ply") for k in range(4)]
     index = json.loads((beat / "f_index.json").read_text())["files"]
     assert "moved" not in index[0]
@@ -234,10 +229,10 @@ def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
         assert still.sum() > 50
     assert index[3]["moved"] == 0
     assert 0 < max(row["moved"] for row in index[1:]) < 0.7 * len(files[0])
-    assert vvgt("convert", beat / "v_2.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "a.ply").code == 0
+    vvgt.ok("convert", beat / "v_2.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "a.ply")
     alone = json.loads((beat / "f_index.json").read_text())
     assert alone["files"][2]["psnr"] > alone["files"][0]["psnr"] - 0.6
-    assert vvgt(*run, "-o", beat / "f.html").code == 0
+    vvgt.ok(*run, "-o", beat / "f.html")
     check_page(beat)
 
 
@@ -281,18 +276,15 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
 
 def test_no_more_steps_than_were_asked_for(vvgt, beat):
     run = ("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW[:-1], "3", "-o", beat / "f_{}.ply")
-    done = vvgt(*run, "--report", beat / "f_{}.json")
-    assert done.code == 0, done.err
-    assert "differences " in done.err
+    assert "differences " in vvgt.ok(*run, "--report", beat / "f_{}.json").err
     assert json.loads((beat / "f_1.json").read_text())["refinement"]["steps"] <= 3
 
 
 def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
-    done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     assert "skipped: starting from the previous frame" in done.err
-    assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
+    vvgt.ok("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply")
     assert uncertified(beat / "a.ply") == uncertified(beat / "f_1.ply")
 
 
@@ -306,6 +298,5 @@ def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
     for file in ("v_2.npy", "v_3.npy"):
         (beat / file).unlink()
     how = HOW[:4] if more == ("--live",) else HOW
-    done = vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
     assert ("differences " in done.err) == (more[0] == "--shard")

@@ -1,13 +1,12 @@
 """Conversions that go on from an earlier one of the same volume: when, how near, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import vvgt_cli as vvgt
+from tests.refused import refused
 from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
 from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
@@ -80,8 +79,7 @@ def test_another_function_is_as_near_as_by_itself(session, earlier, changes, les
     assert names(later)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
     assert later.report.refinement["steps"] == 24
     assert later.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
-    again = session.convert(tf, GOAL, after=earlier)
-    assert np.array_equal(again.gaussians.means, later.gaussians.means)
+    assert np.array_equal(session.convert(tf, GOAL, after=earlier).gaussians.means, later.gaussians.means)
 
 
 def test_another_light_and_another_size(session, earlier):
@@ -118,21 +116,17 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
 
 
 def test_refused(session, earlier):
-    with pytest.raises(vvgt.UsageError, match="same volume"):
-        vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
-    with pytest.raises(vvgt.UsageError, match=r"after with --live: .*remove it"):
-        session.convert(SHELL, GOAL, after=earlier, live=True)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, "example:blob:16", "viridis", GOAL, after=earlier)
+    refused(vvgt.UsageError, r"after with --live: .*remove it", session.convert, SHELL, GOAL, after=earlier, live=True)
     with pytest.raises(vvgt.UsageError, match=r"after with labels: .*remove it"):
         vvgt.convert("example:blob:16", goal=GOAL, after=earlier, split_labels=True)
-    with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
-        session.convert([SHELL, "gray"], GOAL, after=earlier)
+    refused(vvgt.UsageError, r"after with .*give one function", session.convert, [SHELL, "gray"], GOAL, after=earlier)
 
 
 def test_the_same_look_changes_nothing(session, earlier):
     field = earlier.field
     same, before = recolor_earlier(earlier, field), to_box_frame(earlier.gaussians, field.source.volume)
-    clipped = opacity(before).clip(*OPAQUE)
-    assert np.allclose(opacity(same), clipped, atol=1e-6)
+    assert np.allclose(opacity(same), opacity(before).clip(*OPAQUE), atol=1e-6)
     assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
     assert np.array_equal(same.means, before.means)
 
@@ -162,5 +156,4 @@ def test_in_blocks_too(values):
     assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     values = values.copy()
     values[12, 12, 12] = 0
-    with pytest.raises(vvgt.UsageError, match="same volume"):
-        vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, values, tf, GOAL, after=first, spacing=SPACING, blocks=16)

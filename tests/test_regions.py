@@ -1,7 +1,5 @@
 """Refinement region by region: pictures of parts, levels and large clouds, and what their bytes depend on."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -135,7 +133,7 @@ def scores(path: Path, *files: Path | str) -> list[float]:
 
 def test_every_level_is_nearer_to_the_volume_than_the_closed_form(vvgt, volume: Path, folder: Path) -> None:
     closed = volume.parent / "closed"
-    assert vvgt("init", volume, *FIT, "-o", closed / "lod-meta.json").code == 0
+    vvgt.ok("init", volume, *FIT, "-o", closed / "lod-meta.json")
     before, after = (json.loads((place / "lod-meta.json").read_text()) for place in (closed, folder))
     assert after["counts"] == before["counts"]
     assert len(after["counts"]) >= 2
@@ -150,28 +148,24 @@ def test_every_level_is_nearer_to_the_volume_than_the_closed_form(vvgt, volume: 
 
 def test_levels_without_steps_are_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
     for command, more, name in (("convert", ("--steps", "0"), "a"), ("init", (), "b")):
-        assert vvgt(command, volume, *FIT, *more, "-o", tmp_path / name / "lod-meta.json").code == 0
+        vvgt.ok(command, volume, *FIT, *more, "-o", tmp_path / name / "lod-meta.json")
     assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
 @pytest.mark.parametrize("scheduler", [(), ("--scheduler", "local")])
-def test_bytes_depend_on_neither_blocks_nor_workers(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, scheduler: tuple[str, ...]
-) -> None:
+def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume, folder, tmp_path, scheduler) -> None:
     if scheduler:
         pytest.importorskip("distributed")
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "32")
-    assert vvgt(*line, "--workers", "2", *scheduler).code == 0
+    vvgt.ok(*line, "--workers", "2", *scheduler)
     assert files_in(tmp_path / "out") == files_in(folder)
 
 
-def test_an_interrupted_refinement_goes_on_where_it_ended(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)  # the tiles are regions
     whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
-    assert vvgt(*whole).code == 0
+    vvgt.ok(*whole)
     call, seen = RegionNodes.__call__, list[int]()
 
     def stopped(task: RegionNodes, number: int) -> None:
@@ -183,7 +177,7 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(
     monkeypatch.setattr(RegionNodes, "__call__", stopped)
     assert vvgt(*line).code == 130
     assert not (tmp_path / "out" / "lod-meta.json").exists()
-    assert vvgt(*line).code == 0
+    vvgt.ok(*line)
     assert seen.count(seen[0]) == 1  # what was complete is not computed again
     assert files_in(tmp_path / "out") == files_in(tmp_path / "whole")
     assert not list(tmp_path.glob(".*"))
@@ -191,7 +185,7 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(
 
 def test_a_target_that_is_reached_leaves_the_closed_form(vvgt, volume: Path, tmp_path: Path) -> None:
     for name, options in (("a", ("--target-psnr", "5")), ("b", ("--steps", "0"))):
-        assert vvgt("convert", volume, *FIT, *options, "-o", tmp_path / name / "lod-meta.json").code == 0
+        vvgt.ok("convert", volume, *FIT, *options, "-o", tmp_path / name / "lod-meta.json")
     manifests = [json.loads((tmp_path / name / "lod-meta.json").read_text()) for name in "ab"]
     assert manifests[0]["counts"] == manifests[1]["counts"]
     first, second = (files_in(tmp_path / name) for name in "ab")
@@ -199,20 +193,16 @@ def test_a_target_that_is_reached_leaves_the_closed_form(vvgt, volume: Path, tmp
 
 
 def test_no_time_for_steps_is_said(vvgt, volume: Path, tmp_path: Path) -> None:
-    found = vvgt("convert", volume, *FIT[:-1], "--time-budget", "0.01", "-o", tmp_path / "o" / "lod-meta.json")
-    assert found.code == 0
+    found = vvgt.ok("convert", volume, *FIT[:-1], "--time-budget", "0.01", "-o", tmp_path / "o" / "lod-meta.json")
     assert "skipped: refinement" in found.err
 
 
 @pytest.mark.parametrize("options", [(), ("--light", "headlight")])
-def test_large_clouds_are_refined_by_regions_in_every_format(
-    vvgt, volume: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
-) -> None:
+def test_large_clouds_are_refined_by_regions_in_every_format(vvgt, volume, tmp_path, monkeypatch, options) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.convert.MANY", 5000)
     light = options if "--light" in options else ()
-    assert vvgt("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply").code == 0
-    found = vvgt("convert", volume, *FIT[:-1], *STEPS, "--blocks", "32", *options, "-o", tmp_path / "a.ply")
-    assert found.code == 0, found.err
+    vvgt.ok("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply")
+    found = vvgt.ok("convert", volume, *FIT[:-1], *STEPS, "--blocks", "32", *options, "-o", tmp_path / "a.ply")
     assert "region by region" in found.err
     made, closed = (read_splats(str(tmp_path / f"{name}.ply"))[0] for name in ("a", "closed"))
     assert len(made) == pytest.approx(len(closed), rel=0.03)  # those that no viewer draws are left out
@@ -220,10 +210,9 @@ def test_large_clouds_are_refined_by_regions_in_every_format(
     if not light:
         old, new = scores(volume, tmp_path / "closed.ply", tmp_path / "a.ply")
         assert new > old + 1
-        assert vvgt("convert", volume, *FIT, *STEPS, "--blocks", "64", "-o", tmp_path / "a.spz").code == 0
-        planned = vvgt("convert", volume, *FIT, *STEPS, "--blocks", "64", "--dry-run", "-o", tmp_path / "b.ply")
-        assert planned.code == 2
-        assert "each region is refined by itself, without a plan" in planned.err
+        vvgt.ok("convert", volume, *FIT, *STEPS, "--blocks", "64", "-o", tmp_path / "a.spz")
+        planned = vvgt.fails(2, "convert", volume, *FIT, *STEPS, "--blocks 64 --dry-run -o", tmp_path / "b.ply")
+        assert "each region is refined by itself, without a plan" in planned
     assert not list(tmp_path.glob(".*"))
 
 
@@ -242,35 +231,22 @@ def test_results_of_another_number_of_steps_are_not_taken(vvgt, volume: Path, fo
     out = tmp_path / "out"
     shutil.copytree(folder, out)
     line = ("convert", volume, *FIT, "--steps", "8", "-o", out / "lod-meta.json", "--overwrite")
-    assert vvgt(*line).code == 0
+    vvgt.ok(*line)
     assert files_in(out) != files_in(folder)
 
 
 def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path: Path) -> None:
-    line = (
-        "convert",
-        volume,
-        "--max-gaussians",
-        "1",
-        *STEPS,
-        "--size",
-        "64",
-        "-q",
-        "-o",
-        tmp_path / "o" / "lod-meta.json",
-    )
-    assert vvgt(*line).code == 0
+    line = ("convert", volume, "--max-gaussians 1", *STEPS, "--size 64 -q -o", tmp_path / "o" / "lod-meta.json")
+    vvgt.ok(*line)
     assert json.loads((tmp_path / "o" / "lod-meta.json").read_text())["count"] >= 1
 
 
-def test_regions_without_gaussians_are_written_lit_and_not(
-    vvgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_regions_without_gaussians_are_written_lit_and_not(vvgt, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.LARGEST", 1)
     z, y, x = np.mgrid[:160, :60, :60]
     balls = sum((np.hypot(np.hypot(x - 30, y - 30), z - at) < 14) * 200 for at in (24, 80, 136))
     np.save(tmp_path / "v.npy", balls.astype(np.uint8))
     fit = ("--tf", "viridis", "--size", "100", "--max-gaussians", "1", "--blocks", "64", "-q")
     for light in ("none", "headlight"):
-        assert vvgt("init", tmp_path / "v.npy", *fit, "--light", light, "-o", tmp_path / f"{light}.ply").code == 0
+        vvgt.ok("init", tmp_path / "v.npy", *fit, "--light", light, "-o", tmp_path / f"{light}.ply")
         assert len(read_splats(str(tmp_path / f"{light}.ply"))[0]) == 1

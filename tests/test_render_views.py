@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
 from vvgt_cli.cameras import look_at
 from vvgt_cli.cameras.files import camera_to_opengl, read_cameras, transforms_json
@@ -132,8 +133,7 @@ def test_pycolmap_reads_the_model_and_projects_as_we_do(made, expected):
 
 
 def test_points_are_the_volume(made):
-    data = (made / "points3d.ply").read_bytes()
-    header, _, body = data.partition(b"end_header\n")
+    header, _, body = (made / "points3d.ply").read_bytes().partition(b"end_header\n")
     lines = header.decode().splitlines()
     assert lines[2].startswith("element vertex ")
     names = [line.split()[1:] for line in lines if line.startswith("property")]
@@ -153,18 +153,14 @@ def test_load_views_prefers_exr_and_falls_back_to_png(copied, expected):
     np.testing.assert_array_equal(images, np.stack([image for _, image in expected["test"]]))
     for path in (copied / "test").glob("*.exr"):
         path.unlink()
-    rounded = load_views(copied, "test")[1]
-    assert 0 < np.abs(rounded - images).max() < 1.01 / 255
+    assert 0 < np.abs(load_views(copied, "test")[1] - images).max() < 1.01 / 255
     (copied / "test" / "test_001.png").unlink()
-    with pytest.raises(DataError, match="test_001: no such image"):
-        load_views(copied, "test")
-    with pytest.raises(DataError, match="transforms_check"):
-        load_views(copied, "check")
+    refused(DataError, "test_001: no such image", load_views, copied, "test")
+    refused(DataError, "transforms_check", load_views, copied, "check")
 
 
 def test_half_rounds_to_half(vvgt, tmp_path, expected):
-    result = vvgt(*BASE, "--test-views", 0, "--half", "--format", "exr", "-o", tmp_path / "h")
-    assert result.code == 0
+    vvgt.ok(*BASE, "--test-views", 0, "--half", "--format", "exr", "-o", tmp_path / "h")
     camera, image = expected["train"][1]
     read, _ = read_exr(tmp_path / "h" / "train" / f"{camera.name}.exr")
     np.testing.assert_array_equal(read, image.astype(np.float16).astype(np.float32))
@@ -176,19 +172,15 @@ def test_half_rounds_to_half(vvgt, tmp_path, expected):
 def test_several_functions_get_a_folder_each(vvgt, tmp_path):
     tf = tmp_path / "a.b.json"
     tf.write_text('{"points": [{"x": 0, "opacity": 0}, {"x": 1, "opacity": 1, "rgb": [1, 0, 0]}]}')
-    result = vvgt(
-        "render-views", VOLUME, "--tf", tf, "--tf", "magma", "--views", 1, "--test-views", 0, "--size", 16,
-        "--format", "exr", "-o", tmp_path / "v",
-    )  # fmt: skip
-    assert result.code == 0
+    how = "--tf magma --views 1 --test-views 0 --size 16 --format exr -o"
+    vvgt.ok("render-views", VOLUME, "--tf", tf, how, tmp_path / "v")
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.b", "magma"]
     red, other = (load_views(tmp_path / "v" / name)[1][0] for name in ("a.b", "magma"))
     assert (red[..., 1:3] == 0).all()
     assert red[..., 0].max() > 0.1
     assert other[..., 2].max() > 0.1
-    twice = vvgt("render-views", VOLUME, "--tf", "magma", "--tf", "magma", "-o", tmp_path / "w")
-    assert twice.code == 2
-    assert "would both go to" in twice.error
+    twice = vvgt.fails(2, "render-views", VOLUME, "--tf", "magma", "--tf", "magma", "-o", tmp_path / "w")
+    assert "would both go to" in twice
 
 
 def test_names_of_functions():
@@ -204,11 +196,8 @@ def test_cameras_of_a_file_with_their_split(vvgt, tmp_path, made):
         frame["file_path"] = frame["file_path"].replace("_0", ".0")
     document["test_filenames"] = [frame["file_path"] for frame in document["frames"][3:]]
     (tmp_path / "t.json").write_text(json.dumps(document))
-    result = vvgt(
-        "render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "--size", 16, "--format", "exr",
-        "-o", tmp_path / "v",
-    )  # fmt: skip
-    assert result.code == 0
+    how = ("--cameras", tmp_path / "t.json", "--size 16 --format exr -o", tmp_path / "v")
+    vvgt.ok("render-views", VOLUME, "--tf", TF, *how)
     cameras, images = load_views(tmp_path / "v")
     assert [camera.name for camera in cameras] == ["train_000", "train_001", "train_002"]  # a dot would be a suffix
     assert images.shape == (3, 16, 16, 4)
@@ -223,15 +212,14 @@ def test_cameras_of_several_sizes_share_a_contact_sheet(vvgt, tmp_path):
     ]
     (tmp_path / "t.json").write_text(transforms_json(views))
     call = ("render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "-o", tmp_path / "v")
-    assert vvgt(*call).code == 0
+    vvgt.ok(*call)
     document = json.loads((tmp_path / "v" / "transforms.json").read_text())
     assert [(frame["w"], frame["h"]) for frame in document["frames"]] == [(40, 16), (16, 400)]
     assert "camera_angle_x" in json.loads((tmp_path / "v" / "transforms_train.json").read_text())["frames"][1]
     sheet = read_png(tmp_path / "v" / "contact.png")
     assert sheet.shape == (133, 40 + 4 + 40, 3)  # the tall one at a third
     assert all(tile.max() > 0.1 for tile in (sheet[:, :40], sheet[:, 44:]))
-    with pytest.raises(DataError, match="2 sizes"):
-        load_views(tmp_path / "v")
+    refused(DataError, "2 sizes", load_views, tmp_path / "v")
     kept = json.loads((tmp_path / "t.json").read_text())
     kept["test_filenames"] = ["wide.png", "tall.png"]
     (tmp_path / "t.json").write_text(json.dumps(kept))
@@ -269,17 +257,15 @@ def test_orbit():
     ],
 )
 def test_wrong_calls_get_one_line_and_leave_nothing(vvgt, tmp_path, arguments, code, message):
-    result = vvgt("render-views", VOLUME, *arguments, "-o", tmp_path / "v")
-    assert result.code == code
-    assert message in result.error
+    assert message in vvgt.fails(code, "render-views", VOLUME, *arguments, "-o", tmp_path / "v")
     assert not (tmp_path / "v").exists()
 
 
 def test_options_that_a_file_of_cameras_decides(vvgt, tmp_path, made):
     for option in ("--views", "--test-views", "--fov", "--radius"):
-        result = vvgt("render-views", VOLUME, "--cameras", made / "transforms.json", option, 3, "-o", tmp_path / "v")
-        assert result.code == 2
-        assert option in result.error
+        given = ("--cameras", made / "transforms.json", option, 3, "-o", tmp_path / "v")
+        result = vvgt.fails(2, "render-views", VOLUME, *given)
+        assert option in result
     (tmp_path / "file").write_text("")
     assert "is a file" in vvgt(*BASE, "-o", tmp_path / "file").error
     assert "no directory" in vvgt(*BASE, "-o", tmp_path / "a" / "b").error

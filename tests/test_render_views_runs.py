@@ -31,9 +31,7 @@ def stamps(folder):
 
 def test_the_same_command_renders_nothing_again(vvgt, copied):
     before = stamps(copied)
-    result = vvgt(*BASE, "-o", copied)
-    assert result.code == 0
-    assert "5 views, 0 to render here" in result.err
+    assert "5 views, 0 to render here" in vvgt.ok(*BASE, "-o", copied).err
     assert stamps(copied) == before
 
 
@@ -94,9 +92,8 @@ def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch
 def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
     tf = '{"points": [{"x": 0.9999, "opacity": 0}, {"x": 1, "opacity": 1e-9, "rgb": [1, 0, 0]}]}'
     (tmp_path / "tf.json").write_text(tf)
-    result = vvgt("render-views", VOLUME, "--tf", tmp_path / "tf.json", *SMALL, "-o", tmp_path / "v")
-    assert result.code == 1
-    assert "visible" in result.error
+    result = vvgt.fails(1, "render-views", VOLUME, "--tf", tmp_path / "tf.json", *SMALL, "-o", tmp_path / "v")
+    assert "visible" in result
     assert not (tmp_path / "v").exists()
 
 
@@ -118,19 +115,15 @@ def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
 def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, message):
     before = stamps(made)
     base = ["render-views", VOLUME, *SMALL, "--background", 1, 0, 0.5]
-    result = vvgt(*base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
-    assert result.code == 2
-    assert message in result.error
-    assert "--overwrite" in result.error
+    result = vvgt.fails(2, *base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
+    assert message in result
+    assert "--overwrite" in result
     assert stamps(made) == before
 
 
 def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
     (copied / "notes.txt").write_text("mine")
-    result = vvgt(
-        "render-views", VOLUME, "--tf", TF, "--views", 2, "--test-views", 0, "--size", 20, "-o", copied, "--overwrite"
-    )
-    assert result.code == 0
+    vvgt.ok("render-views", VOLUME, "--tf", TF, "--views 2 --test-views 0 --size 20 --overwrite -o", copied)
     assert sorted(path.name for path in (copied / "train").iterdir()) == [
         f"train_00{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")
     ]
@@ -142,15 +135,11 @@ def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
 def test_files_that_no_manifest_knows_are_not_replaced(vvgt, tmp_path):
     (tmp_path / "v").mkdir()
     (tmp_path / "v" / "transforms.json").write_text("mine")
-    result = vvgt(*BASE, "-o", tmp_path / "v")
-    assert result.code == 2
-    assert "transforms.json exists, and no manifest" in result.error
+    assert "transforms.json exists, and no manifest" in vvgt.fails(2, *BASE, "-o", tmp_path / "v")
     assert [path.name for path in (tmp_path / "v").iterdir()] == ["transforms.json"]
     for text in ("{", "[]", '{"format": "other"}', '{"files": {"../x": {"bytes": 1, "sha256": ""}}}'):
         (tmp_path / "v" / "manifest.json").write_text(text)
-        result = vvgt(*BASE, "-o", tmp_path / "v")
-        assert result.code == 1
-        assert "not a manifest" in result.error
+        assert "not a manifest" in vvgt.fails(1, *BASE, "-o", tmp_path / "v")
     assert (tmp_path / "v" / "transforms.json").read_text() == "mine"
 
 
@@ -170,8 +159,7 @@ def test_shards_together_are_the_whole(vvgt, tmp_path, made):
     call = (*BASE, "-o", folder)
     rendered = []
     for i in (3, 1, 2):
-        result = vvgt(*call, "--shard", f"{i}/3")
-        assert result.code == 0
+        vvgt.ok(*call, "--shard", f"{i}/3")
         rendered.append(len(list(folder.rglob("*.exr"))))
         assert (folder / "contact.png").exists() == (i == 2)  # whoever finds every view
         assert (folder / "transforms.json").exists() == (i != 3)  # the first part describes the set
@@ -226,7 +214,7 @@ def test_complete_needs_the_recorded_bytes(tmp_path):
 
 def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made):
     folder = tmp_path / "views"
-    assert vvgt(*BASE, "--no-points", "-o", folder).code == 0
+    vvgt.ok(*BASE, "--no-points", "-o", folder)
     names = {path.relative_to(made) for path in made.rglob("*.*") if path.is_file()}
     found = {path.relative_to(folder) for path in folder.rglob("*.*") if path.is_file()}
     assert {path.name for path in names - found} == {"points3d.ply"}

@@ -1,7 +1,5 @@
 """`vvgt report`: all runs end to end; fronts, tables, charts, the page, comparisons."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import io
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.onnx_models import write_model
+from tests.refused import refused
 from tests.report_runs import document, run, runs
 from vvgt_cli.commands.report import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
@@ -107,9 +106,7 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
 def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
-    result = vvgt("report", *args, "-o", tmp_path / "out")
-    assert result.code == 0, result.err
-    assert "in blocks of 16" in result.err
+    assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err
     blocks = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "--blocks 16" in blocks["command_line"]
     assert [run["name"] for run in blocks["runs"]] == [run["name"] for run in found["runs"]]
@@ -157,17 +154,14 @@ def test_csv_and_plots_of_a_report(scene_report):
 
 def test_nothing_is_overwritten_unasked(scene_report, vvgt):
     folder, _ = scene_report
-    result = vvgt("report", "example:blob:10", *SMALL, "-o", folder)
-    assert result.code == 2
-    assert "exists; give --overwrite" in result.error
+    assert "exists; give --overwrite" in vvgt.fails(2, "report", "example:blob:10", *SMALL, "-o", folder)
 
 
 def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
     folder, _ = scene_report
-    assert vvgt("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
-                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json").code == 0  # fmt: skip
-    result = vvgt("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
-    assert result.code == 0, result.err
+    vvgt.ok("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
+                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")  # fmt: skip
+    result = vvgt.ok("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
     assert {p.name for p in (tmp_path / "both").iterdir()} == {"report.csv", "report.html", *FILES}
     text = (tmp_path / "both" / "report.html").read_text("utf-8")
     Reader(text)
@@ -193,9 +187,7 @@ def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
 def test_calls_that_are_wrong(args, message, vvgt, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("{}")
-    result = vvgt(*args)
-    assert result.code == 2
-    assert message in result.error
+    assert message in vvgt.fails(2, *args)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
@@ -211,10 +203,8 @@ UNNAMED = document(runs=[runs()[0] | {"name": 3}])
 def test_files_that_are_no_reports(content, tmp_path):
     path = tmp_path / "r.json"
     path.write_bytes(content.encode("latin-1"))
-    with pytest.raises(DataError, match=r"r\.json"):
-        read_series(str(path))
-    with pytest.raises(DataError, match="not a report"):
-        read_series(str(tmp_path / "none.json"))
+    refused(DataError, r"r\.json", read_series, str(path))
+    refused(DataError, "not a report", read_series, str(tmp_path / "none.json"))
 
 
 def test_the_front_is_what_nothing_beats():
@@ -232,8 +222,7 @@ def test_the_front_is_what_nothing_beats():
 
 
 def test_the_scoring_costs_nothing_and_units_are_medians():
-    one = run("a", "a", "steps", 1000, 10.0, 30.0, 100)
-    assert cost(one) == pytest.approx(10.0)
+    assert cost(run("a", "a", "steps", 1000, 10.0, 30.0, 100)) == pytest.approx(10.0)
     found = unit_costs(runs())
     steps = sorted(
         s["seconds"] / r["refinement"]["steps"]
@@ -298,8 +287,7 @@ def test_names_cannot_break_out_of_the_page():
         one["name"] = "</script><img src=x onerror=alert(1)>"
     pictures = Pictures([0], [b"png"], [[b"png"]] * len(bad["runs"]))
     one = [Series("<i>", bad["runs"], bad)]
-    text = page(one, draw(one), "<u>", pictures)
-    reader = Reader(text)
+    reader = Reader(page(one, draw(one), "<u>", pictures))
     assert reader.tags.count("img") == 4
     assert reader.tags.count("script") == 2
     assert "u" not in reader.tags
@@ -312,9 +300,8 @@ def test_several_reports_have_different_names(tmp_path, vvgt):
     for name, content in (("a", document()), ("b", other)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "report.json").write_text(json.dumps(content))
-    result = vvgt("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
+    vvgt.ok("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
                   tmp_path / "a" / "report.json", "-o", tmp_path / "c")  # fmt: skip
-    assert result.code == 0, result.err
     text = (tmp_path / "c" / "report.html").read_text("utf-8")
     Reader(text)
     for name in ("a (1)", "b", "a (3)"):

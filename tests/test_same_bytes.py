@@ -1,7 +1,5 @@
 """The same command leaves the same bytes, whatever the clock says: caches of workflow systems compare files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

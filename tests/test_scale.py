@@ -1,7 +1,5 @@
 """The closed form in blocks: the same Gaussians as in memory, the same bytes whatever the blocks, workers and order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -47,34 +45,34 @@ def same_gaussians(one, other):
 
 def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, raw, tmp_path):
     memory = tmp_path / "memory.ply"
-    assert vvgt("init", raw, "-o", memory, *FIT).code == 0
+    vvgt.ok("init", raw, "-o", memory, *FIT)
     files = []
     for size in ("16", "32", "128", "auto"):
         path = tmp_path / f"{size}.ply"
-        assert vvgt("init", raw, "-o", path, *FIT, "--blocks", size).code == 0
+        vvgt.ok("init", raw, "-o", path, *FIT, "--blocks", size)
         files.append(path.read_bytes())
     assert len(set(files)) == 1
     assert same_gaussians(memory, path)
     assert [p.name for p in tmp_path.iterdir() if "blocks" in p.name] == []
 
 
+def in_memory_and_in_blocks(vvgt, raw, folder, *fit):
+    one, other = folder / "a.ply", folder / "b.ply"
+    vvgt.ok("init", raw, "-o", one, *fit)
+    vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")
+    return one, other
+
+
 @pytest.mark.parametrize("budget", ["1", "7", "64", "400", "60000"])
 def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     fit = ("--max-gaussians", budget, "--size", "100", "-q")
-    assert vvgt("init", raw, "-o", one, *fit).code == 0
-    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
-    assert same_gaussians(one, other)
+    assert same_gaussians(*in_memory_and_in_blocks(vvgt, raw, tmp_path, *fit))
 
 
 def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    fit = ("--max-gaussians", "100000", "--size", "100", "-q")
-    assert vvgt("init", raw, "-o", one, *fit).code == 0
-    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
     both = []
-    for path in (one, other):
+    for path in in_memory_and_in_blocks(vvgt, raw, tmp_path, "--max-gaussians", "100000", "--size", "100", "-q"):
         found = read_ply(path)[0]
         both.append(found.take(np.lexsort(found.means.T)))
     assert len(both[0]) == len(both[1]) > 65536
@@ -98,9 +96,9 @@ def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
                   '{"x": 0.4, "rgb": [1, 1, 0], "opacity": 1}]}')  # fmt: skip
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     options = ("--tf", tf, "--max-gaussians", "3000", "--size", "200", "-q")
-    assert vvgt("init", path, "-o", one, *options).code == 0
+    vvgt.ok("init", path, "-o", one, *options)
     for size in ("16", "32"):
-        assert vvgt("init", path, "-o", other, *options, "--blocks", size, "--overwrite").code == 0
+        vvgt.ok("init", path, "-o", other, *options, "--blocks", size, "--overwrite")
         assert same_gaussians(one, other)
 
 
@@ -156,10 +154,7 @@ def store(kind, path, values, chunks=(16, 20, 24)):
 @pytest.mark.parametrize("kind", ["zarr2", "zarr3", "hdf5"])
 def test_chunked_files_are_read_in_blocks(vvgt, tmp_path, kind):
     source = store(kind, tmp_path, bodies().astype(np.float32))
-    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    assert vvgt("init", source, "-o", one, *FIT).code == 0
-    assert vvgt("init", source, "-o", other, *FIT, "--blocks", "32").code == 0
-    assert same_gaussians(one, other)
+    assert same_gaussians(*in_memory_and_in_blocks(vvgt, source, tmp_path, *FIT))
 
 
 def test_axes_of_an_array_in_a_file_are_turned_as_in_memory(tmp_path):
@@ -194,21 +189,18 @@ def test_a_missing_chunk_is_fill_value_and_a_damaged_one_a_line_with_its_index(v
     chunks = chunk_files(source)
     assert len(chunks) == 8
     chunks[5].write_bytes(b"nonsense")
-    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
-    assert run.code == 1
-    assert "chunk (1, 0, 1) (z, y, x) is damaged" in run.err
+    run = vvgt.fails(1, "init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
+    assert "chunk (1, 0, 1) (z, y, x) is damaged" in run
     chunks[5].unlink()
-    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
-    assert run.code == 0
+    vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
     values[32:, :32, 32:] = 0
     np.save(tmp_path / "v.npy", values)
-    assert vvgt("init", tmp_path / "v.npy", "-o", tmp_path / "b.ply", *FIT).code == 0
+    vvgt.ok("init", tmp_path / "v.npy", "-o", tmp_path / "b.ply", *FIT)
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
 
 
 def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
-    zarr = pytest.importorskip("zarr")
-    group = zarr.open_group(tmp_path / "v.zarr", mode="w", zarr_format=3)
+    group = pytest.importorskip("zarr").open_group(tmp_path / "v.zarr", mode="w", zarr_format=3)
     values = np.round(bodies((64, 64, 64)) * 255).astype(np.uint8)
     for n in range(3):
         group.create_array(str(n), data=values[:: 2**n, :: 2**n, :: 2**n])
@@ -221,40 +213,26 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     for size, level, grid in ((300, None, "64 x 64 x 64"), (30, None, "32 x 32 x 32"), (30, "full", "64 x 64 x 64"),
                               (30, "2", "16 x 16 x 16")):  # fmt: skip
         chosen = ["--level", level] if level else ["--blocks", "auto"]
-        run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
-        assert run.code == 0
+        run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
         assert f": {grid} uint8" in run.err
-    run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
-    assert run.code == 2
-    assert "expected full, or 0 to 2" in run.err
-    run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
-    assert run.code == 2
-    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run.err
+    run = vvgt.fails(2, "init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
+    assert "expected full, or 0 to 2" in run
+    run = vvgt.fails(2, "init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
+    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     source = store("hdf5", tmp_path, bodies().astype(np.float32))
-    plain = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert plain.code == 0
-    assert "blocks" not in plain.err
+    assert "blocks" not in vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT[:-1]).err
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 200 << 20)
-    less = vvgt("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
-    assert less.code == 0
-    assert "processed in blocks" in less.err
+    assert "processed in blocks" in vvgt.ok("init", source, "-o", tmp_path / "b.ply", *FIT[:-1]).err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
-    views = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
-    assert views.code == 0, views.err
-    whole = vvgt("evaluate", tmp_path / "b.ply", "--volume", source)
-    assert whole.code == 0, whole.err
-    assert "processed in blocks" in whole.err
-    fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
-    assert fitted.code == 0
-    assert "processed in blocks" in fitted.err
+    vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    assert "processed in blocks" in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source).err
+    assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
-    none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
-    assert none.code == 2
-    assert "MiB more" in none.err
+    assert "MiB more" in vvgt.fails(2, "init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
 
 
 def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
@@ -263,24 +241,20 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
-        run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *options)
-        assert run.code == 2, options
-        assert word in run.err
+        assert word in vvgt.fails(2, "init", raw, "-o", tmp_path / "a.ply", *FIT, *options)
     packed = tmp_path / "v_100x90x80_uint8.raw.gz"
     import gzip
 
     packed.write_bytes(gzip.compress(raw.read_bytes()))
-    assert vvgt("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto").code == 0  # small: unpacked
+    vvgt.ok("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto")  # small: unpacked
     assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2
 
 
 def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
     named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
     named.write_bytes(raw.read_bytes())
-    run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32")
-    assert run.code == 0
-    assert "distinct colours" in run.err
-    assert vvgt("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+    assert "distinct colours" in vvgt.ok("init", named, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "32").err
+    vvgt.ok("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none")
     assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
     assert not list(tmp_path.glob(".*blocks"))
 

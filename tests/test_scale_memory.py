@@ -1,7 +1,5 @@
 """What blocks read and keep: slices of TIFF page by page, every voxel once, no more than a worker's memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -36,8 +34,7 @@ def test_slices_of_tiff_are_read_in_blocks_page_by_page(vvgt, tmp_path, coding):
         files = []
         for blocks in ((), ("--blocks", "16"), ("--blocks", "64")):
             path = tmp_path / "a.ply"
-            run = vvgt("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
-            assert run.code == 0, run.err
+            vvgt.ok("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
             files.append(sorted_rows(path)[1])
         assert np.array_equal(files[0], files[1])
         assert np.array_equal(files[0], files[2])
@@ -48,9 +45,8 @@ def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path
 
     for z in range(20):
         tifffile.imwrite(tmp_path / f"s{z}.tif", np.zeros((8, 9 if z == 17 else 10), np.uint8))
-    run = vvgt("init", tmp_path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "16")
-    assert run.code == 1
-    assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run.error
+    run = vvgt.fails(1, "init", tmp_path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "16")
+    assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run
 
 
 def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt, tmp_path, monkeypatch):
@@ -61,9 +57,7 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
-    run = vvgt("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert run.code == 0, run.err
-    assert "processed in blocks" in run.err
+    assert "processed in blocks" in vvgt.ok("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1]).err
 
 
 def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
@@ -73,9 +67,7 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000
-    run = vvgt("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
-    assert run.code == 0, run.err
-    assert "processed in blocks" in run.err
+    assert "processed in blocks" in vvgt.ok("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1]).err
 
 
 def test_threads_share_a_file_of_pages(tmp_path):
@@ -155,6 +147,5 @@ def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, mon
         return tree
 
     monkeypatch.setattr(tiled_tree, "build_tree", watched)
-    run = vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
-    assert run.code == 0, run.err
+    vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     assert len(made) > 6

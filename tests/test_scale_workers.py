@@ -1,7 +1,5 @@
 """Blocks by shards, processes and Dask's workers: the same bytes, whoever is killed."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -61,21 +59,14 @@ def start(*args, **variables):
 def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, tmp_path):
     folder, out = tmp_path / "v.blocks", tmp_path / "merged.ply"
     for shard in ("2/3", "3/3"):
-        run = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard)
-        assert run.code == 0
-        assert "run the same array again" in run.err
-    early = vvgt("merge", folder, "-o", out)
-    assert early.code == 1
-    assert "run the same array again" in early.err
+        assert "run the same array again" in vvgt.ok("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard).err
+    assert "run the same array again" in vvgt.fails(1, "merge", folder, "-o", out)
     for shard in ("1/3", "3/3"):
-        assert vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard).code == 0
-    early = vvgt("merge", folder, "-o", out)
-    assert early.code == 1
-    assert "is missing; remove its other files" in early.err
-    last = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3")
-    assert "all blocks are complete" in last.err
+        vvgt.ok("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard)
+    assert "is missing; remove its other files" in vvgt.fails(1, "merge", folder, "-o", out)
+    assert "all blocks are complete" in vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3").err
     raw.unlink()  # is not needed any more
-    assert vvgt("merge", folder, "-o", out).code == 0
+    vvgt.ok("merge", folder, "-o", out)
     assert out.read_bytes() == alone
     assert vvgt("merge", folder, "-o", out).code == 2  # exists
     assert vvgt("merge", folder, "-o", "-").out == alone
@@ -83,18 +74,15 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
 
 def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):
     folder = tmp_path / "v.blocks"
-    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/2").code == 0
-    other = vvgt("init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
-    assert other.code == 2
-    assert "another run (other files, function)" in other.err
-    other = vvgt("init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
-    assert other.code == 2
-    assert "another run (other blocks)" in other.err
+    vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/2")
+    other = vvgt.fails(2, "init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
+    assert "another run (other files, function)" in other
+    other = vvgt.fails(2, "init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
+    assert "another run (other blocks)" in other
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("x")
-    other = vvgt("init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
-    assert other.code == 2
-    assert "holds no blocks of vvgt" in other.err
+    other = vvgt.fails(2, "init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
+    assert "holds no blocks of vvgt" in other
 
 
 def test_shards_may_start_together(tmp_path, monkeypatch):
@@ -119,16 +107,12 @@ def test_shards_may_start_together(tmp_path, monkeypatch):
 
 def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
     folder = tmp_path / "v.blocks"
-    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1").code == 0
+    vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1")
     rows = sorted((folder / "cells").glob("*.rows"), key=lambda path: path.stat().st_size)[-1]
     rows.write_bytes(rows.read_bytes()[:-1000])
-    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
-    assert run.code == 1
-    assert "truncated; remove" in run.err
+    assert "truncated; remove" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     rows.with_suffix(".npz").write_bytes(b"PK nonsense")
-    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
-    assert run.code == 1
-    assert "damaged" in run.err
+    assert "damaged" in vvgt.fails(1, "merge", folder, "-o", tmp_path / "a.ply")
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -137,7 +121,7 @@ def test_dasks_workers_convert_labels_under_light(vvgt, tmp_path):
     np.save(tmp_path / "v.npy", np.digitize(bodies((70, 30, 25)), [0.2, 0.6]).astype(np.uint8))
     how = ("--labels", "auto", "--light", "above", "--shadows", "--max-gaussians", 300, "--size", 48, "--steps", 6)
     line = ("convert", tmp_path / "v.npy", *how, "--blocks", 32, "-o")
-    assert vvgt(*line, tmp_path / "one.ply", "-q").code == 0
+    vvgt.ok(*line, tmp_path / "one.ply", "-q")
     run = start(*line, tmp_path / "two.ply", "--workers", 2, "--scheduler", "local")
     said = run.communicate(timeout=900)[1]
     assert run.returncode == 0, said
@@ -195,8 +179,7 @@ def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
     run.kill()
     run.wait()
     assert not (tmp_path / "a.ply").exists()
-    again = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "auto")
-    assert again.code == 0
+    again = vvgt.ok("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "auto")
     assert "resuming with the blocks" in again.err
     done, total = map(int, re.search(r"integrate .* (\d+) of (\d+) blocks", again.err).groups())
     assert done < total
@@ -254,7 +237,7 @@ def test_a_disk_that_takes_no_more_is_a_line_and_the_run_goes_on_when_it_does(ra
     assert "File too large" in full.stderr
     assert not (tmp_path / "a.ply").exists()
     assert list((tmp_path / ".a.ply.blocks").rglob(".*")) == []  # temporary files
-    assert vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE).code == 0
+    vvgt.ok("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)
     assert (tmp_path / "a.ply").read_bytes() == alone
 
 
@@ -335,9 +318,7 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
     assert "sbatch not found" in run.err
     for name, value in {**variables, "SBATCH_REFUSES": "1"}.items():
         monkeypatch.setenv(name, value)
-    run = vvgt(*call)
-    assert run.code == 2
-    assert "expected --memory" in run.err
+    assert "expected --memory" in vvgt.fails(2, *call)
     run = start(*call, "--memory", "3G", **variables, SBATCH_REFUSES="1")
     said = run.communicate(timeout=300)[1]
     assert (run.returncode, said.count("\n")) == (1, 1), said
@@ -396,10 +377,9 @@ def test_a_full_disk_is_reported_before_blocks_are_written(vvgt, raw, tmp_path, 
     assert "102400 are free in" in run.err
     assert not (tmp_path / ".a.ply.blocks" / "cells").exists()
     disk.f_bavail = 400000
-    run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], *SIZE)
-    assert run.code == 0
+    run = vvgt.ok("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], *SIZE)
     need = float(re.search(r"on disk meanwhile: about (\d+) MB in .*\.a\.ply\.blocks", run.err)[1])
     folder = tmp_path / "v.blocks"
-    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1").code == 0
+    vvgt.ok("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1")
     taken = sum(path.stat().st_size for path in (folder / "cells").iterdir()) + (tmp_path / "a.ply").stat().st_size
     assert 0.8 * taken < need * 1e6 < 1.5 * taken

@@ -1,7 +1,5 @@
 """`vvgt convert` of a time series: one range for all, resumed by its manifest, in parts."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -58,14 +56,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_frames_are_those_of_single_conversions_and_dark_ones_are_skipped(vvgt, series: Path) -> None:
     out, tf = series / "out" / "f_{:03d}.ply", series / "tf.json"
-    done = vvgt("convert", series / "run_*.npy", "--tf", tf, "-o", out, *[a for a in SMALL if a != "-q"])
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", series / "run_*.npy", "--tf", tf, "-o", out, *[a for a in SMALL if a != "-q"])
     assert "values 0 to 10" in done.err
     assert "skipped: run_8.npy (nothing of it is visible)" in done.err
     made = contents(series / "out")
     assert list(made) == ["f_001.ply", "f_002.ply", "f_003.ply"]
     alone = series / "alone.ply"
-    assert vvgt("convert", series / "run_9.npy", "--tf", tf, "-o", alone, *SMALL).code == 0
+    vvgt.ok("convert", series / "run_9.npy", "--tf", tf, "-o", alone, *SMALL)
     assert uncertified(alone) == uncertified(made["f_001.ply"])
 
 
@@ -73,7 +70,7 @@ def test_frames_are_those_of_single_conversions_and_dark_ones_are_skipped(vvgt, 
 def test_one_range_for_all(vvgt, series: Path, stand_in: list, how: tuple) -> None:
     how = tuple(series / "tf.json" if part == "TF" else part for part in how)
     run = ("convert", series / "run_*.npy", "-o", series / "out" / "{:d}.ply", *how, *SMALL)
-    assert vvgt(*run, "--report", series / "out" / "r{:d}.json").code == 0
+    vvgt.ok(*run, "--report", series / "out" / "r{:d}.json")
     nodes = [load(request.source).tf.node_range() for request in stand_in]
     assert len(nodes) >= 3
     assert set(nodes) == {nodes[0]}
@@ -85,16 +82,14 @@ def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand
     (series / "parts").mkdir()
     common = ("convert", series / "run_*.npy", "--tf", series / "tf.json", *SMALL)
     whole = (*common, "-o", series / "out" / "{:02d}.ply")
-    assert vvgt(*whole).code == 0
+    vvgt.ok(*whole)
     made = contents(series / "out")
     for part in ("2/2", "1/2"):
-        assert vvgt(*common, "-o", series / "parts" / "{:02d}.ply", "--shard", part).code == 0
+        vvgt.ok(*common, "-o", series / "parts" / "{:02d}.ply", "--shard", part)
     assert contents(series / "parts") == made
     (series / "out" / "02.ply").write_bytes(b"damaged")
     before = (series / "out" / "03.ply").stat().st_mtime_ns
-    again = vvgt(*[part for part in whole if part != "-q"])
-    assert again.code == 0
-    assert "1 frames converted, 2 were complete before" in again.err
+    assert "1 frames converted, 2 were complete before" in vvgt.ok(*[part for part in whole if part != "-q"]).err
     assert contents(series / "out") == made
     assert (series / "out" / "03.ply").stat().st_mtime_ns == before
 
@@ -108,8 +103,7 @@ def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
     for source in ("run_*.npy", "cells.ome.tif", "bold.nii.gz"):
         folder = series / source.partition(".")[0].strip("_*")
         folder.mkdir()
-        done = vvgt("convert", series / source, "-o", folder / "p_{:02d}.ply", *run)
-        assert done.code == 0, done.err
+        done = vvgt.ok("convert", series / source, "-o", folder / "p_{:02d}.ply", *run)
         made[source] = contents(folder)
     assert list(made["cells.ome.tif"]) == ["p_01.ply", "p_02.ply", "p_03.ply"]
     assert made["cells.ome.tif"] == made["bold.nii.gz"] == made["run_*.npy"]
@@ -121,9 +115,8 @@ def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
 
 def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
     out = series / "out" / "{:02d}.ply"
-    done = vvgt("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
-    assert done.code == 2
-    assert "--dry-run with frames: a plan is for one volume" in done.err
+    done = vvgt.fails(2, "convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
+    assert "--dry-run with frames: a plan is for one volume" in done
     assert not list((series / "out").iterdir())
 
 
@@ -140,11 +133,11 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
 
 def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path, stand_in: list) -> None:
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
-    assert vvgt(*run).code == 0
+    vvgt.ok(*run)
     assert "holds frames of another run: max gaussians 60 there, 50 here" in vvgt(*run, "--max-gaussians", "50").error
     np.save(series / "run_12.npy", np.zeros((8, 10, 12), np.float32))
     assert "another volume, frames 4 there, 5 here" in vvgt(*run).error
-    assert vvgt(*run, "--overwrite").code == 0
+    vvgt.ok(*run, "--overwrite")
     (series / "out" / "manifest.json").unlink()
     assert "01.ply exists, and no manifest" in vvgt(*run).error
     (series / "out" / "manifest.json").write_text("{}")
@@ -199,8 +192,7 @@ def test_statistics_together() -> None:
     assert (joined.lo, joined.hi, joined.nan_count) == (whole.lo, whole.hi, 1)
     np.testing.assert_allclose(joined.edges, whole.edges)
     assert joined.histogram.sum() == whole.histogram.sum() == 479
-    off = np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max()
-    assert off <= 0.02 * 479
+    assert np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max() <= 0.02 * 479
     constant = merge_statistics([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
     assert (constant.lo, constant.hi, constant.histogram.sum()) == (3, 3, 16)
 
@@ -216,13 +208,12 @@ def test_frames_of_colours(vvgt, series: Path) -> None:
     for k in range(3):
         write_colors(series / f"rgb_{k}.tif", k)
     out = series / "out" / "c_{}.ply"
-    done = vvgt("convert", series / "rgb_*.tif", "-o", out, *[a for a in SMALL if a != "-q"])
-    assert done.code == 0, done.err
+    done = vvgt.ok("convert", series / "rgb_*.tif", "-o", out, *[a for a in SMALL if a != "-q"])
     assert "opacity by luminance" in done.err
     assert "skipped: rgb_0.tif (nothing of it is visible)" in done.err
     made = contents(series / "out")
     assert list(made) == ["c_1.ply", "c_2.ply"]
-    assert vvgt("convert", series / "rgb_1.tif", "-o", series / "alone.ply", *SMALL).code == 0
+    vvgt.ok("convert", series / "rgb_1.tif", "-o", series / "alone.ply", *SMALL)
     assert uncertified(series / "alone.ply") == uncertified(made["c_1.ply"])
     write_colors(series / "rgb_3.tif", 1, 4)
     assert "components 4; expected the 3 of rgb_0.tif" in vvgt("convert", series / "rgb_*.tif", "-o", out, *SMALL).error
@@ -234,9 +225,7 @@ def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand
     values = rng.random((3, 6, 2, 8, 10)) * np.array([1, 2, 4])[:, None, None, None, None] * 1000
     tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata={"axes": "TZCYX"})
     run = ("convert", series / "t.ome.tif", "--channel", "all", "-o", series / "out" / "{}.ply", *SMALL[:-1])
-    done = vvgt(*run)
-    assert done.code == 0, done.err
-    assert "3 of 10 x 8 x 6" in done.err
+    assert "3 of 10 x 8 x 6" in vvgt.ok(*run).err
     layers = [load(request.source).layers for request in stand_in]
     nodes = [[layer.tf.node_range() for layer in frame] for frame in layers]
     assert [len(frame) for frame in layers] == [2, 2, 2]
@@ -249,11 +238,9 @@ def test_layers_over_frames_have_one_function_and_dark_frames_are_shown(vvgt, se
     """Frame 8 is nothing under the function; what is laid over it is seen all the same."""
     np.save(series / "other.npy", np.ones((8, 10, 12), np.float32))
     run = ("convert", series / "run_*.npy", "--layer", f"{series / 'other.npy'},tf={series / 'tf.json'}")
-    done = vvgt(*run, "--tf", series / "tf.json", "-o", series / "out" / "{:d}.ply", *SMALL)
-    assert done.code == 0, done.err
+    vvgt.ok(*run, "--tf", series / "tf.json", "-o", series / "out" / "{:d}.ply", *SMALL)
     assert len(contents(series / "out")) == 4
     stand_in.clear()
-    done = vvgt(*run, "-o", series / "out" / "b{:d}.ply", *SMALL, "--overwrite")
-    assert done.code == 0, done.err
+    vvgt.ok(*run, "-o", series / "out" / "b{:d}.ply", *SMALL, "--overwrite")
     made = [load(request.source).layers[0].tf for request in stand_in]
     assert len({tf.node_range() for tf in made}) == 1

@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Slices of the volume beside the picture, in a real browser, against what nibabel reads from the same file."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -122,8 +120,7 @@ def test_a_click_moves_the_cross_in_slices_and_picture(marked: str, person: Pers
     far *= person("eval", "window.vvgt.where.lens.perPixel() * window.vvgt.where.world.length")
     print(f"{person.size}: lines {np.round(far, 1)} mm from the mark")
     assert far.max() < 4  # the red of the mark, of radius 5, is in front of its middle
-    link = person("eval", "window.vvgt.where.link()")
-    person("open", link)
+    person("open", person("eval", "window.vvgt.where.link()"))
     assert np.array(person("eval", CROSS)) == pytest.approx(at, abs=0.1)
     person("eval", "document.querySelector('#slices .close').click()")
     person("settled")
@@ -187,8 +184,7 @@ def test_labels_are_drawn_over_the_values_as_their_list_shows_them(person: Perso
     layer = f"{tmp_path / 'labels.nii'},labels=auto"
     how = ["--tf", "gray", "--layer", layer, "--live", "--max-gaussians", "2000", "--quiet"]
     assert run(["convert", str(tmp_path / "scan.nii"), *how, "-o", str(tmp_path / "two.html")]) == 0
-    rects = opened(person, (tmp_path / "two.html").as_uri())
-    left, top, wide, high = rects[0]
+    left, top, wide, high = opened(person, (tmp_path / "two.html").as_uri())[0]
     scale = min(wide, high) / 24
 
     def color(i: float, j: float) -> np.ndarray:
@@ -199,8 +195,7 @@ def test_labels_are_drawn_over_the_values_as_their_list_shows_them(person: Perso
     window, level = person("eval", WINDOW)
     grey = (100 - (level - window / 2)) / window
     assert color(22, 22) == pytest.approx(np.full(3, np.clip(grey, 0, 1)), abs=0.02)  # no label
-    within = color(16, 6)
-    assert np.ptp(within) > 0.1
+    assert np.ptp(color(16, 6)) > 0.1
     look = "window.vvgt.live.layers.find(({ rows }) => rows)"
     person("eval", f"{look}.set([{{ number: 3, color: [0, 0, 1], opacity: 0.5 }}])")
     np.testing.assert_allclose(color(16, 6), (grey / 2, grey / 2, grey / 2 + 0.5), atol=0.02)
@@ -241,8 +236,7 @@ def test_the_face_of_a_cut_shows_the_slice_and_hides_what_is_behind(
 
 def test_damaged_slices_are_said_to_be(marked: str, person: Person, tmp_path: Path) -> None:
     text = Path(marked.removeprefix("file://")).read_text("utf-8")
-    cut = re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text)
-    (tmp_path / "cut.html").write_text(cut, "utf-8")
+    (tmp_path / "cut.html").write_text(re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text), "utf-8")
     opened(person, (tmp_path / "cut.html").as_uri())
     assert person("eval", SAID).startswith("The slices cannot be shown")
     assert person("eval", "window.vvgt.where.link()").count("slices=") == 0

@@ -1,7 +1,5 @@
 """The job scripts in `examples`, with the variables that SLURM sets."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -35,7 +33,6 @@ def test_an_array_of_two_and_a_merge_leave_what_one_run_leaves(tmp_path: Path) -
         last = job("merge.slurm", tmp_path / "parts", tmp_path / "a.ply", "-q")
         if last.returncode == 0:
             break
-    assert last is not None
     assert last.returncode == 0, last.stderr
     whole = [str(Path(sys.executable).parent / "vvgt"), "init", volume, "-o", tmp_path / "b.ply", *options]
     subprocess.run(list(map(str, whole)), check=True, timeout=900)

@@ -1,7 +1,5 @@
 """SOG: what is written against decoding written down pixel by pixel, codebooks against trying all, bad archives."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -14,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.random_clouds import turns
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.sog import (
     COMMENTS,
@@ -113,13 +113,7 @@ def test_every_pixel_decodes_as_in_the_engine(degree: int) -> None:
 
 
 def matrices(quaternions: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    turn = np.moveaxis(np.array(rows), 2, 0)
+    turn = turns(quaternions)
     return (turn * np.exp(2 * log_scales)[:, None]) @ turn.transpose(0, 2, 1)
 
 
@@ -222,12 +216,10 @@ def test_small_archives_that_unpack_to_much_are_refused() -> None:
     files = members(sog(some(50), "a"))
     bomb = zipped(files | {META: b"[" + b" " * (1 << 24) + b"]"}, zipfile.ZIP_DEFLATED)
     assert len(bomb) < 1 << 17
-    with pytest.raises(DataError, match="has 16,777,218 bytes; expected at most 1,048,576"):
-        read_sog(bomb, "bad.sog")
+    refused(DataError, "has 16,777,218 bytes; expected at most 1,048,576", read_sog, bomb, "bad.sog")
     stream = io.BytesIO()
     Image.new("RGBA", (8000, 8000)).save(stream, "WEBP", lossless=True, method=0, quality=0)
-    with pytest.raises(DataError, match="is of 8000 x 8000 px"):
-        read_sog(zipped(files | {"means_l.webp": stream.getvalue()}), "bad.sog")
+    refused(DataError, "is of 8000 x 8000 px", read_sog, zipped(files | {"means_l.webp": stream.getvalue()}), "bad.sog")
 
 
 def test_archives_of_others_are_read() -> None:

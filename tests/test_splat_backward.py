@@ -1,7 +1,5 @@
 """Gradients: the float64 twin against central differences, the kernels against the twin, and the corners of both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -53,7 +51,7 @@ def direction(rng, g, seed, size=2e-4):
 @pytest.mark.parametrize("block", range(6))
 def test_the_twin_agrees_with_central_differences_in_hundreds_of_scenes(block, rule):
     checked, rule = 0, RULES[rule]
-    for seed in range(block, 360, 6):
+    for seed in range(block, 180, 6):
         rng = np.random.default_rng(seed)
         axes = rng.choice([0.15, 0.3, 1.0])
         eye = np.array(EYE) * rng.choice([0.2, 0.5, 1.0])  # some scenes lie around the eye
@@ -70,7 +68,7 @@ def test_the_twin_agrees_with_central_differences_in_hundreds_of_scenes(block, r
         parts = [slopes[f] * (getattr(high, f).astype(np.float64) - getattr(low, f)) for f in FIELDS]
         assert abs(difference - sum(p.sum() for p in parts)) < 2e-3 * sum(np.abs(p).sum() for p in parts) + 1e-12
         checked += any(p.any() for p in parts)
-    assert checked > 40
+    assert checked > 20
 
 
 def assert_matches_twin(g, c, seed=0, tight=2e-3, share=0.01, rule=INRIA):

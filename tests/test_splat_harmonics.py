@@ -1,7 +1,5 @@
 """Colours that depend on the view, through the splatter: pictures and gradients against the float64 twin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

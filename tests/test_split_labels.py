@@ -1,7 +1,5 @@
 """`--split-labels`: the files' Gaussians are those of the whole, each once, and what the whole hides is there too."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -39,8 +37,7 @@ def nested(n: int = 24, cut: bool = False) -> np.ndarray:
 def converted(vvgt, tmp_path: Path, values: np.ndarray, *options) -> dict[int, Gaussians]:
     np.save(tmp_path / "v.npy", values)
     out = ("--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply", "--overwrite")
-    done = vvgt("convert", tmp_path / "v.npy", "--labels", "auto", *out, *options)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "v.npy", "--labels", "auto", *out, *options)
     index = json.loads((tmp_path / "p_index.json").read_text())
     return {row["label"]: read_ply(str(tmp_path / row["file"]))[0] for row in index["files"]}
 
@@ -66,8 +63,7 @@ def test_the_files_hold_the_gaussians_of_the_whole(vvgt, tmp_path: Path, monkeyp
 
 def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Path) -> None:
     report = ("--report", tmp_path / "r_{}.json")
-    files = converted(vvgt, tmp_path, nested(), *report)
-    core = files[3]
+    core = converted(vvgt, tmp_path, nested(), *report)[3]
     np.testing.assert_allclose(core.means.max(axis=0) - core.means.min(axis=0), 1.0, atol=0.25)  # 12 voxels of 24
     assert len(core) > 50
     scores = json.loads((tmp_path / "r_3-label-3.json").read_text())
@@ -91,15 +87,11 @@ def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path
 
 
 def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
-    values = nested()
-    assert list(converted(vvgt, tmp_path, np.where(values == 3, 3, 0))) == [3]
+    assert list(converted(vvgt, tmp_path, np.where(nested() == 3, 3, 0))) == [3]
     line = ("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
-    size = vvgt(*line, "--max-size", 1)
-    assert "--max-size with labels: the limit is for one cloud" in size.error
-    time = vvgt(
-        "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
-    )
-    assert (time.code, "--time-budget with labels: it is for one conversion" in time.error) == (2, True)
+    assert "--max-size with labels: the limit is for one cloud" in vvgt(*line, "--max-size", 1).error
+    time = vvgt.fails(2, "convert", tmp_path / "v.npy", "--labels auto --split-labels --time-budget 9 -o", "p_{}.ply")
+    assert "--time-budget with labels: it is for one conversion" in time
 
 
 def test_standard_input_is_read_once(tmp_path: Path) -> None:
@@ -160,8 +152,7 @@ def test_gaussians_near_no_label_are_told_by_colours_that_light_darkens() -> Non
 
 
 def hidden_of(source):
-    field = Resident(source, source.scene())
-    form = field.pyramid(VbmOptions(600, 64)).form
+    form = Resident(source, source.scene()).pyramid(VbmOptions(600, 64)).form
     return hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
 
 
@@ -172,8 +163,7 @@ def test_hidden_cells_are_those_that_no_view_sees(cut: bool) -> None:
     hides = hidden_of(source)
     assert hides.meet_label(source.volume, 3)
     assert hides.meet_label(source.volume, 1)  # its wall towards the core
-    apart = np.where(values == 3, 3, 0)
-    alone = load(SourceRequest(Volume(apart), labels="auto"))
+    alone = load(SourceRequest(Volume(np.where(values == 3, 3, 0)), labels="auto"))
     assert not hidden_of(alone).meet_label(alone.volume, 3)
     centre = np.zeros((2, 3))
     centre[1] = -0.95 / np.sqrt(3)  # on the outer surface, opposite to the cut

@@ -1,7 +1,5 @@
 """Stiff and extreme scenes through function tables, ray caster, light, closed form and whole conversions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

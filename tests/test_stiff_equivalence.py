@@ -1,7 +1,5 @@
 """Stiff scenes that do not fit into one block: converted in blocks, live, lit and streamed as they are in memory."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 
@@ -111,7 +109,6 @@ def test_streamed_as_in_one_file(vvgt, tmp_path, name):
     look = ("--labels" if row.labels else "--tf", tmp_path / "look.json", "--opacity-unit-distance", np.mean(row.edge))
     for options in (("-o", tmp_path / "a.ply"), ("--blocks", BLOCK, "-o", tmp_path / "lod" / "lod-meta.json")):
         budget = ("--max-gaussians", BUDGET, "--size", SIZE, "--spacing", *row.edge)
-        result = vvgt("init", tmp_path / "a.npy", *look, *budget, *options)
-        assert result.code == 0, result.err
+        vvgt.ok("init", tmp_path / "a.npy", *look, *budget, *options)
         found.append(pictures(vvgt_cli.read_ply(options[-1])[0]))
     assert_alike(*found, ROUNDED)

@@ -1,7 +1,5 @@
 """Streamed SOG: what the engine would take from the manifest and its files, errors drawn again, what is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -89,7 +87,7 @@ def test_nodes_share_out_every_file(folder: Path) -> None:
 
 def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: Path, folder: Path) -> None:
     line = ("init", volume, *FIT, "--up", "z", "--blocks", "32")  # as pages turn what has no way up
-    assert vvgt(*line, "-o", volume.parent / "a.ply").code == 0
+    vvgt.ok(*line, "-o", volume.parent / "a.ply")
     expected = read_ply(volume.parent / "a.ply")[0]
     manifest = read_manifest(folder / "lod-meta.json")
     files = decoded(folder, manifest)
@@ -154,9 +152,9 @@ def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_
 
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert vvgt("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json").code == 0
-    assert vvgt("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts").code == 0
-    assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json").code == 0
+    vvgt.ok("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json")
+    vvgt.ok("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts")
+    vvgt.ok("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json")
     for other in (tmp_path / "whole", tmp_path / "merged"):
         assert {p.relative_to(other): p.read_bytes() for p in other.rglob("*") if p.is_file()} == whole
 
@@ -173,21 +171,17 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
-    found = vvgt("convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
-    assert found.code == 2, found.err
-    assert text in found.error
+    assert text in vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_run_resumes_with_the_same_bytes(
-    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 2500)
     monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
     whole, out = tmp_path / "whole", tmp_path / "out"
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
-    assert vvgt(*line, whole / "lod-meta.json").code == 0
+    vvgt.ok(*line, whole / "lod-meta.json")
     calls = {"level_errors": 0, "images_of": 0}
     real = {"level_selection.level_errors": level_errors, "streamed.images_of": images_of}
     stop = {"level_errors": 20, "images_of": 0}
@@ -213,7 +207,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(
     assert calls["level_errors"] < nodes + 20  # those of the regions that were whole are not drawn again
     assert not (out / "lod-meta.json").exists()
     calls, stop["images_of"] = {"level_errors": 0, "images_of": 0}, 0
-    assert vvgt(*line, out / "lod-meta.json").code == 0
+    vvgt.ok(*line, out / "lod-meta.json")
     assert calls == {"level_errors": 0, "images_of": files - 2}
     found = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (whole, out)]
     assert found[0] == found[1]
@@ -261,7 +255,7 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"x")
     assert vvgt("init", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
-    assert vvgt("init", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json").code == 0
+    vvgt.ok("init", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json")
     assert not stale.exists()
     assert (other / "notes.txt").is_file()  # not of the manifest
 
@@ -269,7 +263,7 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
 def test_nothing_else_in_the_folder_is_touched(vvgt, volume: Path, tmp_path: Path) -> None:
     (tmp_path / "2024_11").mkdir()
     (tmp_path / "2024_11" / "notes.txt").write_text("of someone")
-    assert vvgt("init", volume, *FIT, "-o", tmp_path / "lod-meta.json").code == 0
+    vvgt.ok("init", volume, *FIT, "-o", tmp_path / "lod-meta.json")
     assert (tmp_path / "2024_11" / "notes.txt").read_text() == "of someone"
 
 
@@ -299,10 +293,8 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
 
 def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
-    found = vvgt("view", tmp_path, "--no-browser")
-    assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
-    found = vvgt("view", tmp_path, folder, "-o", tmp_path / "a.html")
-    assert (found.code, "are shown alone" in found.error) == (2, True)
+    assert "is missing; expected the whole folder" in vvgt.fails(1, "view", tmp_path, "--no-browser")
+    assert "are shown alone" in vvgt.fails(2, "view", tmp_path, folder, "-o", tmp_path / "a.html")
 
 
 @pytest.mark.parametrize(
@@ -320,9 +312,7 @@ def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Pa
         (lambda m: m["tree"]["children"][0]["lods"].update({"0": []}), "a node has"),
     ],
 )
-def test_manifests_that_cannot_be_are_one_line(
-    folder: Path, tmp_path: Path, change: Callable[[Any], None], text: str
-) -> None:
+def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     change(manifest)
     (tmp_path / "lod-meta.json").write_text(json.dumps(manifest))
@@ -333,7 +323,7 @@ def test_manifests_that_cannot_be_are_one_line(
 
 
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
-    assert vvgt("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply").code == 0
+    vvgt.ok("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply")
     alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-conditions", "--json").out)
     found = []
     for name in (f"{folder}", f"{folder / 'lod-meta.json'}#1", f"{folder}#2"):
@@ -344,11 +334,10 @@ def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path
     assert [scores["size"] for scores in found] == [150] * 3  # as the comments say
     assert found[0]["scores"]["psnr"] == pytest.approx(alone["scores"]["psnr"], abs=0.3)
     assert found[0]["scores"]["psnr"] > found[1]["scores"]["psnr"] > found[2]["scores"]["psnr"] > 15
-    assert vvgt("view", f"{folder}#1", "-o", tmp_path / "b.ply").code == 0
+    vvgt.ok("view", f"{folder}#1", "-o", tmp_path / "b.ply")
     assert len(read_ply(tmp_path / "b.ply")[0]) == counts[1]
     for name, command in ((f"{folder}#9", ()), (f"{folder}#view", ())):
-        wrong = vvgt("evaluate", name, "--volume", volume, *command)
-        assert (wrong.code, "expected a level from 0 to" in wrong.error) == (2, True), wrong.error
+        assert "expected a level from 0 to" in vvgt.fails(2, "evaluate", name, "--volume", volume, *command)
 
 
 def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: Path) -> None:
@@ -371,7 +360,7 @@ def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: P
     assert len(levels.seen_from(np.array([0, -1e6, 0]), 45.0)) == counts[-1]
     for name, where in (("view", f"{folder}#view"), ("one", f"{folder}#1")):
         line = ("render", where, "--orbit", 2, "--size", 60, "-q", "-o", tmp_path / name)
-        assert vvgt(*line).code == 0
+        vvgt.ok(*line)
     seen, one = (read_png(min((tmp_path / name).glob("*.png"))) for name in ("view", "one"))
     np.testing.assert_array_equal(seen, one)  # at 3 in the unit frame
 
@@ -392,8 +381,7 @@ def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: 
     shutil.copytree(folder, broken)
     (broken / "1_0" / "sh0.webp").unlink()
     line = ("render", f"{broken}#1", "--orbit", 1, "-o", tmp_path / "p")
-    found = vvgt(*line)
-    assert (found.code, "sh0.webp is missing; expected the whole folder" in found.error) == (1, True), found.error
+    assert "sh0.webp is missing; expected the whole folder" in vvgt.fails(1, *line)
     (broken / "1_0" / "meta.json").write_text("{")
     assert "damaged" in vvgt(*line).error
     manifest = json.loads((broken / "lod-meta.json").read_text())

@@ -1,13 +1,12 @@
 """The turbulence solver on what is known: Taylor-Green, Arnold's flow, energy balances, order in time, divergence."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.turbulence import Flow, Solver, advance, fields, flow_of, resolved_viscosity
 
@@ -126,20 +125,15 @@ def test_turbulence_is_that_of_its_seed():
     assert np.abs(one - other).max() > 0.1 * np.abs(one).max()
     found = fields(solver, one)
     assert set(found) == {"speed", "vorticity"}
-    speed = found["speed"]
-    assert (speed**2).mean() / 2 == pytest.approx(solver.energy(one), rel=1e-12)
+    assert (found["speed"] ** 2).mean() / 2 == pytest.approx(solver.energy(one), rel=1e-12)
 
 
 def test_the_smallest_eddies_fit():
-    nu = resolved_viscosity(64)
-    assert (nu**3) ** 0.25 * 64 / 3 == pytest.approx(1.2)
+    assert (resolved_viscosity(64) ** 3) ** 0.25 * 64 / 3 == pytest.approx(1.2)
 
 
 def test_sizes_and_states_that_cannot_be():
-    with pytest.raises(UsageError, match="at least 8"):
-        Flow(4, 0.1)
-    with pytest.raises(DataError, match="of memory"):
-        Flow(100_000, 0.1)
+    refused(UsageError, "at least 8", Flow, 4, 0.1)
+    refused(DataError, "of memory", Flow, 100_000, 0.1)
     solver = Solver(QUIET)
-    with pytest.raises(DataError, match="not finite"):
-        advance(solver, solver.start(0) * np.nan, 0.1)
+    refused(DataError, "not finite", advance, solver, solver.start(0) * np.nan, 0.1)

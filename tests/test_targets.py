@@ -1,7 +1,5 @@
 """Devices that files are made for: what `--for` sets, and how a headset's eyes score it."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cli.fit import TARGETS as NAMES
 from vvgt_cli.conversion.place import headset_axes
@@ -54,10 +53,8 @@ def test_what_is_given_wins_over_the_target():
     goal = Goal.of({"target": "quest", "size": 1080, "rule": "inria"})  # also where it equals the default
     assert (goal.max_gaussians, goal.size, goal.rule) == (device.max_gaussians, 1080, "inria")
     assert Goal(target="phone", max_gaussians=100_000).max_gaussians == 100_000
-    with pytest.raises(UsageError, match=r"--target-psnr 200"):
-        Goal(target="phone", target_psnr=200)
-    with pytest.raises(UsageError, match=r"target 'watch'; expected one of quest, visionos, phone, desktop"):
-        FitOptions(target="watch")
+    refused(UsageError, r"--target-psnr 200", Goal, target="phone", target_psnr=200)
+    refused(UsageError, r"target 'watch'; expected one of quest, visionos, phone, desktop", FitOptions, target="watch")
 
 
 @pytest.mark.parametrize(
@@ -107,8 +104,7 @@ def test_eyes_stand_above_the_middle_as_viewers_show_it(up, direction):
 def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
     out, report = tmp_path / "a.ply", tmp_path / "a.json"
     command = ("convert", BLOB, *FEW, "--for", "quest", "--size", 48, "-o", out)
-    found = vvgt(*command, "--report", report)
-    assert found.code == 0, found.err
+    found = vvgt.ok(*command, "--report", report)
     assert "for quest: at most 20 MB, 60 Gaussians, 48 px, drawn as playcanvas" in found.err
     known = json.loads(report.read_text())
     assert {key: known["options"][key] for key in ("target", "max_gaussians", "size", "rule", "max_megabytes")} == {
@@ -127,8 +123,7 @@ def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
                 whole = render_view(scene, camera, RenderSettings()), render(gaussians, camera, "playcanvas")
                 expected.append(psnr(whole[0][..., :3], whole[1][..., :3]))
         assert one["psnr"] == pytest.approx(np.mean(expected), abs=0.3)  # blocks of the same pictures
-    blocks = vvgt(*command, "--overwrite", "--blocks", 16)
-    assert blocks.code == 0, blocks.err
+    vvgt.ok(*command, "--overwrite", "--blocks", 16)
     again = dict(read_ply(out)[1].certificate.conditions)
     assert [again[name] for name in BOTH] == pytest.approx([recorded[name] for name in BOTH], abs=0.5)
 
@@ -145,18 +140,14 @@ def test_every_kind_of_conversion_has_the_score(vvgt, tmp_path):
 
 def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
     out = tmp_path / "a.ply"
-    assert vvgt("convert", BLOB, *FEW, "--size", 48, "-o", out).code == 0
-    found = vvgt("evaluate", out, "--volume", BLOB, "--for", "quest", "--size", 48, "--step", 1, "--json")
-    assert found.code == 0, found.err
+    vvgt.ok("convert", BLOB, *FEW, "--size", 48, "-o", out)
+    found = vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "quest", "--size", 48, "--step", 1, "--json")
     told = json.loads(found.out)
     assert told["rule"] == "playcanvas"
     assert set(BOTH) <= {one["where"] for one in told["conditions"]}
-    assert (
-        vvgt("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions").code
-        == 0
-    )
-    refused = vvgt("evaluate", out, "--volume", BLOB, "--for", "quest", "--no-conditions")
-    assert (refused.code, "--no-conditions with --for quest" in refused.error) == (2, True)
+    vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions")
+    result = vvgt.fails(2, "evaluate", out, "--volume", BLOB, "--for", "quest", "--no-conditions")
+    assert "--no-conditions with --for quest" in result
 
 
 @pytest.mark.parametrize(
@@ -169,6 +160,5 @@ def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
 )
 def test_what_a_device_cannot_show_is_refused(vvgt, tmp_path, monkeypatch, output, options, why):
     monkeypatch.chdir(tmp_path)
-    refused = vvgt("convert", BLOB, *options, "--for", "quest", "-o", output)
-    assert (refused.code, why in refused.error) == (2, True), refused.err
+    assert why in vvgt.fails(2, "convert", BLOB, *options, "--for", "quest", "-o", output)
     assert not list(tmp_path.iterdir())

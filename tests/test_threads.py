@@ -1,7 +1,5 @@
 """The same bytes on any number of threads, and room for other runs beside."""
 
-from __future__ import annotations
-
 import os
 import statistics
 import subprocess

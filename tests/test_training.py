@@ -1,7 +1,5 @@
 """Training: gradients through the splatter, losses, scenes, the loop, and runs that end and go on."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import json
@@ -19,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 from network_models import TINY, as_rows, scene
 
+from tests.refused import refused
 from tests.splat_twin import render_backward_reference
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.sets import look_at
@@ -218,10 +217,8 @@ def test_configurations_survive_yaml_and_faults_are_named(tmp_path):
         ("steps: 0\n", "at least 1"), ("scenes: {start: uniform}\n", "wo_vbm"), ("views: 9\n", "targets"),
     ):  # fmt: skip
         path.write_text(text)
-        with pytest.raises(DataError, match=message):
-            read_config(path)
-    with pytest.raises(UsageError, match="no such file"):
-        read_config(tmp_path / "no.yaml")
+        refused(DataError, message, read_config, path)
+    refused(UsageError, "no such file", read_config, tmp_path / "no.yaml")
 
 
 def test_held_out_functions_and_volumes_are_not_trained_on(data):
@@ -244,8 +241,7 @@ def test_recipes_keep_to_the_ranges_of_the_configuration(data):
     assert 300 <= min(small) < max(small) <= 500 < 2**1.3 * 300 <= min(large) <= max(large) <= 2**1.3 * 500
     with pytest.raises(UsageError, match="bands"):
         replace(several, bands=(2, 4))  # three functions are trained on
-    with pytest.raises(UsageError, match="densities"):
-        replace(several, densities=(0.0, 1.0))
+    refused(UsageError, "densities", replace, several, densities=(0.0, 1.0))
 
 
 def test_processes_make_shares_of_the_scenes(data):
@@ -330,8 +326,7 @@ def test_a_run_elsewhere_or_otherwise_is_refused(data, straight, tmp_path):
     with pytest.raises(UsageError, match="another configuration"):
         loop.train(replace(CONFIG, rate=2e-3), str(data), str(straight), Console(quiet=True))
     (tmp_path / "thesis.txt").write_text("years")
-    with pytest.raises(UsageError, match="not empty"):
-        loop.train(CONFIG, str(data), str(tmp_path), Console(quiet=True))
+    refused(UsageError, "not empty", loop.train, CONFIG, str(data), str(tmp_path), Console(quiet=True))
     with pytest.raises(UsageError, match="no folder train"):
         loop.train(CONFIG, str(tmp_path), str(tmp_path / "run"), Console(quiet=True))
 
@@ -364,8 +359,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_weights(data, straight, t
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     assert process.wait() == 143, process.stderr.read()
-    done = len(rows_of(tmp_path / "run"))
-    assert 1 <= done < CONFIG.steps
+    assert 1 <= len(rows_of(tmp_path / "run")) < CONFIG.steps
     assert loop.train(CONFIG, str(data), str(tmp_path / "run"), Console(quiet=True)) == 0
     ended = weights(tmp_path / "run" / "last.pt")
     assert all(torch.equal(value, ended[name]) for name, value in weights(straight / "last.pt").items())

@@ -1,12 +1,11 @@
 """LPIPS: against a second writing of the formula with torchvision's numbering, and files that are not its weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network.training.config import LossConfig, SceneConfig, TrainConfig
 
@@ -108,18 +107,15 @@ def test_a_run_takes_it_into_its_loss(files, tmp_path):
 
 def test_other_files_are_refused_in_one_line(files, tmp_path):
     config, backbone, linear = files
-    with pytest.raises(DataError, match="no such file"):
-        load_lpips(replace(config, lpips_backbone="nowhere.pth"))
+    refused(DataError, "no such file", load_lpips, replace(config, lpips_backbone="nowhere.pth"))
     with pytest.raises(DataError, match=r"no features.0.weight; expected VGG-16"):
         load_lpips(replace(config, lpips_backbone=config.lpips_linear))
     with pytest.raises(DataError, match=r"no lin0.model.1.weight; expected LPIPS"):
         load_lpips(replace(config, lpips_linear=config.lpips_backbone))
     torch.save(linear | {"lin4.model.1.weight": torch.ones(1, 9, 1, 1)}, tmp_path / "other.pth")
-    with pytest.raises(DataError, match=r"linear.4"):
-        load_lpips(replace(config, lpips_linear=str(tmp_path / "other.pth")))
+    refused(DataError, r"linear.4", load_lpips, replace(config, lpips_linear=str(tmp_path / "other.pth")))
     torch.save(backbone | {"features.0.bias": torch.full((64,), np.nan)}, tmp_path / "nan.pth")
-    with pytest.raises(DataError, match="finite"):
-        load_lpips(replace(config, lpips_backbone=str(tmp_path / "nan.pth")))
+    refused(DataError, "finite", load_lpips, replace(config, lpips_backbone=str(tmp_path / "nan.pth")))
 
 
 def test_a_missing_file_ends_a_run_before_any_scene_is_made(files, tmp_path):
@@ -131,9 +127,6 @@ def test_a_missing_file_ends_a_run_before_any_scene_is_made(files, tmp_path):
 
 def test_it_is_asked_for_with_both_files_or_not_at_all(files):
     assert load_lpips(LossConfig()) is None
-    with pytest.raises(UsageError, match="lpips_backbone"):
-        LossConfig(lpips=0.05)
-    with pytest.raises(UsageError, match="they need lpips"):
-        LossConfig(lpips_linear="a.pth", lpips_backbone="b.pth")
-    with pytest.raises(UsageError, match="8 px"):
-        TrainConfig(loss=files[0], scenes=SceneConfig(size=8))
+    refused(UsageError, "lpips_backbone", LossConfig, lpips=0.05)
+    refused(UsageError, "they need lpips", LossConfig, lpips_linear="a.pth", lpips_backbone="b.pth")
+    refused(UsageError, "8 px", TrainConfig, loss=files[0], scenes=SceneConfig(size=8))

@@ -1,7 +1,5 @@
 """`vvgt view VOLUME` in a browser: live at once, better when it is converted, saved; a page within a notebook's."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

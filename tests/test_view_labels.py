@@ -1,8 +1,6 @@
 # ruff: noqa: F811
 """Labels of `vvgt view`: saved as the page shows them, and converted so."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +40,10 @@ def test_saved_labels_have_the_colours_of_the_page(controller: tuple[str, PageCo
     of.first = lambda: eight
     assert eight.options.live is not None
     saved = Cloud.of(send(url, "save", {"file": "ply", "labels": rows({2: 0.9, 7: 0.5})})[1], "x")
-    assert saved.options.live is not None
     labels = saved.options.live.labels
     assert [label.opacity for label in labels] == [0, 0.9, 0, 0, 0, 0, 0.5, 0]
     assert [label.name for label in labels] == [label.name for label in eight.options.live.labels]
     live = saved.gaussians.live
-    assert live is not None
     row = live[:, LABEL_ROW].astype(int)
     assert set(row) == set(range(8))  # hidden ones can be shown again
     assert saved.gaussians.opacity_logits[row == 0].max() < -5

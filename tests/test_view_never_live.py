@@ -1,7 +1,5 @@
 """What `vvgt view` converts before a page is there: volumes that have no live form."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

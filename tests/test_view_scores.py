@@ -1,7 +1,5 @@
 """`vvgt view` of volumes while what is shown is scored: what the page and the console hear."""
 
-from __future__ import annotations
-
 import os
 import signal
 from urllib.parse import urlsplit

@@ -1,7 +1,5 @@
 """What web viewers draw, in a real browser, against our pictures by their rules (docs/viewers.md)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -121,16 +119,14 @@ def test_up_and_hand_in_supersplat(tmp_path: Path) -> None:
     gaussians = Gaussians(means, np.full((3, 3), np.log(0.05)), np.tile((1, 0, 0, 0), (3, 1)), np.full(3, 4), np.eye(3))
     write_ply(tmp_path / "axes.ply", gaussians, PlyOptions(up="z"))
     stored, _ = read_ply(tmp_path / "axes.ply")
-    shot = shoot("supersplat", tmp_path / "axes.ply", [None], 400, tmp_path)[0]
-    places = np.argwhere(shot > 0.5)
+    places = np.argwhere(shoot("supersplat", tmp_path / "axes.ply", [None], 400, tmp_path)[0] > 0.5)
     found = np.stack([places[places[:, 2] == k, :2].mean(axis=0) for k in range(3)])  # row, column of each colour
     shown = stored.means * (-1, -1, 1)  # how SuperSplat shows PLY coordinates; its camera is at z = 3, with y up
     focal = 200 / np.tan(np.radians(20))
     expected = 200 + focal * np.stack([-shown[:, 1], shown[:, 0]], axis=1) / (3 - shown[:, 2:])
     assert abs(found - expected).max() < 2
     assert found[2, 0] < found[:2, 0].min() - 50  # z on top
-    hand = np.linalg.det(shown)
-    assert hand == pytest.approx(np.linalg.det(means), rel=1e-5)
+    assert np.linalg.det(shown) == pytest.approx(np.linalg.det(means), rel=1e-5)
 
 
 UPRIGHT = {"supersplat": (-1, -1), "gsplatjs": (1, -1)}

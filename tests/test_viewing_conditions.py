@@ -1,7 +1,5 @@
 """What a score is a score of: blocks or the whole, the rule, the field of view."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

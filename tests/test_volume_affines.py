@@ -1,7 +1,5 @@
 """Where voxels are: affines against nibabel's, SimpleITK's and pydicom's, the same in every format."""
 
-from __future__ import annotations
-
 import tarfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """AmiraMesh and Avizo files, written by hand as the user's guide has them: geometry, encodings, several streams."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Compressed `.vti` and NetCDF box by box: what they are in memory; classic NetCDF's variables in their file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import netCDF4

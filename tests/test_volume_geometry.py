@@ -1,7 +1,5 @@
 """Geometry that files state: directions, conventions, units, spellings, decimal commas."""
 
-from __future__ import annotations
-
 import json
 import re
 import warnings
@@ -93,9 +91,7 @@ DIRECTIONS = [  # name, coordinates, attributes, lowest position, value there
 @pytest.mark.parametrize("reader", [*WRITERS, "xarray"])
 @pytest.mark.parametrize(("name", "centres", "attributes", "lowest", "value"), DIRECTIONS)
 @pytest.mark.filterwarnings("ignore:axis dept.*taken as pointing down", "ignore:axis z.*taken as pointing down")
-def test_vertical_axes_point_up(
-    tmp_path: Path, reader: str, name: str, centres: np.ndarray, attributes: dict, lowest: float, value: float
-) -> None:
+def test_vertical_axes_point_up(tmp_path, reader, name, centres, attributes, lowest, value) -> None:
     if reader == "xarray":
         found = [read_xarray(tmp_path, name, centres, **attributes)]
     else:
@@ -126,8 +122,7 @@ def test_positive_as_in_vtk(tmp_path: Path, name: str, attributes: dict) -> None
     reader.Update()
     theirs, ours = reader.GetOutput(), read_volume(source)
     top = max(range(theirs.GetNumberOfPoints()), key=lambda k: theirs.GetPoint(k)[2])
-    bounds = theirs.GetBounds()
-    assert (ours.origin[2], ours.origin[2] + ours.spacing[2] * 3) == bounds[4:]
+    assert (ours.origin[2], ours.origin[2] + ours.spacing[2] * 3) == theirs.GetBounds()[4:]
     assert ours.data[-1, 0, 0] == vtk_to_numpy(theirs.GetPointData().GetArray("field"))[top]
 
 

@@ -1,7 +1,5 @@
 """Text headers beside or before raw data: NRRD, MetaImage, Inviwo."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import zlib
@@ -10,22 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 
 VALUES = np.random.default_rng(1).integers(-30000, 30000, (3, 4, 5), np.int16)
 NRRD_TYPES = {
-    "int8": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "unsigned short": "u2",
-    "int": "i4",
-    "uint32": "u4",
-    "long long int": "i8",
-    "uint64": "u8",
-    "float": "f4",
-    "double": "f8",
-}
+    "int8": "i1", "uchar": "u1", "short": "i2", "unsigned short": "u2", "int": "i4", "uint32": "u4",
+    "long long int": "i8", "uint64": "u8", "float": "f4", "double": "f8",
+}  # fmt: skip
 
 
 def nrrd(fields: dict[str, object], data: bytes = b"") -> bytes:
@@ -93,8 +84,7 @@ def test_nrrd_geometry(tmp_path: Path) -> None:
     assert volume.direction == (0, -1, 0, 1, 0, 0, 0, 0, 1)
     assert read_volume(str(tmp_path / "b.nrrd"), ReadOptions(spacing=(7, 8, 9))).spacing == (7, 8, 9)
     zero = write(tmp_path / "c.nrrd", nrrd({"spacings": "0 1 1"}, body))
-    with pytest.raises(DataError, match="try --spacing X Y Z"):
-        read_volume(zero)
+    refused(DataError, "try --spacing X Y Z", read_volume, zero)
     assert read_volume(zero, ReadOptions(spacing=(1, 1, 1))).spacing == (1, 1, 1)
 
 
@@ -118,8 +108,7 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
     norm = read_volume(source, ReadOptions(component="magnitude")).data
     assert norm.dtype == np.float32
     np.testing.assert_allclose(norm, np.hypot(both[0].astype(float), both[1]), rtol=1e-6)
-    with pytest.raises(UsageError, match="not component 2"):
-        read_volume(source, ReadOptions(component=2))
+    refused(UsageError, "not component 2", read_volume, source, ReadOptions(component=2))
 
 
 @pytest.mark.parametrize(
@@ -146,17 +135,14 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
 )
 def test_nrrd_lies(tmp_path: Path, fields: dict, message: str) -> None:
     source = write(tmp_path / "v.nrrd", nrrd(fields, VALUES.astype("<i2").tobytes()))
-    with pytest.raises(DataError, match=message) as caught:
-        read_volume(source)
-    assert "\n" not in str(caught.value)
+    refused(DataError, message, read_volume, source)
 
 
 def test_gzip_bomb_is_refused_before_unpacking(tmp_path: Path) -> None:
     source = write(
         tmp_path / "v.nrrd", nrrd({"encoding": "gzip", "sizes": "100000 100000 100000"}, gzip.compress(b"0"))
     )
-    with pytest.raises(DataError, match="cannot hold"):
-        read_volume(source)
+    refused(DataError, "cannot hold", read_volume, source)
 
 
 def test_data_file_may_not_leave_through_a_link(tmp_path: Path) -> None:
@@ -165,8 +151,7 @@ def test_data_file_may_not_leave_through_a_link(tmp_path: Path) -> None:
     home.mkdir()
     (home / "v.raw").symlink_to(outside)
     source = write(home / "v.nhdr", nrrd({"data file": "v.raw"}))
-    with pytest.raises(DataError, match="header's own folder"):
-        read_volume(source)
+    refused(DataError, "header's own folder", read_volume, source)
     (tmp_path / "v.nhdr").symlink_to(home / "w.nhdr")  # a link to both is fine
     write(home / "w.nhdr", nrrd({"data file": "w.raw"}))
     (home / "w.raw").write_bytes(outside.read_bytes())
@@ -176,12 +161,9 @@ def test_data_file_may_not_leave_through_a_link(tmp_path: Path) -> None:
 
 def meta(fields: dict[str, object]) -> bytes:
     base: dict[str, object] = {
-        "ObjectType": "Image",
-        "NDims": 3,
-        "DimSize": "5 4 3",
-        "ElementType": "MET_SHORT",
+        "ObjectType": "Image", "NDims": 3, "DimSize": "5 4 3", "ElementType": "MET_SHORT",
         "ElementDataFile": "v.raw",
-    }
+    }  # fmt: skip
     merged = {k: v for k, v in (base | fields).items() if v is not None}
     last = merged.pop("ElementDataFile", None)
     lines = [f"{k} = {v}\n" for k, v in merged.items()]
@@ -220,8 +202,7 @@ def test_metaimage_local_compressed_and_text(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.data, VALUES)
     packed = meta({"ElementDataFile": "LOCAL", "CompressedData": True}) + zlib.compress(body)
     np.testing.assert_array_equal(read_volume(write(tmp_path / "b.mha", packed)).data, VALUES)
-    with pytest.raises(DataError, match="damaged zlib"):
-        read_volume(write(tmp_path / "c.mha", packed[:-20]))
+    refused(DataError, "damaged zlib", read_volume, write(tmp_path / "c.mha", packed[:-20]))
     text = meta({"ElementDataFile": "LOCAL", "BinaryData": False}) + b" ".join(b"%d" % v for v in VALUES.ravel())
     np.testing.assert_array_equal(read_volume(write(tmp_path / "d.mha", text)).data, VALUES)
 
@@ -230,8 +211,7 @@ def test_metaimage_components_and_steps(tmp_path: Path) -> None:
     channels = np.stack([VALUES, VALUES // 2, VALUES // 5], -1).astype("<i2")
     (tmp_path / "v.raw").write_bytes(channels.tobytes())
     source = write(tmp_path / "v.mhd", meta({"ElementNumberOfChannels": 3}))
-    with pytest.raises(UsageError, match="3 components"):
-        read_volume(source)
+    refused(UsageError, "3 components", read_volume, source)
     np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, channels[..., 2])
     steps = np.moveaxis(channels, -1, 0).copy()
     (tmp_path / "v.raw").write_bytes(steps.tobytes())
@@ -263,8 +243,7 @@ def test_metaimage_components_and_steps(tmp_path: Path) -> None:
 )
 def test_metaimage_lies(tmp_path: Path, fields: dict, message: str) -> None:
     (tmp_path / "v.raw").write_bytes(VALUES.tobytes())
-    with pytest.raises(DataError, match=message):
-        read_volume(write(tmp_path / "v.mhd", meta(fields)))
+    refused(DataError, message, read_volume, write(tmp_path / "v.mhd", meta(fields)))
 
 
 def dat(fields: dict[str, object]) -> bytes:
@@ -301,8 +280,7 @@ def test_inviwo_old_names_scaling_and_sequences(tmp_path: Path) -> None:
     assert volume.slope * 500 + volume.intercept == pytest.approx(0)
     assert volume.slope * 1000 + volume.intercept == pytest.approx(1)
     source = write(tmp_path / "b.dat", dat({"Resolution": "5 4 1", "Sequences": 3}))
-    with pytest.raises(UsageError, match="3 components"):
-        read_volume(source)
+    refused(UsageError, "3 components", read_volume, source)
     np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, VALUES[2:])
     source = write(tmp_path / "c.dat", dat({"Resolution": "5 2 3", "Format": "Vec2INT16"}))
     np.testing.assert_array_equal(
@@ -323,8 +301,7 @@ def test_inviwo_old_names_scaling_and_sequences(tmp_path: Path) -> None:
 )
 def test_inviwo_lies(tmp_path: Path, fields: dict, message: str) -> None:
     (tmp_path / "v.raw").write_bytes(VALUES.tobytes())
-    with pytest.raises(DataError, match=message):
-        read_volume(write(tmp_path / "v.dat", dat(fields)))
+    refused(DataError, message, read_volume, write(tmp_path / "v.dat", dat(fields)))
 
 
 @pytest.mark.parametrize("kind", ["nrrd", "mha"])

@@ -2,8 +2,6 @@
 copies, nuclear medicine, look-up tables, archives. Beside dcm2niix, SimpleITK and pydicom.
 """
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess
@@ -22,6 +20,7 @@ import SimpleITK as sitk
 from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
+from tests.refused import refused
 from tests.test_volume_slices import header
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
@@ -186,8 +185,7 @@ def test_several_volumes_of_a_series(tmp_path: Path, volumes: list, names: list[
         np.testing.assert_array_equal(read_volume(source, ReadOptions(time=t)).data, STACK + 1000 * t)
     for wanted in (names[1], f"4/{names[1]}", f"1.2.3/{names[1]}"):
         np.testing.assert_array_equal(read_volume(source, ReadOptions(array=wanted)).data, STACK + 1000)
-    with pytest.raises(UsageError, match="no volume 'other'; it has "):
-        read_volume(source, ReadOptions(array="4/other"))
+    refused(UsageError, "no volume 'other'; it has ", read_volume, source, ReadOptions(array="4/other"))
     with pytest.raises(UsageError, match=rf"--time 9: expected a time step from 0 to {len(volumes) - 1}"):
         read_volume(source, ReadOptions(time=9))
 
@@ -203,11 +201,9 @@ def test_times_as_in_dcm2niix(tmp_path: Path) -> None:
 
 def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt: Callable, tmp_path: Path) -> None:
     source = series(tmp_path / "in", [{"EchoTime": e} for e in (4.92, 7.38)])
-    said = vvgt("info", source).out.decode()
-    assert "step 1, name EchoTime 7.38 ms, option --time 1" in said
+    assert "step 1, name EchoTime 7.38 ms, option --time 1" in vvgt("info", source).out.decode()
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
-    done = vvgt("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
-    assert done.code == 0, done.error
+    vvgt.ok("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
     assert sorted(p.name for p in tmp_path.glob("p_*.ply")) == ["p_00.ply", "p_01.ply"]
 
 
@@ -281,8 +277,7 @@ def test_uneven_slices_are_resampled_or_taken_as_even(tmp_path: Path) -> None:
     np.testing.assert_allclose(volume.spacing, (0.5, 1.5, 0.5))
     index = np.indices(volume.dims).reshape(3, -1)
     place = volume.affine[:3, :3] @ index + volume.affine[:3, 3:] - [[5], [6], [7]]
-    axes = np.column_stack([OBLIQUE[:3], OBLIQUE[3:], np.cross(OBLIQUE[:3], OBLIQUE[3:])])
-    x, y, z = axes.T @ place
+    x, y, z = np.column_stack([OBLIQUE[:3], OBLIQUE[3:], np.cross(OBLIQUE[:3], OBLIQUE[3:])]).T @ place
     np.testing.assert_allclose(volume.data[index[2], index[1], index[0]], 100 * z + 10 * y / 1.5 + x / 0.5, atol=1e-3)
     with pytest.raises(UsageError, match="its slices lie at even distances; leave out --dims"):
         read_volume(series(tmp_path / "even", [{}]), ReadOptions(dims=(2, 2, 2)))
@@ -346,8 +341,7 @@ def test_gated_frames_of_nuclear_medicine_are_volumes(tmp_path: Path) -> None:
 
 def test_frames_in_time_and_frames_without_a_place(tmp_path: Path) -> None:
     save(nuclear(4, FrameIncrementPointer=0x00181063, FrameTime=40), tmp_path / "a.dcm")
-    with pytest.raises(DataError, match=r"4 frames of a film .*expected slices of a volume"):
-        read_volume(str(tmp_path / "a.dcm"))
+    refused(DataError, r"4 frames of a film .*expected slices of a volume", read_volume, str(tmp_path / "a.dcm"))
     save(nuclear(4, DetectorInformationSequence=None), tmp_path / "b.dcm")
     with pytest.raises(DataError, match=r"no ImagePositionPatient.*or --spacing X Y Z to stack images"):
         read_volume(str(tmp_path / "b.dcm"))
@@ -377,8 +371,7 @@ def test_modality_look_up_tables_as_in_pydicom(tmp_path: Path) -> None:
     table = Dataset()
     table.LUTDescriptor, table.ModalityLUTType = [200, 0, 16], "US"
     table.add_new("LUTData", "OW", (3 * np.arange(200) + 5).astype("<u2").tobytes())
-    source = series(tmp_path, [{}], ModalityLUTSequence=[table], PixelRepresentation=0)
-    volume = read_volume(source)
+    volume = read_volume(series(tmp_path, [{}], ModalityLUTSequence=[table], PixelRepresentation=0))
     np.testing.assert_array_equal(volume.data, 3 * STACK + 5)
     one = pydicom.dcmread(next(iter(sorted(tmp_path.iterdir()))))
     k = int(one.InstanceNumber) - 1
@@ -402,8 +395,7 @@ def test_zip_archives_and_dicomdir(tmp_path: Path) -> None:
         assert volume.name == name[0]
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("readme.txt", "not an image")
-    with pytest.raises(DataError, match=r"no DICOM images \(no DICOM files\)"):
-        read_volume(str(tmp_path / "c.zip"))
+    refused(DataError, r"no DICOM images \(no DICOM files\)", read_volume, str(tmp_path / "c.zip"))
     shutil.copy(next(Path(source).iterdir()), Path(source) / "DICOMDIR")
     np.testing.assert_array_equal(read_volume(f"{source}/DICOMDIR").data, STACK)
 

@@ -1,7 +1,5 @@
 """TIFF of ImageJ: voxel sizes that are half known, and stacks with one directory for all planes."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from pathlib import Path
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.stored import is_file_backed
@@ -77,9 +76,7 @@ NO_SIZE, NO_DEPTH = "no size of its pixels; taken as 1", "no distance between it
         ("unit=um\nspacing=2.0\n", (4, 5, 2), (0.25, 0.2, 2), "um", ("taken per um",)),
     ],
 )
-def test_imagej_sizes_that_are_half_known(
-    tmp_path: Path, text: str, tags: tuple | None, spacing: tuple, unit: str, told: tuple
-) -> None:
+def test_imagej_sizes_that_are_half_known(tmp_path, text, tags, spacing, unit, told) -> None:
     """Expected as ij.io.TiffDecoder and ij.io.FileOpener take them, except of dots per inch or cm without a unit."""
     source = described(tmp_path / "a.tif", f"images=4\nslices=4\n{text}", tags)
     with warnings.catch_warnings(record=True) as caught:
@@ -95,14 +92,12 @@ def test_imagej_sizes_that_are_half_known(
 
 def test_sizes_that_are_no_numbers(tmp_path: Path) -> None:
     comma = described(tmp_path / "a.tif", "images=4\nslices=4\nunit=um\nspacing=2,5\n", (4, 4, 1))
-    with pytest.raises(UsageError, match=r"spacing is '2,5'; expected a number; try --spacing X Y Z"):
-        read_volume(comma)
+    refused(UsageError, r"spacing is '2,5'; expected a number; try --spacing X Y Z", read_volume, comma)
     assert read_volume(comma, ReadOptions(spacing=(1, 1, 2.5))).spacing == (1, 1, 2.5)
     sizes = {"PhysicalSizeX": "0,5", "PhysicalSizeY": 0.5, "PhysicalSizeZ": 2}
     path = tmp_path / "a.ome.tif"
     tifffile.imwrite(path, VALUES[0, 0], ome=True, metadata={"axes": "ZYX", **sizes})
-    with pytest.raises(UsageError, match=r"PhysicalSizeX is '0,5'; expected a number"):
-        read_volume(str(path))
+    refused(UsageError, r"PhysicalSizeX is '0,5'; expected a number", read_volume, str(path))
     tifffile.imwrite(path, VALUES[0, 0], ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 2})
     with pytest.warns(UserWarning, match="no width or no height of its pixels; taken as 2 "):
         assert read_volume(str(path)).spacing == (2, 2, 2)
@@ -176,5 +171,4 @@ def test_planes_that_only_images_counts(tmp_path: Path) -> None:
     path.write_bytes(body.replace(b"slices=4", b"sliced=4"))
     np.testing.assert_array_equal(read_volume(str(path)).data, values)
     path.write_bytes(body.replace(b"slices=4", b"sliced=4").replace(b"images=4", b"images=6"))
-    with pytest.raises(DataError, match=r"6 images that are not there \(120 bytes are missing\)"):
-        read_volume(str(path))
+    refused(DataError, r"6 images that are not there \(120 bytes are missing\)", read_volume, str(path))

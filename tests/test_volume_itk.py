@@ -1,7 +1,5 @@
 """NRRD and MetaImage files of SimpleITK and VTK, as VTK's own readers and SimpleITK have them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -47,9 +45,7 @@ def values_of(kind: str) -> np.ndarray:
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("kind", TYPES)
-def test_values_spacing_and_origin_of_what_simpleitk_writes(
-    tmp_path: Path, kind: str, suffix: str, compressed: bool
-) -> None:
+def test_values_spacing_and_origin_of_what_simpleitk_writes(tmp_path, kind, suffix, compressed) -> None:
     path, values = tmp_path / f"v{suffix}", values_of(kind)
     image = sitk.GetImageFromArray(values)
     image.SetSpacing((0.5, 1.25, 3.0))

@@ -1,7 +1,5 @@
 """Density maps: MRC against mrcfile, cube and OpenDX against numpy; place, types, byte orders, stacks, damage."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import tracemalloc
@@ -14,6 +12,7 @@ import mrcfile
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, blocks, read_volume
 from vvgt_cli.volume.maps.text import BOHR
@@ -109,8 +108,7 @@ def test_mrc_packed(tmp_path: Path, suffix: str, pack: Callable[[bytes], bytes])
     for how in (ReadOptions(), ReadOptions(packed=True)):
         np.testing.assert_array_equal(read_volume(str(packed), how).data[:], VALUES)
     packed.write_bytes(pack(plain.read_bytes()[:-8]))
-    with pytest.raises(DataError, match="its header declares"):
-        read_volume(str(packed))
+    refused(DataError, "its header declares", read_volume, str(packed))
 
 
 def test_mrc_stack_of_volumes_is_a_series(tmp_path: Path) -> None:
@@ -122,8 +120,7 @@ def test_mrc_stack_of_volumes_is_a_series(tmp_path: Path) -> None:
         read_volume(str(path))
     assert found.value.steps == 2
     np.testing.assert_array_equal(read_volume(str(path), ReadOptions(time=1)).data, VALUES + 1)
-    with pytest.raises(UsageError, match="0 to 1"):
-        read_volume(str(path), ReadOptions(time=2))
+    refused(UsageError, "0 to 1", read_volume, str(path), ReadOptions(time=2))
 
 
 def test_mrc_extended_header_is_skipped(tmp_path: Path) -> None:
@@ -142,11 +139,9 @@ def test_mrc_lies(tmp_path: Path, at: int, value: int, message: str) -> None:
     content = bytearray(path.read_bytes())
     content[at : at + 4] = np.int32(value).tobytes()
     path.write_bytes(content)
-    with pytest.raises(DataError, match=message):
-        read_volume(str(path))
+    refused(DataError, message, read_volume, str(path))
     path.write_bytes(content[:500])
-    with pytest.raises(DataError, match="500 bytes"):
-        read_volume(str(path))
+    refused(DataError, "500 bytes", read_volume, str(path))
 
 
 CUBE = "a comment\nanother\n{atoms}  -2.0 1.0 0.5{nval}\n {n[0]} 0.5 0 0\n {n[1]} 0 0.25 0\n {n[2]} 0 0.1 1\n"
@@ -194,8 +189,7 @@ def test_cube_of_several_values(tmp_path: Path, orbitals: bool) -> None:
     head = CUBE.format(atoms=-2 if orbitals else 2, nval="" if orbitals else " 2", n=[3, 4, 5])
     path = tmp_path / "v.cube"
     path.write_text(head + ATOMS + ("  2  21\n  22\n" if orbitals else "") + text(GRID))
-    with pytest.raises(UsageError, match="orbitals 21, 22" if orbitals else "2 components"):
-        read_volume(str(path))
+    refused(UsageError, "orbitals 21, 22" if orbitals else "2 components", read_volume, str(path))
     for k in (0, 1):
         np.testing.assert_allclose(read_volume(str(path), ReadOptions(component=k)).data, GRID[..., k], rtol=1e-6)
 
@@ -222,8 +216,7 @@ def test_dx(tmp_path: Path, form: str) -> None:
 
 def test_dx_as_another_library_writes_it(tmp_path: Path) -> None:
     grids = pytest.importorskip("gridData")
-    grid = grids.Grid(GRID[..., 0], origin=[1, 2, 3], delta=[0.5, 1, 2])
-    grid.export(str(tmp_path / "v.dx"))
+    grids.Grid(GRID[..., 0], origin=[1, 2, 3], delta=[0.5, 1, 2]).export(str(tmp_path / "v.dx"))
     volume = read_volume(str(tmp_path / "v.dx"))
     np.testing.assert_allclose(volume.data, GRID[..., 0], rtol=1e-5)
     np.testing.assert_allclose(place(volume, 2, 3, 4), [2, 5, 11], atol=1e-4)
@@ -249,5 +242,4 @@ def test_text_lies(tmp_path: Path, name: str, change: tuple[str, str], message: 
     content = cube if name == "v.cube" else DX.format(kind="double", form="") + text(GRID[..., 0]).rstrip("\n")
     assert change[0] in content
     (tmp_path / name).write_text(content.replace(*change))
-    with pytest.raises(DataError, match=message):
-        read_volume(str(tmp_path / name))
+    refused(DataError, message, read_volume, str(tmp_path / name))

@@ -1,7 +1,5 @@
 """VTK meshes and grids, written by VTK: resampled, checked against a field that is linear in position."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
 from tests.ramps import X, Y, Z, axes_of, check_ramp
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import contents
@@ -88,8 +87,7 @@ def test_outside_of_the_mesh_is_nan_and_cell_data_constant(tmp_path: Path) -> No
     ball.cell_data["where"] = ball.cell_data["where"].astype("u1")
     ball.save(tmp_path / "v.vtu")
     volume = read_volume(str(tmp_path / "v.vtu"), ReadOptions(dims=(20, 20, 20)))
-    share = np.isfinite(volume.data).mean()
-    assert abs(share - np.pi / 6) < 0.05
+    assert abs(np.isfinite(volume.data).mean() - np.pi / 6) < 0.05
     assert np.isnan(volume.data[0, 0, 0])
     assert set(np.unique(volume.data[np.isfinite(volume.data)])) == {0.0, 1.0}
     assert np.nanmean(volume.data[:, :, 12:]) > 0.8
@@ -101,8 +99,7 @@ def test_vtkhdf_meshes_and_images(tmp_path: Path) -> None:
     volume = read_volume(str(tmp_path / "v.vtkhdf"), ReadOptions(dims=(8, 7, 6), array="ramp"))
     check_ramp(volume, atol=0.1)
     hdf(pv.Sphere(), tmp_path / "s.hdf")
-    with pytest.raises(DataError, match=r"a surface \(vtkPolyData\)"):
-        read_volume(str(tmp_path / "s.hdf"))
+    refused(DataError, r"a surface \(vtkPolyData\)", read_volume, str(tmp_path / "s.hdf"))
 
 
 def test_components_and_choices(tmp_path: Path) -> None:
@@ -117,8 +114,7 @@ def test_components_and_choices(tmp_path: Path) -> None:
         (ReadOptions(array="ramp", spacing=(1, 1, 1)), "leave out --spacing"),
         (ReadOptions(array="ramp", dtype="uint8"), "leave out --dtype"),
     ):
-        with pytest.raises(UsageError, match=message):
-            read_volume(str(path), options)
+        refused(UsageError, message, read_volume, str(path), options)
 
 
 @pytest.mark.parametrize("suffix", ["vtr", "vts", "vtu", "vtk"])
@@ -127,8 +123,7 @@ def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.Mo
     {"vtr": rectilinear, "vts": structured, "vtu": tetrahedra, "vtk": tetrahedra}[suffix]().save(path)
     code = "import os, vvgt_cli.volume.vtk.child as c; c.answer = lambda request: os.kill(os.getpid(), 11); c.main()"
     monkeypatch.setattr(vtk_child, "START", code)
-    with pytest.raises(DataError, match=r"VTK's reader of VTK files broke down \(SIGSEGV\)"):
-        read_volume(str(path))
+    refused(DataError, r"VTK's reader of VTK files broke down \(SIGSEGV\)", read_volume, str(path))
 
 
 def test_arrays_of_a_mesh_are_listed_with_their_options(tmp_path: Path, vvgt) -> None:
@@ -151,8 +146,7 @@ def test_lies_are_refused_before_vtk_reads(tmp_path: Path) -> None:
         ("<Cells>", "<Sells>", "damaged"),
     ):
         path.write_text(text.replace(old, new))
-        with pytest.raises(DataError, match=message):
-            read_volume(str(path), ReadOptions(array="ramp"))
+        refused(DataError, message, read_volume, str(path), ReadOptions(array="ramp"))
     legacy(tetrahedra(), tmp_path / "v.vtk", binary=False, version=42)
     text = (tmp_path / "v.vtk").read_text()
     for old, new, message in (
@@ -161,5 +155,4 @@ def test_lies_are_refused_before_vtk_reads(tmp_path: Path) -> None:
     ):
         assert old in text
         (tmp_path / "v.vtk").write_text(text.replace(old, new, 1))
-        with pytest.raises(DataError, match=message):
-            read_volume(str(tmp_path / "v.vtk"), ReadOptions(array="ramp"))
+        refused(DataError, message, read_volume, str(tmp_path / "v.vtk"), ReadOptions(array="ramp"))

@@ -1,7 +1,5 @@
 """Byte order marks before headers, names in another case than files have, and what unread formats are told."""
 
-from __future__ import annotations
-
 import gzip
 import itertools
 from pathlib import Path
@@ -13,6 +11,7 @@ import SimpleITK as sitk
 from vtkmodules.vtkIOXML import vtkXMLImageDataReader, vtkXMLImageDataWriter
 
 from tests import vtk_files as files
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import ROWS, way_out
@@ -25,7 +24,7 @@ def mark(path: Path) -> None:
     path.write_bytes(MARK + path.read_bytes())
 
 
-@pytest.mark.parametrize(("mode", "packed", "coded"), itertools.product(range(3), (False, True), (False, True)))
+@pytest.mark.parametrize(("mode", "packed", "coded"), [*itertools.product(range(3), (False, True), (False, True))])
 def test_marked_images_of_vtk_are_as_vtk_reads_them(tmp_path: Path, mode: int, packed: bool, coded: bool) -> None:
     path, image = tmp_path / "v.vti", files.image()
     writer = vtkXMLImageDataWriter()
@@ -53,8 +52,7 @@ def test_appended_data_that_vtk_would_break_down_at(tmp_path: Path, old: bytes, 
     data = files.write(writer, files.image(), path).read_bytes()
     assert old in data
     path.write_bytes(data.replace(old, new))
-    with pytest.raises(DataError, match=r"do not begin with _|no whole table"):
-        read_volume(str(path), ReadOptions(array="ramp"))
+    refused(DataError, r"do not begin with _|no whole table", read_volume, str(path), ReadOptions(array="ramp"))
 
 
 @pytest.mark.parametrize(
@@ -95,8 +93,7 @@ def test_marked_headers_as_text(tmp_path: Path, name: str) -> None:
 def test_ensight_is_refused_with_a_mark(tmp_path: Path) -> None:
     path = files.ensight(tmp_path)
     mark(path)  # VTK's reader loses the time steps
-    with pytest.raises(DataError, match="byte order mark"):
-        read_volume(str(path), ReadOptions(time=0))
+    refused(DataError, "byte order mark", read_volume, str(path), ReadOptions(time=0))
 
 
 @pytest.mark.parametrize("kind", [nibabel.Nifti1Pair, nibabel.AnalyzeImage])
@@ -126,8 +123,7 @@ def test_data_files_in_another_case(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"'V\.RAW' does not exist, v\.raw is read"):
         np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
     (tmp_path / "v.Raw").write_bytes(VALUES.tobytes())  # which one?
-    with pytest.raises(DataError, match="does not exist beside it"):
-        read_volume(str(path))
+    refused(DataError, "does not exist beside it", read_volume, str(path))
     (tmp_path / "V.RAW").write_bytes(VALUES.tobytes())
     np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
 

@@ -1,7 +1,5 @@
 """MGH, Analyze and MINC against nibabel and the files of MINC's own tools that it brings; sequences of 3D Slicer."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +11,7 @@ from vtkmodules.util.numpy_support import numpy_to_vtk
 from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkIOMINC import vtkMINCImageWriter
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.stored import Stored, read_block
@@ -65,11 +64,9 @@ def test_mgh_lies(tmp_path: Path) -> None:
     nib.save(nib.MGHImage(VALUES.astype("f4"), np.eye(4)), str(path))
     content = path.read_bytes()
     path.write_bytes(content[:300])
-    with pytest.raises(DataError, match="check that the file is whole"):
-        read_volume(str(path))
+    refused(DataError, "check that the file is whole", read_volume, str(path))
     path.write_bytes(content[:20] + b"\0\0\0\x07" + content[24:])
-    with pytest.raises(DataError, match="named like a MGH file"):
-        read_volume(str(path))
+    refused(DataError, "named like a MGH file", read_volume, str(path))
 
 
 FREESURFER = (
@@ -82,14 +79,12 @@ def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt: Callable
     labels[2:5, 3:9, 3:9], labels[7:10, 3:9, 3:9] = 17, 53
     nib.save(nib.MGHImage(labels, OBLIQUE), str(tmp_path / "aseg.mgz"))
     (tmp_path / "FreeSurferColorLUT.txt").write_text(FREESURFER)
-    facts = vvgt("info", tmp_path / "aseg.mgz")
-    assert facts.code == 0
-    assert "label_map" in facts.out.decode()
+    assert "label_map" in vvgt.ok("info", tmp_path / "aseg.mgz").out.decode()
     source = ("init", tmp_path / "aseg.mgz", "--labels", tmp_path / "FreeSurferColorLUT.txt", "--max-gaussians", 300)
     for name, blocks in (("whole", ()), ("blocks", ("--blocks", 32))):
-        assert vvgt(*source, "-o", tmp_path / f"{name}.ply", *blocks).code == 0
+        vvgt.ok(*source, "-o", tmp_path / f"{name}.ply", *blocks)
     assert (tmp_path / "whole.ply").read_bytes().count(b"\n") > 10
-    assert vvgt("info", tmp_path / "blocks.ply").code == 0
+    vvgt.ok("info", tmp_path / "blocks.ply")
 
 
 KINDS = {"analyze": nib.AnalyzeImage, "spm99": nib.Spm99AnalyzeImage, "spm2": nib.Spm2AnalyzeImage}
@@ -124,7 +119,7 @@ def test_analyze_as_nibabel_writes_it(tmp_path: Path, kind: str, order: str) -> 
 def test_analyze_says_so_on_one_line(tmp_path: Path, vvgt: Callable) -> None:
     nib.AnalyzeImage(VALUES.astype("i2"), None).to_filename(tmp_path / "v.img")
     with pytest.warns(UserWarning, match="^v.hdr: Analyze does not say which side is left; .*$") as said:
-        assert vvgt("info", tmp_path / "v.hdr").code == 0
+        vvgt.ok("info", tmp_path / "v.hdr")
     assert len(said) == 1
     (tmp_path / "v.hdr").unlink()
     assert "without its .hdr" in vvgt("info", tmp_path / "v.img").error
@@ -167,15 +162,13 @@ def test_minc_over_time(name: str) -> None:
     assert found.value.steps == 2
     volume = read_volume(str(MINC / name), ReadOptions(time=1))
     np.testing.assert_allclose(volume.data, nib.load(MINC / name).get_fdata()[1], rtol=1e-6)
-    with pytest.raises(UsageError, match="0 to 1"):
-        read_volume(str(MINC / name), ReadOptions(time=2))
+    refused(UsageError, "0 to 1", read_volume, str(MINC / name), ReadOptions(time=2))
 
 
 @pytest.mark.parametrize("name", ["minc1_1_scale.mnc", "minc2_1_scale.mnc"])
 def test_minc_cut_short(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes((MINC / name).read_bytes()[:-3000])
-    with pytest.raises(DataError, match="whole"):
-        read_volume(str(tmp_path / name))
+    refused(DataError, "whole", read_volume, str(tmp_path / name))
 
 
 def sequence(kinds: str = "list domain domain domain") -> bytes:
@@ -201,16 +194,13 @@ def test_slicers_sequence_is_a_series(tmp_path: Path) -> None:
         volume = read_volume(str(source), how)
         np.testing.assert_array_equal(xyz(volume), VALUES + 2000)
         np.testing.assert_allclose(volume.affine[:3, 3], (-1, -2, 3))
-    with pytest.raises(UsageError, match="0 to 2"):
-        read_volume(str(source), ReadOptions(time=3))
+    refused(UsageError, "0 to 2", read_volume, str(source), ReadOptions(time=3))
 
 
 def test_other_lists_are_components(tmp_path: Path) -> None:
     (tmp_path / "v.nrrd").write_bytes(sequence())
-    with pytest.raises(UsageError, match="3 components"):
-        read_volume(str(tmp_path / "v.nrrd"))
-    with pytest.raises(UsageError, match="no axis of time"):
-        read_volume(str(tmp_path / "v.nrrd"), ReadOptions(component=1, time=1))
+    refused(UsageError, "3 components", read_volume, str(tmp_path / "v.nrrd"))
+    refused(UsageError, "no axis of time", read_volume, str(tmp_path / "v.nrrd"), ReadOptions(component=1, time=1))
     (tmp_path / "v.nrrd").write_bytes(sequence("time domain domain domain"))
     np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(time=1))), VALUES + 1000)
 
@@ -218,15 +208,13 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
 def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> None:
     (tmp_path / "v.seq.nrrd").write_bytes(sequence())
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
-    done = vvgt("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
-    assert done.code == 0, done.err
+    vvgt.ok("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
 
 
 def test_minc_2_without_h5py_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(DataError, match=r"needs h5py .*pip install 'vvgt\[hdf5\]'"):
-        read_volume(str(MINC / "minc2_1_scale.mnc"))
+    refused(DataError, r"needs h5py .*pip install 'vvgt\[hdf5\]'", read_volume, str(MINC / "minc2_1_scale.mnc"))
 
 
 @pytest.mark.parametrize("code", ["u1", "i2", "f4"])
@@ -254,5 +242,4 @@ def test_minc_1_as_vtk_writes_it(tmp_path: Path, code: str) -> None:
 ])  # fmt: skip
 def test_minc_1_that_is_no_regular_volume(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
     (tmp_path / "v.mnc").write_bytes((MINC / "minc1_1_scale.mnc").read_bytes().replace(old, new))
-    with pytest.raises(DataError, match=message):
-        read_volume(str(tmp_path / "v.mnc"))
+    refused(DataError, message, read_volume, str(tmp_path / "v.mnc"))

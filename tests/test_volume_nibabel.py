@@ -1,7 +1,5 @@
 """AFNI and Philips PAR/REC: against nibabel, by headers that come with it, and against the formula in the headers."""
 
-from __future__ import annotations
-
 import gzip
 import re
 import sys
@@ -11,6 +9,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -74,8 +73,7 @@ def test_a_rec_file_is_philips_where_its_par_lies_beside_it(tmp_path: Path, head
     philips(tmp_path, "T1.PAR", 10, header, values)
     assert read_volume(str(tmp_path / values)).dims == (8, 8, 10)
     (tmp_path / header).unlink()
-    with pytest.raises(DataError, match=r"mode|sizes|bytes"):
-        read_volume(str(tmp_path / values))
+    refused(DataError, r"mode|sizes|bytes", read_volume, str(tmp_path / values))
 
 
 def afni(folder: Path, head: bytes, name: str = "v+orig.BRIK", count: int = 1) -> np.ndarray:
@@ -118,11 +116,8 @@ def test_afni_sub_bricks_by_label_and_factor(tmp_path: Path) -> None:
 def test_half_a_pair_and_no_nibabel_are_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     philips(tmp_path, "T1.PAR", 10)
     (tmp_path / "a.PAR").write_bytes((tmp_path / "v.PAR").read_bytes())
-    with pytest.raises(DataError, match=r"expected \.PAR and \.REC"):
-        read_volume(str(tmp_path / "a.PAR"))
+    refused(DataError, r"expected \.PAR and \.REC", read_volume, str(tmp_path / "a.PAR"))
     (tmp_path / "v.PAR").write_bytes(b"# === DATA DESCRIPTION FILE ===\n# Research image export tool     V4.2\n")
-    with pytest.raises(DataError, match="dcm2niix may convert"):
-        read_volume(str(tmp_path / "v.REC"))
+    refused(DataError, "dcm2niix may convert", read_volume, str(tmp_path / "v.REC"))
     monkeypatch.setitem(sys.modules, "nibabel", None)
-    with pytest.raises(DataError, match=r"pip install 'vvgt\[neuro\]'"):
-        read_volume(str(tmp_path / "v.PAR"))
+    refused(DataError, r"pip install 'vvgt\[neuro\]'", read_volume, str(tmp_path / "v.PAR"))

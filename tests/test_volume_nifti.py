@@ -1,7 +1,5 @@
 """NIfTI against nibabel: types, byte orders, scaling, geometry, series."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 
@@ -108,8 +107,7 @@ def test_spacing_signs_and_zeros(tmp_path: Path) -> None:
     source = save(tmp_path / "v.nii", VALUES.astype("u1"))
     patch(source, 252, np.zeros(2, "<i2"))  # neither qform nor sform
     patch(source, 80, np.array([-2, 3, 0], "<f4"))
-    with pytest.raises(DataError, match="try --spacing X Y Z"):
-        read_volume(source)
+    refused(DataError, "try --spacing X Y Z", read_volume, source)
     assert read_volume(source, ReadOptions(spacing=(1, 1, 2))).spacing == (1, 1, 2)
     patch(source, 88, np.array([-4], "<f4"))
     assert read_volume(source).spacing == (2, 3, 4)
@@ -119,22 +117,19 @@ def test_spacing_signs_and_zeros(tmp_path: Path) -> None:
 def test_series(tmp_path: Path, suffix: str) -> None:
     series = np.stack([VALUES, VALUES + 100], -1).astype("i2")
     source = save(tmp_path / f"v{suffix}", series, slope=0.5, inter=-3)
-    with pytest.raises(UsageError, match=r"2 time steps; .*--time N"):
-        read_volume(source)
+    refused(UsageError, r"2 time steps; .*--time N", read_volume, source)
     expected = nib.load(source).get_fdata()
     for step in (0, 1):
         volume = read_volume(source, ReadOptions(component=step))
         np.testing.assert_array_equal(data_values(volume), expected[..., step])
         assert isinstance(volume.data, np.memmap) == (suffix == ".nii")
-        by_time = read_volume(source, ReadOptions(time=step))
-        np.testing.assert_array_equal(by_time.data, volume.data)
+        np.testing.assert_array_equal(read_volume(source, ReadOptions(time=step)).data, volume.data)
     for options, message in (
         ({"time": 2}, "expected a time step from 0 to 1"),
         ({"time": 0, "component": 1}, "leave out --component 1"),
         ({"component": "T1"}, "not component T1"),
     ):
-        with pytest.raises(UsageError, match=message):
-            read_volume(source, ReadOptions(**options))
+        refused(UsageError, message, read_volume, source, ReadOptions(**options))
     norm = read_volume(source, ReadOptions(component="magnitude"))
     np.testing.assert_allclose(data_values(norm), np.linalg.norm(expected, axis=-1), rtol=1e-6)
     single = save(tmp_path / f"one{suffix}", series[..., :1])
@@ -151,19 +146,15 @@ def test_vectors_over_time(tmp_path: Path, suffix: str) -> None:
             np.testing.assert_array_equal(data_values(volume), both[..., time, component])
     norm = read_volume(source, ReadOptions(time=1, component="magnitude"))
     np.testing.assert_allclose(data_values(norm), np.linalg.norm(both[..., 1, :].astype(float), axis=-1), rtol=1e-6)
-    with pytest.raises(UsageError, match="2 time steps"):
-        read_volume(source, ReadOptions(component=1))
-    with pytest.raises(UsageError, match="3 components"):
-        read_volume(source, ReadOptions(time=1))
+    refused(UsageError, "2 time steps", read_volume, source, ReadOptions(component=1))
+    refused(UsageError, "3 components", read_volume, source, ReadOptions(time=1))
 
 
 def test_pair(tmp_path: Path) -> None:
-    image = nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4))
-    image.to_filename(tmp_path / "v.img")
+    nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4)).to_filename(tmp_path / "v.img")
     np.testing.assert_array_equal(data_values(read_volume(str(tmp_path / "v.hdr"))), VALUES)
     (tmp_path / "v.img").unlink()
-    with pytest.raises(DataError, match=r"without its .img file"):
-        read_volume(str(tmp_path / "v.hdr"))
+    refused(DataError, r"without its .img file", read_volume, str(tmp_path / "v.hdr"))
 
 
 def test_content_beats_name(tmp_path: Path) -> None:
@@ -196,19 +187,15 @@ def test_content_beats_name(tmp_path: Path) -> None:
 def test_lies(tmp_path: Path, at: int, values: np.ndarray, message: str) -> None:
     source = save(tmp_path / "v.nii", VALUES.astype("u1"))
     patch(source, at, values)
-    with pytest.raises(DataError, match=message) as caught:
-        read_volume(source)
-    assert "\n" not in str(caught.value)
+    refused(DataError, message, read_volume, source)
 
 
 def test_gzip_damage(tmp_path: Path) -> None:
     source = Path(save(tmp_path / "v.nii.gz", VALUES.astype("u1")))
     body = source.read_bytes()
     source.write_bytes(body[:-30])
-    with pytest.raises(DataError, match="gzip"):
-        read_volume(str(source))
+    refused(DataError, "gzip", read_volume, str(source))
     plain = bytearray(gzip.decompress(body))
     plain[42:48] = np.array([32767] * 3, "<i2").tobytes()
     source.write_bytes(gzip.compress(bytes(plain)))
-    with pytest.raises(DataError, match="cannot hold"):
-        read_volume(str(source))
+    refused(DataError, "cannot hold", read_volume, str(source))

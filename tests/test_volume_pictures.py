@@ -1,7 +1,5 @@
 """Slices as pictures, the numbers in the names of slices, and voxel sizes in the logs of scanners."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings
@@ -13,6 +11,7 @@ import pytest
 import tifffile
 from PIL import Image, ImageOps
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.stored import read_block
@@ -96,12 +95,10 @@ def test_colours_and_opacity_are_components(tmp_path: Path, vvgt) -> None:
     mixed = COLOR[..., 2].copy()
     mixed[1] = GREY[1]
     np.testing.assert_array_equal(read_volume(str(tmp_path / "c3"), ReadOptions(component=2)).data, mixed)
-    with pytest.raises(UsageError, match="not component 3"):
-        read_volume(str(tmp_path / "c3"), ReadOptions(component=3))
+    refused(UsageError, "not component 3", read_volume, str(tmp_path / "c3"), ReadOptions(component=3))
     assert json.loads(vvgt("info", tmp_path / "c3", "--json").out)["dims"] == [7, 5, 4]
     grey_alpha = np.concatenate([GREY[..., None], ALPHA], 3)
-    with pytest.raises(SeveralComponents, match="2 components"):
-        read_volume(str(write(tmp_path / "la", grey_alpha)))
+    refused(SeveralComponents, "2 components", read_volume, str(write(tmp_path / "la", grey_alpha)))
 
 
 def test_orientation_as_pillow_turns_it(tmp_path: Path) -> None:
@@ -144,16 +141,14 @@ def test_pictures_that_do_not_fit(tmp_path: Path) -> None:
     ):
         folder = write(tmp_path / "scan", GREY)
         change(folder / "rec_0010.png")
-        with pytest.raises(DataError, match=message):
-            read_volume(str(folder))
+        refused(DataError, message, read_volume, str(folder))
     folder = write(tmp_path / "jpeg", GREY, ".jpg")
     (folder / "rec_0010.jpg").write_bytes((folder / "rec_0010.jpg").read_bytes()[:-20])
     with pytest.raises(DataError, match="Premature end of JPEG"):  # which would otherwise be grey from there on
         read_volume(str(folder))
     folder = write(tmp_path / "grey", threefold(np.repeat(GREY, 8, axis=0)))
     Image.fromarray(COLOR[0]).save(folder / "rec_0009.png")  # not one of those that are looked at first
-    with pytest.raises(DataError, match=r"rec_0009.png: 3 components .*; expected 1 as in other pictures"):
-        read_volume(str(folder))
+    refused(DataError, r"rec_0009.png: 3 components .*; expected 1 as in other pictures", read_volume, str(folder))
 
 
 def test_previews_do_not_make_a_folder_one_of_slices(tmp_path: Path) -> None:
@@ -165,8 +160,7 @@ def test_previews_do_not_make_a_folder_one_of_slices(tmp_path: Path) -> None:
     assert read_volume(str(tmp_path)).dims == (7, 5, 12)
     (tmp_path / "one").mkdir()
     Image.fromarray(GREY[0]).save(tmp_path / "one" / "a.png")
-    with pytest.raises(DataError, match=r"found 1 picture \(a.png\): give one of the files"):
-        read_volume(str(tmp_path / "one"))
+    refused(DataError, r"found 1 picture \(a.png\): give one of the files", read_volume, str(tmp_path / "one"))
     for name in ("a.png", "A", "a.dat"):
         (tmp_path / "one" / "a.png").rename(tmp_path / "one" / name)
         assert read_volume(str(tmp_path / "one" / name)).dims == (7, 5, 1)
@@ -229,8 +223,7 @@ def test_names_of_several_stacks(tmp_path: Path, names: list[str], ranges: str, 
     assert str(caught.value).endswith(f"give one, as '{tmp_path / pattern}'")
     for k, name in enumerate(names):
         Image.fromarray(np.full((2, 3), k, "u1")).save(tmp_path / name)
-    with pytest.raises(DataError, match="no one number counts the slices"):
-        read_volume(str(tmp_path))
+    refused(DataError, "no one number counts the slices", read_volume, str(tmp_path))
     chosen = [k for k, name in enumerate(names) if Path(name).match(pattern)]
     assert read_volume(str(tmp_path / pattern)).data[:, 0, 0].tolist() == chosen
     assert 1 < len(chosen) < len(names)
@@ -319,11 +312,9 @@ def test_logs_that_do_not_fit(tmp_path: Path) -> None:
         for log in logs:
             (folder / log).unlink()
     (folder / "x.log").write_text(skyscan(size="1,65905"))
-    with pytest.raises(DataError, match=r"x.log: .*pixel size \(um\) is '1,65905'; expected 1 finite numbers"):
-        read_volume(str(folder))
+    refused(DataError, r"x.log: .*pixel size \(um\) is '1,65905'; expected 1 finite numbers", read_volume, str(folder))
     (folder / "x.log").write_text(skyscan(size="0"))
-    with pytest.raises(DataError, match="expected three positive numbers"):
-        read_volume(str(folder))
+    refused(DataError, "expected three positive numbers", read_volume, str(folder))
 
 
 def test_sizes_that_slices_state_themselves(tmp_path: Path) -> None:

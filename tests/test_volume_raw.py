@@ -1,7 +1,5 @@
 """Raw volumes: layouts from names and options, sizes, standard input."""
 
-from __future__ import annotations
-
 import gzip
 import io
 from pathlib import Path
@@ -11,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.headers import DTYPES
@@ -83,8 +82,7 @@ def test_gzipped_raw(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(values.tobytes()))
     np.testing.assert_array_equal(read_volume(str(path)).data, values)
     path.write_bytes(gzip.compress(values.tobytes()[:-1]))
-    with pytest.raises(DataError, match="hold 47 bytes, its header declares 48 bytes"):
-        read_volume(str(path))
+    refused(DataError, "hold 47 bytes, its header declares 48 bytes", read_volume, str(path))
 
 
 @pytest.mark.parametrize("size", [47, 49, 1])
@@ -98,8 +96,7 @@ def test_size_must_fit_exactly(tmp_path: Path, size: int) -> None:
 def test_absurd_dims_do_not_allocate(tmp_path: Path) -> None:
     path = tmp_path / "v_999999999x999999999x999999999_float64.raw"
     path.write_bytes(b"\0" * 64)
-    with pytest.raises(DataError, match="999999999 x 999999999 x 999999999"):
-        read_volume(str(path))
+    refused(DataError, "999999999 x 999999999 x 999999999", read_volume, str(path))
 
 
 @pytest.mark.parametrize(
@@ -113,10 +110,8 @@ def test_absurd_dims_do_not_allocate(tmp_path: Path) -> None:
 def test_unknown_layout_asks_for_it(tmp_path: Path, options: ReadOptions, message: str) -> None:
     path = tmp_path / "v.raw"
     path.write_bytes(b"\0" * 8)
-    with pytest.raises(UsageError, match=message):
-        read_volume(str(path), options)
-    with pytest.raises(UsageError, match=message):
-        raw_module.read_stdin(options, io.BytesIO(b"\0" * 8))
+    refused(UsageError, message, read_volume, str(path), options)
+    refused(UsageError, message, raw_module.read_stdin, options, io.BytesIO(b"\0" * 8))
 
 
 class Feed:
@@ -136,11 +131,9 @@ def test_stdin(monkeypatch: pytest.MonkeyPatch, header: int) -> None:
     np.testing.assert_array_equal(volume.data, values)
     assert volume.name == "stdin"
     monkeypatch.setattr("sys.stdin", Feed(body[:-1]))
-    with pytest.raises(DataError, match=rf"standard input: {len(body) - 1} bytes came"):
-        read_volume("-", options)
+    refused(DataError, rf"standard input: {len(body) - 1} bytes came", read_volume, "-", options)
     monkeypatch.setattr("sys.stdin", Feed(body + b"x"))
-    with pytest.raises(DataError, match=rf"more than {len(body)} bytes came"):
-        read_volume("-", options)
+    refused(DataError, rf"more than {len(body)} bytes came", read_volume, "-", options)
 
 
 @pytest.mark.parametrize(
@@ -156,14 +149,11 @@ def test_stdin(monkeypatch: pytest.MonkeyPatch, header: int) -> None:
     ],
 )
 def test_options_check_themselves(bad: dict) -> None:
-    with pytest.raises(UsageError, match="expected"):
-        ReadOptions(**bad)
+    refused(UsageError, "expected", ReadOptions, **bad)
 
 
 def test_flags_that_raw_does_not_take(tmp_path: Path) -> None:
     path = tmp_path / "v_1x1x1_uint8.raw"
     path.write_bytes(b"\1")
-    with pytest.raises(UsageError, match="leave out --array"):
-        read_volume(str(path), ReadOptions(array="a"))
-    with pytest.raises(UsageError, match="leave out --component"):
-        read_volume(str(path), ReadOptions(component=1))
+    refused(UsageError, "leave out --array", read_volume, str(path), ReadOptions(array="a"))
+    refused(UsageError, "leave out --component", read_volume, str(path), ReadOptions(component=1))

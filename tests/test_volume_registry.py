@@ -1,7 +1,5 @@
 """How a format is found, what an option may do to it, and how errors read."""
 
-from __future__ import annotations
-
 import gzip
 import subprocess
 import sys
@@ -14,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.blocks import parse_numbers
@@ -47,9 +46,7 @@ def test_content_before_name(tmp_path: Path, name: str) -> None:
 def test_a_name_with_the_wrong_content_is_one_clear_line(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"v{suffix}"
     path.write_bytes(b"nothing that any format begins with")
-    with pytest.raises(VvgtError, match=r"expected|no field|has no ElementDataFile|unknown layout") as caught:
-        read_volume(str(path))
-    assert "\n" not in str(caught.value)
+    refused(VvgtError, r"expected|no field|has no ElementDataFile|unknown layout", read_volume, str(path))
 
 
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -82,11 +79,9 @@ def test_the_undamaged_heads_are_read(tmp_path: Path) -> None:
         path = tmp_path / f"v{k}"
         path.write_bytes(head)
         if head.startswith(b"II*"):  # directories without pixels
-            with pytest.raises(DataError, match="damaged"):
-                read_volume(str(path))
+            refused(DataError, "damaged", read_volume, str(path))
         elif head.startswith(b"11111"):  # its first plane has 8 voxels, 4 were declared
-            with pytest.raises(DataError, match="plane 0 of 2"):
-                read_volume(str(path))
+            refused(DataError, "plane 0 of 2", read_volume, str(path))
         elif b"n+1\0" in head:
             path.write_bytes(head[:352].ljust(352, b"\0") + bytes(8))
             assert read_volume(str(path)).dims == (2, 2, 2)
@@ -102,19 +97,16 @@ def test_what_cannot_be_opened(tmp_path: Path) -> None:
         ("x" * 5000, "cannot be read"),
         ("a\0b", "cannot be read"),
     ):
-        with pytest.raises(DataError, match=message):
-            read_volume(str(source))
+        refused(DataError, message, read_volume, str(source))
     (tmp_path / "empty.nii").touch()
-    with pytest.raises(DataError, match="the file is empty"):
-        read_volume(str(tmp_path / "empty.nii"))
+    refused(DataError, "the file is empty", read_volume, str(tmp_path / "empty.nii"))
     (tmp_path / "v.abc").write_bytes(b"what is this")
     with pytest.raises(
         DataError, match=r"of no known format; expected .*NRRD.* of docs/formats.md, .*--dims X Y Z --dtype TYPE"
     ):
         read_volume(str(tmp_path / "v.abc"))
     (tmp_path / "v.nrrd.gz").write_bytes(gzip.compress(NRRD))
-    with pytest.raises(DataError, match="gzip-compressed NRRD file; unpack it first"):
-        read_volume(str(tmp_path / "v.nrrd.gz"))
+    refused(DataError, "gzip-compressed NRRD file; unpack it first", read_volume, str(tmp_path / "v.nrrd.gz"))
 
 
 @pytest.mark.parametrize(
@@ -129,8 +121,7 @@ def test_what_cannot_be_opened(tmp_path: Path) -> None:
 )
 def test_options_that_would_do_nothing_are_refused(tmp_path: Path, options: ReadOptions, message: str) -> None:
     (tmp_path / "v.nrrd").write_bytes(NRRD)
-    with pytest.raises(UsageError, match=message):
-        read_volume(str(tmp_path / "v.nrrd"), options)
+    refused(UsageError, message, read_volume, str(tmp_path / "v.nrrd"), options)
 
 
 def test_names() -> None:
@@ -163,8 +154,7 @@ def test_numbers_across_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vvgt_cli.volume.blocks._CHUNK", 7)
     text = b" ".join(b"%d" % v for v in range(100)) + b"\n"
     np.testing.assert_array_equal(parse_numbers(text, 0, 100, np.dtype("u1"), "t"), np.arange(100))
-    with pytest.raises(DataError, match="holds 100 values, expected 101"):
-        parse_numbers(text, 0, 101, np.dtype("u1"), "t")
+    refused(DataError, "holds 100 values, expected 101", parse_numbers, text, 0, 101, np.dtype("u1"), "t")
 
 
 @pytest.mark.parametrize(

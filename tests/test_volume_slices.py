@@ -1,7 +1,5 @@
 """Volumes as many files: DICOM series, TIFF slices, NRRD with several data files."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import sys
@@ -16,6 +14,7 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, RLELossless, generate_uid
 
 from tests.ramps import X, Y, Z, check_grid, ramp
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -98,8 +97,7 @@ def test_dicom_several_series(tmp_path: Path) -> None:
         read_volume(str(tmp_path))
     for wanted in ("2", "1.2.4", "series 2"):
         assert read_volume(str(tmp_path), ReadOptions(array=wanted)).intercept == 0
-    with pytest.raises(UsageError, match="no one series '3'; it has 1 'series 1'"):
-        read_volume(str(tmp_path), ReadOptions(array="3"))
+    refused(UsageError, "no one series '3'; it has 1 'series 1'", read_volume, str(tmp_path), ReadOptions(array="3"))
 
 
 def test_dicom_scalings_that_differ_are_applied(tmp_path: Path) -> None:
@@ -155,15 +153,13 @@ def test_dicom_compressed(tmp_path: Path) -> None:
 )
 def test_dicom_refusals(tmp_path: Path, changes: dict, message: str) -> None:
     write_series(tmp_path / "scan", **changes)
-    with pytest.raises(DataError, match=message):
-        read_volume(str(tmp_path / "scan"))
+    refused(DataError, message, read_volume, str(tmp_path / "scan"))
 
 
 def test_dicom_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_series(tmp_path / "scan")
     monkeypatch.setitem(sys.modules, "pydicom", None)
-    with pytest.raises(DataError, match=r"needs pydicom .*pip install 'vvgt\[dicom\]'"):
-        read_volume(str(tmp_path / "scan"))
+    refused(DataError, r"needs pydicom .*pip install 'vvgt\[dicom\]'", read_volume, str(tmp_path / "scan"))
 
 
 def write_slices(folder: Path, values: np.ndarray) -> None:
@@ -194,13 +190,10 @@ def test_tiff_slices_of_a_folder_and_a_glob(tmp_path: Path) -> None:
 
 def test_tiff_slices_refusals(tmp_path: Path) -> None:
     write_slices(tmp_path / "stack", VALUES.astype(np.float32))
-    with pytest.raises(DataError, match="no such file"):
-        read_volume(str(tmp_path / "none_*.tif"))
-    with pytest.raises(UsageError, match="leave out --dims"):
-        read_volume(str(tmp_path / "stack" / "*.tif"), ReadOptions(dims=(1, 1, 1)))
+    refused(DataError, "no such file", read_volume, str(tmp_path / "none_*.tif"))
+    refused(UsageError, "leave out --dims", read_volume, str(tmp_path / "stack" / "*.tif"), ReadOptions(dims=(1, 1, 1)))
     (tmp_path / "stack" / "notes.txt").write_text("x")
-    with pytest.raises(DataError, match=r"notes.txt is no slice"):
-        read_volume(str(tmp_path / "stack" / "*"))
+    refused(DataError, r"notes.txt is no slice", read_volume, str(tmp_path / "stack" / "*"))
     spec = oiio.ImageSpec(2, 2, 1, "float")
     output = oiio.ImageOutput.create(str(tmp_path / "stack" / "slice_9.tif"))
     output.open(str(tmp_path / "stack" / "slice_9.tif"), spec)
@@ -239,8 +232,7 @@ def test_nrrd_in_several_files(tmp_path: Path, encoding: str, pack) -> None:
         ("s%02d.raw 0 900000 1", "MIN MAX STEP"),
         ("s%02d.raw 1 3 1", "does not exist beside it"),
     ):
-        with pytest.raises(DataError, match=message):
-            read_volume(nhdr(tmp_path / "v.nhdr", named, encoding))
+        refused(DataError, message, read_volume, nhdr(tmp_path / "v.nhdr", named, encoding))
 
 
 def test_info_takes_folders_globs_and_inner_paths(vvgt, tmp_path: Path) -> None:
@@ -248,9 +240,7 @@ def test_info_takes_folders_globs_and_inner_paths(vvgt, tmp_path: Path) -> None:
     write_slices(tmp_path / "stack", VALUES.astype(np.float32))
     np.savez(tmp_path / "v.npz", field=VALUES, other=VALUES)
     for source in ("scan", "stack", "stack/*.tif", "v.npz:/field"):
-        done = vvgt("info", f"{tmp_path}/{source}", "--json")
-        assert done.code == 0, done.err
-        assert json.loads(done.out)["dims"] == [5, 4, 3]
+        assert json.loads(vvgt.ok("info", f"{tmp_path}/{source}", "--json").out)["dims"] == [5, 4, 3]
     (tmp_path / "empty").mkdir()
     assert "a folder; expected a volume file" in vvgt("info", tmp_path / "empty").error
 
@@ -266,5 +256,4 @@ def test_dicom_slices_may_be_off_by_a_hundredth_of_the_largest_edge_each(tmp_pat
         return read_volume(str(folder), LPS)
 
     assert read(shift / 1.5).dims == (5, 4, 3)
-    with pytest.raises(DataError, match="shift sideways unevenly"):
-        read(1.02 * shift / 1.5 / 0.99)
+    refused(DataError, "shift sideways unevenly", read, 1.02 * shift / 1.5 / 0.99)

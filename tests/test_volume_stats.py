@@ -1,7 +1,5 @@
 """Statistics against numpy, for every type, with scaling, NaN and memory."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 
@@ -72,8 +70,7 @@ def test_constant(value: np.generic) -> None:
 
 
 def test_values_at_the_limits_of_float64() -> None:
-    data = np.array([-1.7e308, 0, 1.7e308]).reshape(1, 1, 3)
-    found = statistics(Volume(data))
+    found = statistics(Volume(np.array([-1.7e308, 0, 1.7e308]).reshape(1, 1, 3)))
     assert (found.lo, found.hi) == (-1.7e308, 1.7e308)
     np.testing.assert_array_equal(np.nonzero(found.histogram)[0], [0, 128, 255])
     assert np.isfinite(found.edges).all()

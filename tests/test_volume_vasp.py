@@ -1,13 +1,12 @@
 """VASP's grids, written as VASP's wiki has them: cell, scale, factors of values, blocks of spin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralComponents
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -54,8 +53,7 @@ def test_potentials_are_as_stored(tmp_path: Path, name: str) -> None:
 
 def test_blocks_of_spin_are_components(tmp_path: Path) -> None:
     source = put(tmp_path, "CHGCAR_sum", chgcar([VALUES, VALUES - 0.5]))
-    with pytest.raises(SeveralComponents, match="total, then magnetization"):
-        read_volume(source)
+    refused(SeveralComponents, "total, then magnetization", read_volume, source)
     for k in range(2):
         np.testing.assert_allclose(read_volume(source, ReadOptions(component=k)).data, VALUES - 0.5 * k, atol=1e-7)
 
@@ -67,5 +65,4 @@ def test_what_has_no_grid_is_an_error(tmp_path: Path) -> None:
         (whole.replace("2 3 4", "2 3 400"), "2 x 3 x 400"),
         (whole.replace("4.000000 0.000000 0.000000", "1.000000 5.000000 0.000000"), "expected three sizes, a volume"),
     ):
-        with pytest.raises(DataError, match=message):
-            read_volume(put(tmp_path, "CHGCAR", text))
+        refused(DataError, message, read_volume, put(tmp_path, "CHGCAR", text))

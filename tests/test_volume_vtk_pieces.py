@@ -1,7 +1,5 @@
 """`.pvti`: pieces as blocks, the same volume as the `.vti` of the same field, whatever is wrong with a piece."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from pathlib import Path
@@ -13,6 +11,7 @@ import pyvista as pv
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from tests import vtk_files as files
+from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.registry import contents
@@ -104,8 +103,7 @@ def test_hidden_cells_are_nan(tmp_path: Path) -> None:
     path = by_hand(tmp_path, marks={0: 1, 1: 32})
     for stored in (False, True):
         volume = read_volume(str(path), ReadOptions(array="cells", stored=stored))
-        values = volume.data[:, :, :]
-        assert np.argwhere(np.isnan(values)).tolist() == [[0, 0, 2]]
+        assert np.argwhere(np.isnan(volume.data[:, :, :])).tolist() == [[0, 0, 2]]
     points = read_volume(str(path), ReadOptions(array="ramp"))
     assert not np.isnan(points.data).any()  # each has another cell beside it
     duplicates = by_hand(tmp_path, marks={0: 1, 1: 1})
@@ -113,8 +111,7 @@ def test_hidden_cells_are_nan(tmp_path: Path) -> None:
 
 
 def test_a_box_reads_the_pieces_that_it_meets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = by_hand(tmp_path, (0, 1, 2, 3, 4))
-    volume = read_volume(str(path), ReadOptions(array="cells", stored=True))
+    volume = read_volume(str(by_hand(tmp_path, (0, 1, 2, 3, 4))), ReadOptions(array="cells", stored=True))
     opened: list[str] = []
     real = vtk_pieces.scan
     monkeypatch.setattr(vtk_pieces, "scan", lambda file: opened.append(file.name) or real(file))
@@ -163,13 +160,11 @@ def test_pieces_that_are_elsewhere_or_cut(tmp_path: Path) -> None:
     part = pv.read(tmp_path / "p1.vti")
     part.origin = (0.5, -3, 10.5)
     part.save(tmp_path / "p1.vti")
-    with pytest.raises(DataError, match=r"expected the place that v\.pvti gives it"):
-        read_volume(str(path), ReadOptions(array="cells"))
+    refused(DataError, r"expected the place that v\.pvti gives it", read_volume, str(path), ReadOptions(array="cells"))
     by_hand(tmp_path)
     content = (tmp_path / "p1.vti").read_bytes()
     (tmp_path / "p1.vti").write_bytes(content[: len(content) // 3])
-    with pytest.raises(DataError, match=r"p1\.vti"):
-        read_volume(str(path), ReadOptions(array="cells"))
+    refused(DataError, r"p1\.vti", read_volume, str(path), ReadOptions(array="cells"))
 
 
 def test_very_many_pieces_are_read_one_by_one(tmp_path: Path) -> None:

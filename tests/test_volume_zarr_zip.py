@@ -1,7 +1,5 @@
 """Zarr in zip files, written by zarr's ZipStore and by zipping folders: the same as the folder."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import numpy as np
 import pytest
 import zarr
 
+from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -56,20 +55,16 @@ def test_a_store_of_zarrs_own(tmp_path: Path, version: int, stored: bool) -> Non
 )
 def test_zipped_folders(tmp_path: Path, version: int, name: str, inside: str, packed: bool) -> None:
     source = zipped(tmp_path, version, name, inside, packed)
-    volume = read_volume(source, ReadOptions(time=0))
-    np.testing.assert_array_equal(volume.data, VALUES[0])
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(time=0)).data, VALUES[0])
     for other in (read_volume(source + ":/1", ReadOptions(time=0)), read_volume(source, ReadOptions(time=0, level=1))):
         np.testing.assert_array_equal(other.data, VALUES[0, :, ::2, ::2])
         assert other.spacing == (2, 4, 3)
-    with pytest.raises(UsageError, match="no array '/nothing'"):
-        read_volume(source + ":/nothing", ReadOptions(time=0))
+    refused(UsageError, "no array '/nothing'", read_volume, source + ":/nothing", ReadOptions(time=0))
 
 
 def test_what_is_no_store(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "v.zarr.zip", "w") as file:
         file.writestr("a.txt", "hello")
-    with pytest.raises(DataError, match="no Zarr store in this zip"):
-        read_volume(str(tmp_path / "v.zarr.zip"))
+    refused(DataError, "no Zarr store in this zip", read_volume, str(tmp_path / "v.zarr.zip"))
     (tmp_path / "v.ozx").write_bytes(b"PK\3\4 zarr.json")
-    with pytest.raises(DataError, match="no zip file; expected"):
-        read_volume(str(tmp_path / "v.ozx"))
+    refused(DataError, "no zip file; expected", read_volume, str(tmp_path / "v.ozx"))

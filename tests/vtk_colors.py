@@ -1,7 +1,5 @@
 """VTK's picture of an RGBA volume with dependent components: what the tests and benchmarks compare with."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

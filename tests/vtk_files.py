@@ -4,8 +4,6 @@ Each function writes into a folder and returns the file to open. Values of step 
 the ramp at their centres.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -90,8 +88,7 @@ def amr(folder: Path) -> Path:
         grid.SetSpacing(edge, edge, edge)
         grid.SetOrigin(10.0, 20.0, 30.0)
         axes = [o + edge * (np.arange(k) + 0.5) for o, k in zip((10, 20, 30), n, strict=True)]
-        values = pv.convert_array((ramp(*axes) + level).ravel(), name="cells")
-        grid.GetCellData().SetScalars(values)
+        grid.GetCellData().SetScalars(pv.convert_array((ramp(*axes) + level).ravel(), name="cells"))
         found.SetAMRBox(level, 0, vtkAMRBox((0, 0, 0), tuple(k - 1 for k in n)))
         found.SetDataSet(level, 0, grid)
     return write(vtkIOXML.vtkXMLUniformGridAMRWriter(), found, folder / "v.vthb")
@@ -167,8 +164,7 @@ def hdf_steps(folder: Path) -> Path:
         root.attrs["WholeExtent"] = np.array([0, 4, 0, 3, 0, 2])
         root.attrs["Origin"], root.attrs["Spacing"] = np.array([X[0], Y[0], Z[0]]), np.array([0.25, 0.5, 2.0])
         root.attrs["Direction"] = np.eye(3).ravel()
-        values = np.stack([ramp(X, Y, Z) + STEP * k for k in range(2)])
-        root.create_dataset("PointData/ramp", data=values)
+        root.create_dataset("PointData/ramp", data=np.stack([ramp(X, Y, Z) + STEP * k for k in range(2)]))
         steps = root.create_group("Steps")
         steps.attrs["NSteps"] = 2
         steps["Values"] = np.array(TIMES)

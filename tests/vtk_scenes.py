@@ -1,7 +1,5 @@
 """A smooth lump off the centre of a small oblique volume, and pictures and places to compare with a program's own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Views that VTK draws, in a process of its own: VTK may crash where OpenGL is incomplete."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

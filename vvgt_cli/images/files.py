@@ -141,7 +141,8 @@ def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
         check_pixels(path, width, height)
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
     except (RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a readable EXR image ({error}); expected channels R, G, B, A") from error
+        why = " ".join(str(error).split())
+        raise DataError(f"{path}: not a readable EXR image ({why}); expected channels R, G, B, A") from error
     missing = [name for name in CHANNELS[:3] if name not in channels]
     if missing:
         raise DataError(f"{path}: channels {', '.join(sorted(channels))}; expected R, G, B, A")
