@@ -239,7 +239,7 @@ def read_png(path: str | PathLike[str]) -> np.ndarray:
         check_pixels(path, spec.width, spec.height)
         pixels = source.read_image(oiio.FLOAT)
         if pixels is None:
-            raise DataError(f"{path}: damaged PNG ({source.geterror().strip()}); expected a complete one")
+            raise DataError(f"{path}: damaged PNG ({' '.join(source.geterror().split())}); expected a complete one")
     finally:
         source.close()
     pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
