@@ -107,6 +107,7 @@ class Result:
         assert len(lines) == 1, self.err
         assert "Traceback" not in self.err
         assert self.err.splitlines()[-1] == lines[0], self.err
+        assert lines[0].count("vvgt: error: ") == 1, self.err
         return lines[0]
 
 

@@ -189,8 +189,8 @@ def test_grey(bench, scenes, tmp_path, monkeypatch):
         return read_png(folder / f"blob-{rule}-{size}.command.png")[..., :3], {}
 
     monkeypatch.setattr(module, "page_picture", page_picture)
-    monkeypatch.chdir(tmp_path)  # pictures go to out/grey
-    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--gaussians", 500, "--size", SIZE)
+    given = "-o", tmp_path / "a.csv", "--pictures", tmp_path / "pictures", "--gaussians", 500, "--size", SIZE
+    call(module.main, *scenes, *given)
     rows = rows_of(tmp_path / "a.csv")
     assert [row["rule"] for row in rows] == ["mip", "xray"]
     assert all(20 < float(row["command"]) == float(row["page"]) < float(row["agreement"]) for row in rows)

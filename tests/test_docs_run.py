@@ -104,7 +104,8 @@ def run_blocks(page: str, vvgt) -> list[str]:
         for line in block.splitlines():
             words = shlex.split(line)
             assert words[0] == "vvgt", f"{page}: {line}: expected a vvgt command"
-            vvgt.ok(*small(words[1:]))
+            result = vvgt(*small(words[1:]))
+            assert result.code == 0, f"{page}: {line}\n{result.err}"
             done.append(line)
     return done
 

@@ -3,7 +3,6 @@
 import io
 import json
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +68,7 @@ def test_a_file_of_vvgt_with_such_rows_is_damaged(tmp_path: Path) -> None:
         read_ply(io.BytesIO(ply(damaged(), "comment vvgt 0.1.0")))
 
 
-def test_every_command_takes_them_and_check_reports_them(vvgt: Callable, tmp_path: Path) -> None:
+def test_every_command_takes_them_and_check_reports_them(vvgt, tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(ply(damaged()))
     message = "of 40 Gaussians 7 skipped"
@@ -91,7 +90,7 @@ def test_every_command_takes_them_and_check_reports_them(vvgt: Callable, tmp_pat
     assert told == {"centres": 1, "sizes": 2, "opacities": 3, "rotations": 1, "colours": 1}
 
 
-def test_nothing_but_such_rows(vvgt: Callable, tmp_path: Path) -> None:
+def test_nothing_but_such_rows(vvgt, tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(ply(np.full_like(GOOD, np.nan)))
     with (
         pytest.warns(UserWarning, match="of 40 Gaussians 40 skipped"),
@@ -116,7 +115,7 @@ def splat(rows: np.ndarray) -> bytes:
     return content
 
 
-def test_splat(vvgt: Callable, tmp_path: Path) -> None:
+def test_splat(vvgt, tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(splat(GOOD))
     found, expected = read_splats(path)[0], read_ply(io.BytesIO(ply(GOOD)))[0]
@@ -136,7 +135,7 @@ def test_splat(vvgt: Callable, tmp_path: Path) -> None:
         assert len(read_splats(path)[0]) == 39
 
 
-def test_what_is_no_splat_and_what_is_not_written(vvgt: Callable, tmp_path: Path) -> None:
+def test_what_is_no_splat_and_what_is_not_written(vvgt, tmp_path: Path) -> None:
     for content in (b"", splat(GOOD)[:-1]):
         (tmp_path / "a.splat").write_bytes(content)
         refused(DataError, r"expected a .splat of 32 bytes a Gaussian", read_splats, tmp_path / "a.splat")
@@ -180,7 +179,7 @@ def read(tmp_path: Path, content: bytes, name: str = "a.compressed.ply") -> Gaus
     return read_splats(tmp_path / name)[0]
 
 
-def test_chunks_of_supersplat_1_have_colours_from_0_to_1(vvgt: Callable, tmp_path: Path) -> None:
+def test_chunks_of_supersplat_1_have_colours_from_0_to_1(vvgt, tmp_path: Path) -> None:
     content = compressed(RANGES)
     found = read(tmp_path, content, "b.ply")
     bits = np.frombuffer(content[-300 * 16 :], "<u4").reshape(300, 4)

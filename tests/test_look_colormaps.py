@@ -2,7 +2,6 @@
 
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +60,7 @@ def test_presets_are_those_of_vtk(tmp_path: Path, fields: dict[str, Any], number
     np.testing.assert_allclose(tf.color(AT), vtk_colors(number, wrap, NODES), atol=tolerance)
 
 
-def test_the_rainbow_runs_from_blue_over_green_to_red(vvgt: Callable, tmp_path: Path) -> None:
+def test_the_rainbow_runs_from_blue_over_green_to_red(vvgt, tmp_path: Path) -> None:
     """Without HSVWrap, which ParaView writes where it is not 0; converted too."""
     preset = {"ColorSpace": "HSV", "Name": "Blue to Red Rainbow", "RGBPoints": [0, 0, 0, 1, 1, 1, 0, 0]}
     source, out = written(tmp_path / "p.json", [preset]), tmp_path / "own.json"
@@ -152,7 +151,7 @@ def test_what_niivue_takes_where_a_list_is_missing(tmp_path: Path) -> None:
     np.testing.assert_allclose(short.opacity(np.array([0.5])), 0.5)  # makeLut stretches the last segment to 255
 
 
-def test_per_voxel_survives_conversion_and_is_said(vvgt: Callable, tmp_path: Path) -> None:
+def test_per_voxel_survives_conversion_and_is_said(vvgt, tmp_path: Path) -> None:
     source = written(tmp_path / "b.clut", CLUT.format(lo=0, hi=9))
     vvgt.ok("tf", "convert", source, tmp_path / "own.json")
     again = read_transfer_function(str(tmp_path / "own.json"))
@@ -168,7 +167,7 @@ def nih(colors: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("form", ["bytes", "fork", "nih", "text of three", "text of four"])
-def test_imagej(vvgt: Callable, tmp_path: Path, form: str) -> None:
+def test_imagej(vvgt, tmp_path: Path, form: str) -> None:
     path = tmp_path / "fire.LUT"
     plain = COLORS.T.tobytes()
     rows = [" ".join(map(str, row)) for row in COLORS.tolist()]

@@ -39,7 +39,7 @@ def save(path: Path, values: np.ndarray) -> str:
 
 
 @pytest.mark.parametrize("name", names())
-def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, tmp_path: Path, vvgt: Callable) -> None:
+def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, tmp_path: Path, vvgt) -> None:
     function = read_transfer_function(name)
     assert function.name == name
     assert function.opacity_unit_share == 1 / 256
@@ -55,7 +55,7 @@ def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, 
             np.testing.assert_array_equal(one.color(x), other.color(x))
 
 
-def test_the_list_names_them_all(vvgt: Callable) -> None:
+def test_the_list_names_them_all(vvgt) -> None:
     lines = vvgt("tf", "list").out.decode().splitlines()
     assert [line.split()[0] for line in lines] == list(names())
     assert all(len(line.split(None, 1)[1]) > 10 for line in lines)
@@ -135,7 +135,7 @@ def test_a_density_without_anything_above_its_noise_is_shown_by_its_histogram() 
     assert from_histogram(statistics(Volume(values)), density=True).name == "automatic (histogram)"
 
 
-def test_info_names_a_function_that_fits(tmp_path: Path, vvgt: Callable) -> None:
+def test_info_names_a_function_that_fits(tmp_path: Path, vvgt) -> None:
     def suggested(source: str) -> str | None:
         return json.loads(vvgt("info", source, "--json").out).get("tf")
 
@@ -279,7 +279,7 @@ def test_blocks_count_for_functions_of_the_histogram(name: str) -> None:
 
 
 @pytest.mark.parametrize("tf", [None, "density-contour"])
-def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt: Callable, tf: str | None) -> None:
+def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt, tf: str | None) -> None:
     """The same Gaussians, and the same bytes however the map is divided."""
     source = save(tmp_path / "v.mrc", np.kron(blob(), np.ones((2, 2, 2), np.float32)))
     files = []

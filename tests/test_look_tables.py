@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +133,7 @@ def test_faulty_separated_tables(tmp_path: Path, text: str, said: str) -> None:
     refused(DataError, said, read_labels, saved(tmp_path, "t.csv", text))
 
 
-def test_hidden_labels_are_named(vvgt: Callable, tmp_path: Path) -> None:
+def test_hidden_labels_are_named(vvgt, tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", np.repeat(np.arange(4, dtype=np.uint8), 128).reshape(8, 8, 8))
     small = ("--max-gaussians", 60, "--size", 64, "--overwrite", "-o", tmp_path / "o.ply")
     table = saved(tmp_path, "t.ctbl", ROWS.format(a=255, b=0, c=0))
@@ -149,7 +148,7 @@ def test_hidden_labels_are_named(vvgt: Callable, tmp_path: Path) -> None:
         assert "try --labels auto" in vvgt("init", tmp_path / "labels.npy", "--labels", none, *small).error
 
 
-def test_info_lists_a_separated_table(vvgt: Callable, tmp_path: Path) -> None:
+def test_info_lists_a_separated_table(vvgt, tmp_path: Path) -> None:
     found = json.loads(vvgt("info", saved(tmp_path, "s.csv", SLICER_CSV), "--json").out)
     assert (found["kind"], found["labels"]) == ("table of labels", 2)
     assert found["entries"][0]["name"] == "left  lung, upper"

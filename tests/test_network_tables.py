@@ -136,6 +136,7 @@ def test_poses_hold_translation_rotation_and_field_of_view():
     camera = default_views("check")[1]
     pose = view_arrays([camera])["poses"][0]
     assert np.allclose(turns(pose[None, 3:7])[0], camera.rotation, atol=1e-6)
+    assert np.isclose(np.linalg.norm(pose[3:7]), 1, atol=1e-6)
     assert pose[3] >= 0
     assert np.allclose(pose[7:], np.radians(40))
     assert np.allclose(np.abs(quaternion(np.diag([-1.0, 1.0, -1.0]))), [0, 0, 1, 0], atol=1e-12)

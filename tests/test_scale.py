@@ -57,6 +57,7 @@ def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, 
 
 
 def in_memory_and_in_blocks(vvgt, raw, folder, *fit):
+    """Convert in memory and in blocks of 32 voxels, and return both files."""
     one, other = folder / "a.ply", folder / "b.ply"
     vvgt.ok("init", raw, "-o", one, *fit)
     vvgt.ok("init", raw, "-o", other, *fit, "--blocks", "32")

@@ -122,6 +122,7 @@ def test_the_nearest_turn_is_the_same_ellipsoid() -> None:
     before = s.quaternions.astype(np.float64), s.log_scales.astype(np.float64)
     after = nearest_turn(*before)
     np.testing.assert_allclose(matrices(*after), matrices(*before), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(after[0], axis=1), 1, rtol=1e-5)
     assert abs(after[0][:, 0]).min() > 0.85  # cos(62.8 degrees / 2): no turn is further from the 24
     assert (abs(after[0]).argmax(axis=1) == 0).all()
 

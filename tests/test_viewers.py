@@ -35,10 +35,12 @@ def front(size: int = SIZE) -> Camera:
 
 
 def saved(gaussians: Gaussians, folder: Path, ending: str = ".ply") -> Path:
-    """A file of ``gaussians`` that no viewer turns."""
+    """Write ``gaussians`` to a file that no viewer turns, and return its path."""
     path = folder / f"saved{ending}"
-    known = format_of(path)
-    path.write_bytes(encoded(known, gaussians, PlyOptions(), path.name)) if known else write_ply(path, gaussians)
+    if known := format_of(path):
+        path.write_bytes(encoded(known, gaussians, PlyOptions(), path.name))
+    else:
+        write_ply(path, gaussians)
     return path
 
 
@@ -213,7 +215,7 @@ def fog(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 @pytest.mark.parametrize("viewer", RULE)
 def test_converted_volume_looks_as_scored(viewer: str, body: Shown, tmp_path: Path) -> None:
     gaussians = read_ply(body.file)[0]
-    file = saved(gaussians, tmp_path, ENDING.get(viewer, ".ply"))
+    file = saved(gaussians, tmp_path, ENDING[viewer]) if viewer in ENDING else body.file
     shot = shoot(viewer, file, [body.camera], 1080, tmp_path, OPTIONS.get(viewer, ""))[0]
     ours = render(gaussians, body.camera, rule=RULE[viewer])[..., :3]
     seen, said, same = psnr(body.volume, shot), psnr(body.volume, ours), psnr(ours, shot)

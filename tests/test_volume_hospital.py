@@ -7,7 +7,6 @@ import struct
 import subprocess
 import warnings
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -199,7 +198,7 @@ def test_times_as_in_dcm2niix(tmp_path: Path) -> None:
         check_same(read_volume(source, ReadOptions(time=t)), theirs, t)
 
 
-def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt: Callable, tmp_path: Path) -> None:
+def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt, tmp_path: Path) -> None:
     source = series(tmp_path / "in", [{"EchoTime": e} for e in (4.92, 7.38)])
     assert "step 1, name EchoTime 7.38 ms, option --time 1" in vvgt("info", source).out.decode()
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)

@@ -1,7 +1,6 @@
 """MGH, Analyze and MINC against nibabel and the files of MINC's own tools that it brings; sequences of 3D Slicer."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import nibabel as nib
@@ -74,7 +73,7 @@ FREESURFER = (
 )
 
 
-def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt: Callable) -> None:
+def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt) -> None:
     labels = np.zeros((12, 12, 12), np.int32)
     labels[2:5, 3:9, 3:9], labels[7:10, 3:9, 3:9] = 17, 53
     nib.save(nib.MGHImage(labels, OBLIQUE), str(tmp_path / "aseg.mgz"))
@@ -116,7 +115,7 @@ def test_analyze_as_nibabel_writes_it(tmp_path: Path, kind: str, order: str) -> 
         np.testing.assert_allclose(volume.origin, expected)
 
 
-def test_analyze_says_so_on_one_line(tmp_path: Path, vvgt: Callable) -> None:
+def test_analyze_says_so_on_one_line(tmp_path: Path, vvgt) -> None:
     nib.AnalyzeImage(VALUES.astype("i2"), None).to_filename(tmp_path / "v.img")
     with pytest.warns(UserWarning, match="^v.hdr: Analyze does not say which side is left; .*$") as said:
         vvgt.ok("info", tmp_path / "v.hdr")
@@ -205,7 +204,7 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
     np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(time=1))), VALUES + 1000)
 
 
-def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> None:
+def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt) -> None:
     (tmp_path / "v.seq.nrrd").write_bytes(sequence())
     few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
     vvgt.ok("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)

@@ -110,7 +110,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], tuple]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_blocks_give_the_same_gaussians(case: str, tmp_path: Path, vvgt: Callable) -> None:
+def test_blocks_give_the_same_gaussians(case: str, tmp_path: Path, vvgt) -> None:
     make, options = CASES[case]
     source, facts = make(tmp_path), []
     for blocks in ((), ("--blocks", 16)):
@@ -123,7 +123,7 @@ def test_blocks_give_the_same_gaussians(case: str, tmp_path: Path, vvgt: Callabl
 
 
 @pytest.mark.parametrize(("case", "steps"), [("mrc stack", 2), ("sequence", 2), ("minc", 2)])
-def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, tmp_path: Path, vvgt: Callable) -> None:
+def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, tmp_path: Path, vvgt) -> None:
     source = CASES[case][0](tmp_path)
     assert json.loads(vvgt("info", source, "--json").out)["time_steps"] == steps
     facts = json.loads(vvgt("info", source, "--json", "--time", 1).out)
@@ -131,14 +131,14 @@ def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, t
     assert facts["range"][1] > facts["range"][0]
 
 
-def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt: Callable) -> None:
+def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt) -> None:
     out = tmp_path / "o.ply"
     done = vvgt.ok("init", analyze(tmp_path), "-o", out, "--max-gaussians", 50, "--blocks", 32, "--workers", 2)
     assert "Analyze" not in done.err  # of this process the warning goes to pytest
 
 
 @pytest.mark.parametrize("make", [netcdf, vti])
-def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Path, vvgt: Callable) -> None:
+def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Path, vvgt) -> None:
     """In blocks; the packed ones with processes of workers."""
     np.save(tmp_path / "v.npy", BALL.astype("f4"))
     files = []
@@ -149,7 +149,7 @@ def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Pa
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt: Callable) -> None:
+def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt) -> None:
     source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
     vvgt.ok("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--size", 32, "--steps", 0)
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply"]

@@ -117,7 +117,7 @@ def write_exr(
         try:
             OpenEXR.File(header, {"RGBA": pixels}).write(str(temporary))
         except RuntimeError as error:
-            raise DataError(f"{path}: cannot be written ({error})") from error
+            raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())})") from error
 
 
 def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
