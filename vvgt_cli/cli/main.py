@@ -17,7 +17,7 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, open_streams, received
+from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, leave, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
@@ -188,7 +188,7 @@ def main() -> None:
     open_streams()
     end_on_signals()
     warnings.showwarning = _note
-    sys.exit(_several() if sys.argv[1:] == ["--commands"] else run())
+    leave(_several() if sys.argv[1:] == ["--commands"] else run())
 
 
 if __name__ == "__main__":

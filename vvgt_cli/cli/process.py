@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -9,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, NoReturn
 
 from vvgt_cli.files import discard_leftovers
 from vvgt_cli.progress import MessageStream
@@ -57,6 +58,20 @@ def end_on_signals() -> None:
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
+
+
+def leave(status: int) -> NoReturn:
+    """End the process with a status, without freeing its objects one by one, which takes 0.3 s after a conversion.
+
+    Functions registered with `atexit` run. A process with other threads to wait for ends as usual.
+    """
+    if all(thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 @contextmanager
