@@ -21,6 +21,7 @@ from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, leave, 
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
+from vvgt_cli.resources import keep_freed_memory
 from vvgt_cli.version import VERSION
 
 COMMANDS = [  # modules of this room, with underscores
@@ -187,6 +188,7 @@ def main() -> None:
     """Run the `vvgt` command and exit."""
     open_streams()
     end_on_signals()
+    keep_freed_memory()
     warnings.showwarning = _note
     leave(_several() if sys.argv[1:] == ["--commands"] else run())
 
