@@ -198,3 +198,5 @@ def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path
     assert "live" not in scene("why-shadows.html", "v.npy", *lit)
     assert "live" not in scene("why-time.html", "v.npy", "--time-budget", "5")
     assert "live" not in scene("why-rgb.html", "rgb.npy", "--component", "color")
+    np.save(tmp_path / "many.npy", np.arange(512, dtype=np.uint16).reshape(8, 8, 8))
+    assert "live" not in scene("why-many.html", "many.npy", "--labels", "auto")

@@ -281,12 +281,12 @@ def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
 
 
 def live_labels(source: Source) -> tuple[Label, ...]:
-    """Return labels that Gaussians can belong to, invisible ones too; raise DataError for more than `MOST_LABELS`."""
+    """Return labels that Gaussians can belong to, invisible ones too; raise NoLiveForm for more than `MOST_LABELS`."""
     table = source.tf
     assert isinstance(table, LabelTable)
     found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
     if len(found) > MOST_LABELS:
-        raise DataError(f"{source.name}: {len(found)} labels; expected at most {MOST_LABELS} with --live")
+        raise NoLiveForm(f"{source.name}: {len(found)} labels; a live form has at most {MOST_LABELS}")
     return found
 
 
