@@ -52,7 +52,7 @@ class PreviousLook(WarmStart):
             with work.run.stage("earlier") as stage:
                 work.gaussians = as_stored(recolor_earlier(self.earlier, work.field))
                 stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
-            why = self._fitted(work, plan)
+            why = self._refine(work, plan)
         if why is None:
             plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         else:
@@ -79,7 +79,7 @@ class PreviousLook(WarmStart):
             raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         return None
 
-    def _fitted(self, work: Work, plan: Plan) -> str | None:
+    def _refine(self, work: Work, plan: Plan) -> str | None:
         """Refine the recoloured Gaussians; return the reason why they are not good enough, None if they are."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])

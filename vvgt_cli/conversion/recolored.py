@@ -270,7 +270,7 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
 
 
 def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:
-    """Return a table of labels, twice: as given and as used, which are the same."""
+    """Return the table of labels as given and as used, which are the same."""
     from vvgt_cli.look.label_files import read_labels
 
     wrong = ["--tf"] * (function.tf is not None) + ["--tf-range"] * (function.tf_range != "data")

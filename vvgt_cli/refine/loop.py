@@ -1,4 +1,4 @@
-"""The loop: a view a step, looks at the check views in between, the best kept.
+"""The loop: a view a step, scores on the check views in between, the best kept.
 
 `Densified` is 3DGS as it was published (Kerbl et al. 2023), for comparison: Gaussians are cloned, split and pruned on
 the way. There, of 30,000 steps, every 100th from the 500th to the 15,000th densifies; here the same shares of the run,
@@ -31,10 +31,10 @@ from vvgt_cli.splat import Projection, blend
 from vvgt_cli.splat.render import moments, screen_slopes
 
 SLOWER = 0.5  # rates after a fall
-LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
-SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
+SCORES = 8  # on the check views in a run, where that leaves enough steps between two
+SETTLING = 0.5  # share of the run from which on scores without gain count: rates fall only then
 NEAR, FORGOTTEN, LITTLE = 0.3, 0.9, 1e-3  # 1 - cosine between views that are near; what was seen, a step; among equals
-KEEP = 30.0  # seconds after which a run is kept, looks or not
+KEEP = 30.0  # seconds after which a run is kept, scored or not
 
 
 def run(
@@ -78,15 +78,15 @@ def run(
         expected = _expected(options, record.steps, course.elapsed)
         if progress:
             progress(record.steps, expected)
-        if record.steps >= course.looked + max(options.check_every, expected // LOOKS):
-            course.looked = record.steps
+        if record.steps >= course.scored + max(options.check_every, expected // SCORES):
+            course.scored = record.steps
             if judge.measure(time.perf_counter() - began, share >= SETTLING):
                 course.speed *= SLOWER
         elif time.perf_counter() < saved + KEEP:
             continue
         keep()
         saved = time.perf_counter()
-    keep()  # before the last look: a run that goes on from here would not have taken it
+    keep()  # before the last score: a run that goes on from here would not have it
     judge.measure(time.perf_counter() - began)
     result = judge.result(gaussians)
     record.seconds = spent + time.perf_counter() - entered
@@ -100,7 +100,7 @@ class _Course:
     error: float | None = None
     speed: float = 1.0
     elapsed: float = 0.0
-    looked: int = 0
+    scored: int = 0
 
 
 def _checkpoint(

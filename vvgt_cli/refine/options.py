@@ -45,8 +45,8 @@ class OptimizeOptions:
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.
         judge: by which the check views are drawn.
-        check_every: fewest steps between two looks at the check views, of which a run takes eight or so.
-        patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
+        check_every: fewest steps between two scores on the check views, of which a run takes eight or so.
+        patience: scores in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
         device: "cpu", or "cuda" for steps of the method "frame" there (`vvgt_cli.refine.on_device`).
@@ -102,7 +102,7 @@ class OptimizeRecord:
         seconds: wall time.
         reason: why it ended: "steps", "time", "target", "no gain", "interrupted".
         psnr_before, psnr_after: dB on the check views; None without any.
-        checks: (step, seconds, dB) of each look at the check views.
+        checks: (step, seconds, dB) of each score on the check views.
     """
 
     steps: int = 0

@@ -24,7 +24,7 @@ HARMONICS = 1.0, 1.1, 1.25, 1.4  # factors of the time with harmonics of degree 
 WIDER = 1.1  # factor of widths along surfaces: some steps undo the blur, while the lattice of cells stays hidden
 CHECK_EVERY = 25  # steps between checks where a target ends the run; else one check is in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis, in screen pixels, below which viewers drop or fade splats
-MOST = 0.99  # share of the Gaussians that usually remain where small ones are widened
+MIN_KEPT = 0.99  # share of the Gaussians that usually remain where small ones are widened
 REASONS = {
     "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no more gain",
     "interrupted": "interrupted",
@@ -87,7 +87,7 @@ class Refinement(Stage):
 def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
     """Apply `without_undrawn`; where that removes many, count the mass in the way that the check views prefer."""
     kept = without_undrawn(gaussians, work.fit.size)
-    if len(kept) >= MOST * len(gaussians):
+    if len(kept) >= MIN_KEPT * len(gaussians):
         return kept
     return max(kept, without_undrawn(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
 
