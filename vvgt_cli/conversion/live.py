@@ -25,7 +25,7 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
-from vvgt_cli.errors import DataError, NoLiveForm, NothingVisible, UsageError
+from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
