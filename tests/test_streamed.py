@@ -172,6 +172,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
     assert text in vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
+    assert "levels are of one volume" in vvgt.fails(2, "convert", volume, *FIT, "-o", tmp_path / "{}" / "lod-meta.json")
     assert not list(tmp_path.iterdir())
 
 

@@ -63,7 +63,8 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
         ),
         "levels are cuts of one closed form, refined on the CPU; remove it",
-    ),
+    )
+    | {"a file each": "levels are of one volume; convert the frames one by one"},
     NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
     ONE_FILE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
