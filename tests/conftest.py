@@ -3,8 +3,10 @@
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -19,6 +21,11 @@ SLOWEST = (
     *("conversion_plan", "previous_look", "split_labels", "dask", "field_rays", "volume_openfoam", "volume_grib"),
     *("check_splats", "clouds", "splat_backward", "closed_form_moments", "architecture", "peers", "threads"),
 )  # files' names, tens of seconds to ten
+
+places = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH")]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, places))  # of processes that tests start
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of them would compile every module again, for 0.3 s
+sys.dont_write_bytecode = False
 
 hypothesis.settings.register_profile("default", max_examples=40, deadline=None)
 hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)

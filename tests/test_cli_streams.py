@@ -16,19 +16,15 @@ from tests.headers import uncertified
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import read_ply
 
-ROOT = Path(__file__).parent.parent
 INIT = "init example:blob:8 --max-gaussians 20 --size 32"
 FULL = os.strerror(errno.ENOSPC)
 
 
 def shell(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
     """A line for bash, in which ``vvgt`` is this program."""
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     define = f'vvgt() {{ "{sys.executable}" -m vvgt_cli.cli.main "$@"; }}\n'
-    return subprocess.run(
-        ["bash", "-c", define + line], cwd=folder, env=os.environ | {"PYTHONPATH": paths} | more, capture_output=True,
-        text=True, timeout=900,
-    )  # fmt: skip
+    run = ["bash", "-c", define + line]
+    return subprocess.run(run, cwd=folder, env=os.environ | more, capture_output=True, text=True, timeout=900)
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-", "2>/dev/full", ">/dev/full"])

@@ -27,8 +27,7 @@ STEP = (
 
 def environment(folder, **more):
     own = {"NUMBA_CACHE_DIR": str(folder)} if folder else {}
-    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    return kept | {"PYTHONPATH": str(ROOT)} | own | more
+    return {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | own | more
 
 
 def python(*args, cwd=ROOT, code=0, **variables):
