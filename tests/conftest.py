@@ -11,7 +11,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from tests.spared import MARCH, spare
+from tests.spared import spare
 from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
@@ -76,16 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def small_conversions() -> None:
-    """Spare commands in this process what takes most of a small one's time; in others they do as users have it."""
+    """Spare commands in this process what takes most of a small one's time."""
     spare()
-
-
-@pytest.fixture(scope="module")
-def whole_march() -> Iterator[None]:
-    """March visibility as users have it, where files of this process are compared with those of another."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MARCH, 128)
-        yield
 
 
 @pytest.fixture(scope="session")

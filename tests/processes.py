@@ -5,7 +5,7 @@ import subprocess
 import sys
 from typing import Any
 
-VVGT = ("-m", "vvgt_cli.cli.main")
+VVGT = ("-m", "tests.spared")
 
 
 def start(*words: object, variables: dict[str, str] | None = None, **how: Any) -> subprocess.Popen:

@@ -1,8 +1,6 @@
-"""What small conversions in tests are spared; tests that compare with vvgt in a process of its own undo it."""
+"""What small conversions in tests are spared; `python -m tests.spared` stands in for `vvgt` in other processes."""
 
 from importlib import import_module
-
-MARCH = "vvgt_cli.closed_form.closed_form.MARCH_SIZE"
 
 
 def spare() -> None:
@@ -12,3 +10,8 @@ def spare() -> None:
     evaluate = import_module("vvgt_cli.commands.evaluate")
     evaluate.viewing_conditions = lambda size: [(size, 40.0), (size, 10.0)]
     import_module("vvgt_cli.closed_form.closed_form").MARCH_SIZE = 32
+
+
+if __name__ == "__main__":
+    spare()
+    import_module("vvgt_cli.cli.main").main()

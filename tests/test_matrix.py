@@ -80,7 +80,7 @@ ROWS = {
     "layers": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto")),
     "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
     "colours": ("rgb_0.tif", ()),
-    "colours, lit": ("rgb_0.tif", ("--light", "headlight", "--sh-degree", "3")),
+    "colours, lit": ("rgb_0.tif", ("--light", "headlight")),
     "channels": ("rgb_0.tif", ("--component", "all")),
     "a channel, few steps": ("rgb_0.tif", ("--component", "0", "--steps", "12")),
     "time, no steps": ("four.nii", ("--time", "1", "--tf", "tf.json", "--steps", "0")),
@@ -88,7 +88,10 @@ ROWS = {
     "mask, rule": ("scalars.nii", ("--tf", "tf.json", "--mask", "mask.nii", "--rule", "playcanvas")),
     "masked labels, unlit": ("labels.nii", ("--labels", "auto", "--mask", "mask.nii", "--light", "none")),
     "world": ("scalars.nii", ("--tf", "tf.json", "--target-psnr", "35", "--frame", "world", "--up", "superior")),
-    "wavelet, lit": ("scalars.nii", ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight")),
+    "wavelet, lit": (
+        "scalars.nii",
+        ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight", "--sh-degree", "3"),
+    ),
     "model, lit by the function": ("scalars.nii", ("--tf", "lit.json", "--model", "vvgt-small")),
 }
 

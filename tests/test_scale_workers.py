@@ -21,7 +21,6 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 
 SIZE = ("--blocks", "32")
-pytestmark = pytest.mark.usefixtures("whole_march")
 
 
 @pytest.fixture(scope="module")
