@@ -149,7 +149,7 @@ def test_csv_and_plots_of_a_report(scene_report):
     for name in FILES:
         image = read_png(folder / name)
         assert min(image.shape[:2]) > 300
-        assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
+        assert len(np.unique(image[::8, ::8].reshape(-1, image.shape[2]), axis=0)) > 20
 
 
 def test_nothing_is_overwritten_unasked(scene_report, vvgt):

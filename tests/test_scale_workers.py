@@ -161,7 +161,7 @@ def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
         if workers and parts and not killed:
             os.kill(workers[0], signal.SIGKILL)
             killed += 1
-        time.sleep(0.01)
+        time.sleep(0.05)
     assert run.wait(10) == 0, run.stderr.read()
     assert killed == 1
     assert (tmp_path / "two.ply").read_bytes() == alone
@@ -193,7 +193,7 @@ def test_a_killed_worker_of_dask_costs_nothing_but_time(raw, alone, tmp_path):
         if len(workers) > 1 and not killed and list(tmp_path.glob(".two.ply.blocks/counts/*.npz")):
             os.kill(workers[-1], signal.SIGKILL)
             killed += 1
-        time.sleep(0.01)
+        time.sleep(0.05)
     said = run.communicate(timeout=60)[1]
     assert run.returncode == 0, said
     assert killed == 1
