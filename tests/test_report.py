@@ -103,7 +103,8 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
     assert found["machine"]["cpu"]
 
 
-def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
+def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.commands.report.warm_up", lambda *_: None)
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err
