@@ -48,7 +48,7 @@ def test_a_name_with_the_wrong_content_is_one_clear_line(tmp_path: Path, suffix:
     refused(VvgtError, r"expected|no field|has no ElementDataFile|unknown layout", read_volume, str(path))
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     head=st.sampled_from(HEADS),
     edits=st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=4)), max_size=4),
