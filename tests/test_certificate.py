@@ -58,7 +58,7 @@ def made(folder):
 
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
-    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--json", *more)
+    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--step", "1", "--json", *more)
     return json.loads(vvgt.ok("evaluate", ply, "--volume", folder / volume, *how).out)["certificate"]
 
 
