@@ -16,11 +16,10 @@ from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
 SLOWEST = (
-    *("matrix", "docs_run", "stiff", "benchmarks", "jit", "fuzz", "stiff_equivalence", "volume_vtk_family", "report"),
-    *("scale_workers", "slurm", "cli_streams", "previous_frame", "closed_form", "certificate", "cli_convert"),
-    *("conversion_plan", "previous_look", "split_labels", "dask", "field_rays", "volume_openfoam", "volume_grib"),
-    *("check_splats", "clouds", "splat_backward", "closed_form_moments", "architecture", "peers", "threads"),
-)  # files' names, tens of seconds to ten
+    *("matrix", "jit", "docs_run", "benchmarks", "scale_workers", "stiff", "stiff_equivalence", "volume_vtk_family"),
+    *("certificate", "report", "previous_frame", "cli_streams", "page_slices", "field_rays", "splat_backward", "fuzz"),
+    *("nodes", "conversion_plan", "dask", "layers", "previous_look", "cli_convert", "volume_grib", "closed_form"),
+)  # files' names, a minute to ten seconds of processor
 
 places = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH")]
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, places))  # of processes that tests start
