@@ -3,22 +3,28 @@
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import hypothesis
 import pytest
 
-from tests.spared import MARCH, spare
+from tests.spared import spare
 from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
 SLOWEST = (
-    *("matrix", "docs_run", "stiff", "benchmarks", "jit", "fuzz", "stiff_equivalence", "volume_vtk_family", "report"),
-    *("scale_workers", "slurm", "cli_streams", "previous_frame", "closed_form", "certificate", "cli_convert"),
-    *("conversion_plan", "previous_look", "split_labels", "dask", "field_rays", "volume_openfoam", "volume_grib"),
-    *("check_splats", "clouds", "splat_backward", "closed_form_moments", "architecture", "peers", "threads"),
-)  # files' names, tens of seconds to ten
+    *("matrix", "jit", "docs_run", "benchmarks", "scale_workers", "stiff", "stiff_equivalence", "volume_vtk_family"),
+    *("certificate", "report", "previous_frame", "cli_streams", "page_slices", "field_rays", "splat_backward", "fuzz"),
+    *("nodes", "conversion_plan", "dask", "layers", "previous_look", "cli_convert", "volume_grib", "closed_form"),
+)  # files' names, a minute to ten seconds of processor
+
+places = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH")]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, places))  # of processes that tests start
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of them would compile every module again, for 0.3 s
+sys.dont_write_bytecode = False
 
 hypothesis.settings.register_profile("default", max_examples=40, deadline=None)
 hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)
@@ -69,16 +75,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def small_conversions() -> None:
-    """Spare commands in this process what takes most of a small one's time; in others they do as users have it."""
+    """Spare commands in this process what takes most of a small one's time."""
     spare()
-
-
-@pytest.fixture(scope="module")
-def whole_march() -> Iterator[None]:
-    """March visibility as users have it, where files of this process are compared with those of another."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MARCH, 128)
-        yield
 
 
 @pytest.fixture(scope="session")

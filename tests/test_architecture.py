@@ -1,12 +1,11 @@
 """The rules of the house: import order of the rooms, sizes of files and functions, where heavy imports sit."""
 
 import ast
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
+from tests.processes import python
 from vvgt_cli.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
@@ -225,8 +224,7 @@ def test_nothing_below_the_commands_prints_exits_or_handles_signals(path):
 def loaded(*code: str) -> set[str]:
     """Top-level packages in a fresh interpreter after running the lines."""
     lines = [*code, "import sys", "print(' '.join(sorted({m.split('.')[0] for m in sys.modules})))"]
-    run = subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=ROOT, capture_output=True, text=True, check=True)
-    return set(run.stdout.splitlines()[-1].split())
+    return set(python("-c", "\n".join(lines))[0].splitlines()[-1].split())
 
 
 def test_help_loads_click_and_nothing_heavier():

@@ -36,7 +36,6 @@ def test_none_is_left_out():
 def bench(monkeypatch):
     """Import a benchmark, with pictures of `SIZE` px and what else is given in place of its constants."""
     monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
     def small_views(name, count=None, size=None):
         return default_views(name, count, size=SIZE)

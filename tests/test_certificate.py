@@ -58,7 +58,7 @@ def made(folder):
 
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
-    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--json", *more)
+    how = (*RAW, "--tf", folder / tf, "--no-conditions", "--step", "1", "--json", *more)
     return json.loads(vvgt.ok("evaluate", ply, "--volume", folder / volume, *how).out)["certificate"]
 
 
@@ -264,19 +264,19 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
 
     points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 60, "opacity": 1, "rgb": [1, 0.9, 0.8]}]
     (tmp_path / "solid.json").write_text(json.dumps({"points": points}))
-    solid = (folder / "ball.raw", *RAW, "--tf", tmp_path / "solid.json", "--max-gaussians", "1500", "--steps", "4")
-    vvgt.ok("convert", *solid, "--size", "256", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json")
+    solid = (folder / "ball.raw", *RAW, "--tf", tmp_path / "solid.json", "--max-gaussians", "1500", "--steps", "0")
+    vvgt.ok("convert", *solid, "--size", "192", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json")
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
-    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(256)
-    assert [(c.width, c.height) for c in cameras] == [(85, 85)]
-    found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
+    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(192)
+    assert [(c.width, c.height) for c in cameras] == [(64, 64)]
+    found = score_texture(source.scene(), boxed, 192, header.rule, cameras=cameras)
     assert found.blocks >= 4
     assert header.certificate.texture == pytest.approx((found.ours, found.reference), abs=1e-3)
     assert json.loads((tmp_path / "r.json").read_text())["texture"]["blocks"] == found.blocks
     assert f"texture {header.certificate.texture[0]:g}" in vvgt("info", tmp_path / "out.ply").out.decode()
-    vvgt.ok("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
+    vvgt.ok("convert", *solid, "--size", "192", "--blocks", "16", "-o", tmp_path / "blocks.ply")
     assert read_ply(tmp_path / "blocks.ply")[1].certificate.texture[1] == pytest.approx(found.reference, abs=0.01)
     small = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     vvgt.ok("convert", *small, "--size", "48", "-o", tmp_path / "small.ply")

@@ -145,7 +145,9 @@ def test_a_mirrored_file_is_found_by_the_command(vvgt, made, scene, tmp_path):
     assert "with axes -x y z, a mirror image" in names["place: axes swapped or mirrored"]["what"]
 
 
-def test_the_check_recognises_world_coordinates_without_a_header(vvgt, made, scene, tmp_path):
+def test_the_check_recognises_world_coordinates_without_a_header(vvgt, made, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.commands.check_splats.SIZE", 128)
+
     def moved(columns):
         return replace(columns, means=columns.means * EDGE / 2 + EDGE / 2 - 0.5,
                        log_scales=columns.log_scales + np.log(EDGE / 2), comments=())  # fmt: skip

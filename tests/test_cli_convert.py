@@ -2,14 +2,12 @@
 
 import io
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.processes import VVGT, python
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.gaussians import in_unit_frame, read_ply
 from vvgt_cli.images import read_exr, read_png
@@ -38,16 +36,9 @@ def converted(tmp_path_factory):
     """One conversion with every output, and its standard error."""
     folder = tmp_path_factory.mktemp("converted")
     args = ["convert", SOURCE, *SMALL, "-o", "a.ply", "--report", "a.json", "--preview", "a.png"]
-    done = run_python(args, folder)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == b""
-    return folder, done.stderr.decode()
-
-
-def run_python(args, folder, stdin=None):
-    command = [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, args)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    return subprocess.run(command, cwd=folder, input=stdin, capture_output=True, env=environment, check=False)
+    out, talk = python(*VVGT, *args, cwd=folder)
+    assert out == ""
+    return folder, talk
 
 
 def test_convert_leaves_file_report_and_preview(converted):
@@ -92,9 +83,8 @@ def test_the_report_page_names_every_field(converted):
 
 
 def test_the_same_command_gives_the_same_bytes_on_standard_output_too(converted):
-    again = run_python(["convert", SOURCE, *SMALL, "-o", "-", "-q"], converted[0])
-    assert (again.returncode, again.stderr) == (0, b"")
-    assert again.stdout == (converted[0] / "a.ply").read_bytes()
+    again = python(*VVGT, "convert", SOURCE, *SMALL, "-o", "-", "-q", cwd=converted[0], text=False)
+    assert again == ((converted[0] / "a.ply").read_bytes(), b"")
 
 
 def test_report_to_standard_output(folder, vvgt):
@@ -154,13 +144,11 @@ def test_render_writes_views_that_render_again(converted, folder, vvgt):
 def test_pipes(folder, vvgt):
     values = (np.indices((12, 12, 12)).sum(axis=0) * 7).astype(np.uint8)
     options = ["--dims", 12, 12, 12, "--dtype", "uint8", *SMALL, "-o", "-", "-q"]
-    made = run_python(["init", "-", *options], folder, values.tobytes())
-    assert made.returncode == 0, made.stderr
-    count = len(read_ply(io.BytesIO(made.stdout))[0])
-    facts = run_python(["info", "-", "--json"], folder, made.stdout)
-    assert json.loads(facts.stdout)["gaussians"] == count
-    drawn = run_python(["render", "-", "--orbit", 1, "--size", 20, "-o", "d"], folder, made.stdout)
-    assert drawn.returncode == 0, drawn.stderr
+    made, _ = python(*VVGT, "init", "-", *options, given=values.tobytes(), text=False)
+    count = len(read_ply(io.BytesIO(made))[0])
+    facts, _ = python(*VVGT, "info", "-", "--json", given=made, text=False)
+    assert json.loads(facts)["gaussians"] == count
+    python(*VVGT, "render", "-", "--orbit", 1, "--size", 20, "-o", "d", given=made, text=False)
     assert Path("d/orbit_000.png").exists()
 
 

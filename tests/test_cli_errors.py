@@ -2,19 +2,17 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.processes import python
 from vvgt_cli import __version__
 from vvgt_cli.cli import main
 from vvgt_cli.cli.options import THREAD_VARIABLES, default_threads
 from vvgt_cli.errors import DataError
 
-ROOT = Path(__file__).parent.parent
 RAW = ("--dims", 8, 8, 8, "--dtype", "uint8")
 
 
@@ -208,12 +206,9 @@ def test_a_closed_pipe_is_quiet(folder):
     code = "import sys; from vvgt_cli.cli.main import run; sys.exit(run(['info', 'example:blob:8']))"
     reader, writer = os.pipe()
     os.close(reader)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(
-        [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, env=environment, check=False
-    )
+    _, told = python("-c", code, stdout=writer, code=141)
     os.close(writer)
-    assert (done.returncode, done.stderr) == (141, b"")
+    assert told == ""
 
 
 def test_threads_come_from_the_environment(monkeypatch):
@@ -237,8 +232,7 @@ def test_threads_reach_numba_before_it_is_imported():
             "print('threads', numba.get_num_threads())",
         ]
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "threads 1"
+    assert python("-c", code)[0].splitlines()[-1] == "threads 1"
 
 
 def test_termination_removes_the_temporary_file(folder):
@@ -256,8 +250,6 @@ def test_termination_removes_the_temporary_file(folder):
             "main.main()",
         ]
     )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     before = sorted(folder.iterdir())
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=False)
-    assert done.returncode == 143
+    python("-c", code, code=143)
     assert sorted(folder.iterdir()) == before

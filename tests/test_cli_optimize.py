@@ -1,17 +1,15 @@
 """`vvgt optimize`: nearer to the views, never worse, stopped by budgets and by Ctrl-C with a valid file."""
 
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.processes import start
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.cli.main import run
 from vvgt_cli.commands.optimize import load_sets
@@ -19,7 +17,6 @@ from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images import write_exr
 
 SCENE = ("example:blob:16", "--tf", "viridis")
-ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module")
@@ -150,10 +147,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(case, folder, tmp_path, monk
 def test_ctrl_c_writes_what_there_is(folder, tmp_path):
     code = "import sys; from vvgt_cli.cli.main import main; main()"
     args = [folder / "in.ply", "--views", folder / "views", "--steps", 10**7, "-o", tmp_path / "out.ply"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    child = subprocess.Popen(
-        [sys.executable, "-c", code, "optimize", *map(str, args)], stderr=subprocess.PIPE, env=environment, text=True
-    )
+    child = start("-c", code, "optimize", *args)
     said = [child.stderr.readline(), child.stderr.readline()]  # read, views: the descent begins
     assert said[1].startswith("views"), said
     time.sleep(5)  # kernels are loaded, on a busy machine too

@@ -3,13 +3,12 @@
 import os
 import resource
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.processes import start
+
 # A march of so many rays that it takes minutes, in one kernel, while a file is being written.
 LONG = """
 import signal, sys, threading
@@ -85,19 +84,11 @@ os._exit(0)
 """
 
 
-def start(code: str, folder: Path, *args: str) -> subprocess.Popen[str]:
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *args], cwd=folder, env=os.environ | {"PYTHONPATH": paths}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-
-
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processor time of a child is in /proc")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_kernel_that_runs_for_minutes_is_ended_within_seconds(name, tmp_path):
     number = getattr(signal, name)
-    child = start(LONG, tmp_path, "init", "example:blob:16", "--max-gaussians", "20", "-q", "-o", "a.ply")
+    child = start("-c", LONG, "init", "example:blob:16", "--max-gaussians", "20", "-q", "-o", "a.ply", cwd=tmp_path)
     assert child.stdout.readline() == "in the kernel\n", child.communicate()
     before = sum(map(int, Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()[11:15]))
     ended = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
@@ -110,7 +101,7 @@ def test_a_kernel_that_runs_for_minutes_is_ended_within_seconds(name, tmp_path):
 
 
 def test_a_hangup_that_is_ignored_stays_so(tmp_path):
-    child = start(ALONE, tmp_path)
+    child = start("-c", ALONE, cwd=tmp_path)
     out, told = child.communicate()
     assert (child.returncode, out, told) == (128 + signal.SIGTERM, "alive\n", "")
 
@@ -118,7 +109,7 @@ def test_a_hangup_that_is_ignored_stays_so(tmp_path):
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_no_kernel_that_is_being_called_swallows_a_signal(name, tmp_path):
     number = getattr(signal, name)
-    out, told = start(OFTEN, tmp_path, name).communicate(timeout=120)
+    out, told = start("-c", OFTEN, name, cwd=tmp_path).communicate(timeout=120)
     status, line = (130, "interrupted") if name == "SIGINT" else (128 + number, f"ended by {name}")
     assert out.split() == 200 * [str(status)], told[-2000:]
     assert told.splitlines() == 200 * [f"vvgt: error: {line}"]

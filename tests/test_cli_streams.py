@@ -16,19 +16,18 @@ from tests.headers import uncertified
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import read_ply
 
-ROOT = Path(__file__).parent.parent
 INIT = "init example:blob:8 --max-gaussians 20 --size 32"
 FULL = os.strerror(errno.ENOSPC)
 
 
 def shell(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    """A line for bash, in which ``vvgt`` is this program."""
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    define = f'vvgt() {{ "{sys.executable}" -m vvgt_cli.cli.main "$@"; }}\n'
-    return subprocess.run(
-        ["bash", "-c", define + line], cwd=folder, env=os.environ | {"PYTHONPATH": paths} | more, capture_output=True,
-        text=True, timeout=900,
-    )  # fmt: skip
+    """A line for bash, in which ``vvgt`` is this program, and ``small`` as well, for small conversions."""
+    define = "".join(
+        f'{name}() {{ "{sys.executable}" -m {module} "$@"; }}\n'
+        for name, module in (("vvgt", "vvgt_cli.cli.main"), ("small", "tests.spared"))
+    )
+    run = ["bash", "-c", define + line]
+    return subprocess.run(run, cwd=folder, env=os.environ | more, capture_output=True, text=True, timeout=900)
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-", "2>/dev/full", ">/dev/full"])
@@ -68,13 +67,13 @@ MAKE = "--max-gaussians 50 --size 32 --steps 2 -q"
 
 
 def test_volumes_functions_and_outputs_through_pipes(head):
-    plain = shell(f"vvgt convert head.npy --tf tf.json {MAKE} -o a.ply", head)
+    plain = shell(f"small convert head.npy --tf tf.json {MAKE} -o a.ply", head)
     assert plain.returncode == 0, plain.stderr
     for i, line in enumerate(
         (
-            f"vvgt convert <(gunzip -c head.npy.gz) --tf <(cat tf.json) {MAKE} -o >(cat > b0.ply) && sleep 0.3",
-            f"gunzip -c head.npy.gz | vvgt convert /dev/stdin --tf tf.json {MAKE} -o /dev/stdout > b1.ply",
-            f"mkfifo out.ply; cat out.ply > b2.ply & vvgt convert head.npy --tf tf.json {MAKE} -o out.ply && wait",
+            f"small convert <(gunzip -c head.npy.gz) --tf <(cat tf.json) {MAKE} -o >(cat > b0.ply) && sleep 0.3",
+            f"gunzip -c head.npy.gz | small convert /dev/stdin --tf tf.json {MAKE} -o /dev/stdout > b1.ply",
+            f"mkfifo out.ply; cat out.ply > b2.ply & small convert head.npy --tf tf.json {MAKE} -o out.ply && wait",
         )
     ):
         done = shell(line, head)

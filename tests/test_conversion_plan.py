@@ -126,18 +126,18 @@ def test_refinement_on_small_views_gains_on_whole_ones(tmp_path):
 
 
 def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
-    report = done(tmp_path, FitOptions(600, 800, steps=48))
-    assert report.refinement["dilation"] == pytest.approx(DILATION / 16)
+    report = done(tmp_path, FitOptions(600, 600, steps=48))
+    assert report.refinement["dilation"] == pytest.approx(DILATION / 9)
     stages = {stage.name: stage for stage in report.stages}
     assert stages["views"].note.startswith("24 of 200 px")
     assert "blocks" in stages["check views"].note
     header = read_ply(tmp_path / "a.ply")[1]
-    assert (header.made_for, header.rule) == (800, "inria")
-    other = done(tmp_path, FitOptions(600, 800, steps=48, rule="playcanvas"), overwrite=True)
+    assert (header.made_for, header.rule) == (600, "inria")
+    other = done(tmp_path, FitOptions(600, 600, steps=48, rule="playcanvas"), overwrite=True)
     by = {(condition["rule"], condition["size"]): condition["psnr"] for condition in report.conditions}
     assert {(condition["rule"], condition["size"]): condition["psnr"] for condition in other.conditions}[
-        "playcanvas", 800
-    ] > by["playcanvas", 800]
+        "playcanvas", 600
+    ] > by["playcanvas", 600]
     assert report.conditions == sorted(report.conditions, key=lambda condition: condition["psnr"])
     assert len(by) == 10
 

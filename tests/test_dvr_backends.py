@@ -52,7 +52,7 @@ def test_a_machine_without_opengl_is_told_so(monkeypatch):
 VTK_VIEWS = """
 import sys
 import numpy as np
-from test_dvr_backends import FINE, decentred, scene, view
+from tests.test_dvr_backends import FINE, decentred, scene, view
 from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.look.lighting import Lighting
 draw, lit = (view_renderer("vtk", made, FINE) for made in (scene(), scene().lit(Lighting())))

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes import start
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.runners import IDLE, Processes
 
-ROOT = Path(__file__).parent.parent
 MINUTE = 60.0
 posix = pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
 
@@ -96,10 +96,7 @@ def started(folder: Path, within: str) -> subprocess.Popen[str]:
     lines += f"if __name__ == '__main__':\n    folder = Path({str(folder)!r})\n    with Processes(2, 2) as runner:\n"
     file = folder.with_suffix(".py")
     file.write_text(lines + "".join(f"        {line}\n" for line in within.splitlines()))
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        [sys.executable, str(file)], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    return start(file, start_new_session=True)
 
 
 def there(file: Path) -> None:

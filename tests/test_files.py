@@ -4,27 +4,22 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from tests.processes import start
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, check_disk_space, claim
 from vvgt_cli.gaussians import read_ply
 
-ROOT = Path(__file__).parent.parent
 INIT = ("init", "example:blob:8", "--max-gaussians", "20", "--size", "32")
 
 
 def process(code: str, folder: Path, *args: object) -> subprocess.Popen[str]:
     """Python in a process of its own; it says a line once it is where it should be."""
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, args)], cwd=folder, env=os.environ | {"PYTHONPATH": paths}, text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    return start("-c", code, *args, cwd=folder, stdin=subprocess.PIPE)
 
 
 HOLD = "from vvgt_cli.files import claim\nwith claim('a.ply'):\n    print('held', flush=True)\n    input()\n"

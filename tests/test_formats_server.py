@@ -3,12 +3,10 @@
 import gzip
 import http.client
 import json
-import os
 import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,12 +16,11 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from tests.processes import start
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.commands.view import expanded
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-
-ROOT = Path(__file__).parent.parent
 
 
 def cloud(count: int = 20, shift: float = 0.0) -> Gaussians:
@@ -146,10 +143,7 @@ def shown(*args: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], str
     """`vvgt view`, and its address."""
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "from vvgt_cli.cli.main import main; main()"
-    child = subprocess.Popen(
-        [sys.executable, "-c", code, "view", "--no-browser", *args], cwd=folder, text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    child = start("-c", code, "view", "--no-browser", *args, cwd=folder)
     try:
         yield child, child.stdout.readline().strip()
     finally:

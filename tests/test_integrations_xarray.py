@@ -1,13 +1,11 @@
 """The accessor of xarray: what `vvgt_cli.convert` does, on the array; registered by an import alone."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 import vvgt_cli
 import vvgt_cli.integrations.xarray
+from tests.processes import python
 
 xarray = pytest.importorskip("xarray")
 
@@ -52,5 +50,4 @@ def test_arrays_of_dask_are_never_read_as_a_whole() -> None:
 
 def test_the_library_alone_registers_nothing() -> None:
     code = "import numpy, xarray, vvgt_cli; vvgt_cli.convert; print(hasattr(xarray.DataArray(numpy.zeros(3)), 'vvgt'))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    assert python("-c", code)[0].strip() == "False"

@@ -27,8 +27,7 @@ STEP = (
 
 def environment(folder, **more):
     own = {"NUMBA_CACHE_DIR": str(folder)} if folder else {}
-    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    return kept | {"PYTHONPATH": str(ROOT)} | own | more
+    return {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | own | more
 
 
 def python(*args, cwd=ROOT, code=0, **variables):
@@ -40,7 +39,7 @@ def python(*args, cwd=ROOT, code=0, **variables):
 
 
 def command(*args, cwd, **variables):
-    return python("-m", "vvgt_cli.cli.main", *map(str, args), cwd=cwd, **variables)
+    return python("-m", "tests.spared", *map(str, args), cwd=cwd, **variables)
 
 
 def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
@@ -133,6 +132,7 @@ def test_warmup_without_a_place_is_an_error(tmp_path):
 
 SPY = """
 import importlib, json, os, sys
+from tests.spared import spare
 from vvgt_cli.cli.main import run
 from vvgt_cli.jit import ahead, compile
 from vvgt_cli.jit.cache import KernelCache
@@ -143,6 +143,7 @@ def spy(self, sig, context):
     (asked if tuple(getattr(sig, "args", sig)) in usual else odd).add(name)
     return inner(self, sig, context)
 KernelCache.load_overload = spy
+spare()
 for name in ahead.ALL:
     importlib.import_module(name.split(":")[0])
 for line in sys.stdin:

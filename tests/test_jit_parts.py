@@ -1,15 +1,12 @@
 """Loops that threads share: every turn once, the same numbers on any number of threads, failures said."""
 
-import os
-import subprocess
-import sys
-
 import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.processes import python
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 from vvgt_cli.refine.steps import adam
@@ -105,6 +102,5 @@ def test_numbers_do_not_depend_on_the_threading_layer(layer):
         "    assert (out == np.sqrt(values)).all()\n"
         "print(numba.threading_layer())"
     )
-    env = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "3"}
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], env=env, capture_output=True, text=True)
-    assert (done.stdout.strip(), done.returncode) == (layer, 0), done.stderr
+    how = {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "3"}
+    assert python("-W", "ignore", "-c", code, variables=how)[0].strip() == layer

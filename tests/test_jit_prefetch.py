@@ -1,12 +1,9 @@
 """Memory that is asked for ahead of time: an instruction, and no other effect."""
 
-import os
-import subprocess
-import sys
-
 import numba as nb
 import numpy as np
 
+from tests.processes import python
 from vvgt_cli.splat.buffer import prefetch
 
 
@@ -28,7 +25,4 @@ def test_a_line_is_asked_for_and_nothing_else_changes():
 
 def test_in_plain_python_nothing_is_asked_for():
     call = "from vvgt_cli.splat.buffer import prefetch; print(prefetch(None, 0, 0))"
-    done = subprocess.run(
-        [sys.executable, "-c", call], env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True
-    )
-    assert (done.stdout.strip(), done.stderr) == ("None", "")
+    assert python("-c", call, variables={"NUMBA_DISABLE_JIT": "1"}) == ("None\n", "")

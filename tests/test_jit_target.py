@@ -1,13 +1,8 @@
 """What machine kernels are compiled for, and who may call them."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.processes import python
 
 
 def test_helpers_are_not_called_from_python():
@@ -38,9 +33,6 @@ def test_a_worker_compiles_by_those_features(tmp_path):
         "from numba.core.registry import cpu_target; cpu_target.target_context.codegen()\n"
         "print(*(found.count(',-avx512vbmi2') for found in asked))"
     )
-    run = [sys.executable, "-c", code]
-    done = subprocess.run(run, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    counts = done.stdout.split()
+    counts = python("-c", code, cwd=tmp_path)[0].split()
     assert counts, "numba asked for no machine"
     assert min(map(int, counts)) >= 1

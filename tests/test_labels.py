@@ -358,7 +358,7 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     again = table(
         tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
     )
-    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 0.5, "-q")
+    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 2, "--size", 24, "-q")
     for options, others in (
         (("--labels", labels), False),
         (("--labels", again), False),  # other names, and a label that the volume has not got

@@ -114,7 +114,8 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
     refused(UsageError, "--keep-largest nan: expected a finite", ReadOptions, keep_largest=float("nan"))
     whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
     assert whole.gaussians.means[:, 0].max() < 0.2
-    runs = {"a": (), "b": ("--blocks", 16), "c": ("--blocks", 16, "--workers", 2), "live": ("--live",)}
+    few, blocks = ("--steps", 0), ("--blocks", 16)
+    runs = {"a": few, "b": (*few, *blocks), "c": (*few, *blocks, "--workers", 2), "live": ("--live",)}
     for name, more in runs.items():
         given = ("--tf", "gray:0.9,1", "--keep-largest", -300, "--max-gaussians", 200, "--size", 40, *more)
         with pytest.warns(UserWarning, match=r"hides 40\.7 % of the voxels above it") as notes:

@@ -4,8 +4,6 @@ import doctest
 import html
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import nibabel
@@ -17,6 +15,7 @@ import xarray
 
 import vvgt_cli as vvgt
 from tests.headers import uncertified
+from tests.processes import python
 from tests.refused import refused
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
@@ -233,9 +232,8 @@ def test_the_examples_in_docstrings_run(module):
 def test_importing_costs_nothing_and_is_quiet():
     code = "import sys, vvgt_cli as vvgt; print(len({m for m in sys.modules if m.startswith(('numpy', 'numba'))}))"
     code += "; vvgt.convert; print('convert' in dir(vvgt))"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.split() == ["0", "True"]
-    assert run.stderr == ""
+    out, err = python("-c", code)
+    assert (out.split(), err) == (["0", "True"], "")
     assert (ROOT / "vvgt_cli" / "py.typed").exists()
     with pytest.raises(AttributeError, match="nothing_like_it"):
         _ = vvgt.nothing_like_it

@@ -15,7 +15,7 @@ SLANTED = (0.6, -0.48, 0.64)
 BY_VTK = """
 import sys
 import numpy as np
-from test_light_vtk import both, long_box, STEP, by_cpu_mapper, distant
+from tests.test_light_vtk import both, long_box, STEP, by_cpu_mapper, distant
 from vvgt_cli.dvr.vtk import view_renderer
 found = {}
 for name in ("stretched", "mended"):

@@ -209,7 +209,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     np.testing.assert_allclose(found.colors, np.tile([1, 0, 0], (len(found), 1)), atol=1e-6)
     scores = []
     for file in (label_file, tmp_path / "a.ply"):
-        shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", *look)
+        shown = ("evaluate", file, "--step", 1, "--volume", label_file.parent / "map_label.npy", *look)
         scores.append(json.loads(vvgt(*shown, "--json", "--no-conditions").out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
     assert scores[0] > 18

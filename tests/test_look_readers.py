@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.refused import refused
@@ -237,7 +237,6 @@ JSON_VALUES = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
 @given(key=st.sampled_from([*PRESET, *MINIMAL, "range"]), value=JSON_VALUES, base=st.sampled_from([PRESET, MINIMAL]))
 def test_any_field_may_hold_anything(tmp_path_factory, key, value, base):
     path = tmp_path_factory.mktemp("tf") / "a.json"
@@ -251,7 +250,6 @@ def test_any_field_may_hold_anything(tmp_path_factory, key, value, base):
     assert ((opacity >= 0) & (opacity <= 1)).all()
 
 
-@settings(max_examples=200, deadline=None)
 @given(data=st.binary(max_size=60))
 def test_any_bytes_are_read_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("tf") / "a.json"

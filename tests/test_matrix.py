@@ -74,11 +74,9 @@ ROWS = {
     "function": ("scalars.nii", ("--tf", "tf.json")),
     "no function": ("scalars.nii", ()),
     "directions": ("scalars.nii", ("--tf", "tf.json", "--light", "1,1,2", "--light", "left")),
-    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows")),
-    "occlusion": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight", "--ambient-occlusion", "0.3")),
-    "labels": ("labels.nii", ("--labels", "auto")),
+    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows", "--ambient-occlusion", "0.3")),
+    "labels": ("labels.nii", ("--labels", "auto")),  # lit by default
     "recognised labels, uniform": ("labels.nii", ("--init", "uniform")),
-    "labels, lit": ("labels.nii", ("--labels", "auto", "--light", "headlight")),
     "layers": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto")),
     "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
     "colours": ("rgb_0.tif", ()),
@@ -88,11 +86,13 @@ ROWS = {
     "time, no steps": ("four.nii", ("--time", "1", "--tf", "tf.json", "--steps", "0")),
     "crop, size": ("scalars.nii", ("--tf", "tf.json", "--crop", "3:28,:,2:", "--max-size", "0.05")),
     "mask, rule": ("scalars.nii", ("--tf", "tf.json", "--mask", "mask.nii", "--rule", "playcanvas")),
-    "masked labels": ("labels.nii", ("--labels", "auto", "--mask", "mask.nii")),
+    "masked labels, unlit": ("labels.nii", ("--labels", "auto", "--mask", "mask.nii", "--light", "none")),
     "world": ("scalars.nii", ("--tf", "tf.json", "--target-psnr", "35", "--frame", "world", "--up", "superior")),
-    "wavelet, lit": ("scalars.nii", ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight")),
+    "wavelet, lit": (
+        "scalars.nii",
+        ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight", "--sh-degree", "3"),
+    ),
     "model, lit by the function": ("scalars.nii", ("--tf", "lit.json", "--model", "vvgt-small")),
-    "harmonics": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight", "--sh-degree", "3")),
 }
 
 
@@ -143,7 +143,7 @@ def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, 
     assert memory["texture"] == pytest.approx(blocks["texture"], abs=0.05, nan_ok=True)
 
 
-FEW = ("function", "shadows", "labels, lit", "layers, lit", "colours", "masked labels", "wavelet, lit")
+FEW = ("function", "shadows", "labels", "layers, lit", "colours", "masked labels, unlit", "wavelet, lit")
 
 
 @pytest.mark.parametrize("row", [row if row in FEW else pytest.param(row, marks=pytest.mark.long) for row in ROWS])
@@ -211,13 +211,12 @@ class TestEitherWay:
         vvgt.ok("convert", "four.nii", "--tf", "tf.json", *FEWEST, *blocks, "-o", tmp_path / "x.html")
         assert [path.name for path in tmp_path.iterdir()] == ["x.html"]
 
-    @pytest.mark.parametrize("light", [(), ("--light", "headlight")], ids=["unlit", "lit"])
-    def test_labels_one_by_one(self, vvgt, at, tmp_path, blocks, light):
-        vvgt.ok("convert", "labels.nii", "--split-labels", *light, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
+    def test_labels_one_by_one(self, vvgt, at, tmp_path, blocks):
+        vvgt.ok("convert", "labels.nii", "--split-labels", *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
         index = json.loads((tmp_path / "x_index.json").read_text())
         assert [row["label"] for row in index["files"]] == [1, 2, 3]
 
-    @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours", "layers", "wavelet, lit"])
+    @pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours", "layers", "wavelet, lit"])
     def test_the_closed_form_alone(self, vvgt, at, tmp_path, blocks, row):
         volume, options = ROWS[row]
         fit = FEWEST[:4]
@@ -233,14 +232,14 @@ class TestEitherWay:
         lit, plain = (vvgt_cli.read_ply(tmp_path / name / "lod-meta.json")[0] for name in "yz")
         assert np.abs(lit.colors.mean(axis=0) - plain.colors.mean(axis=0)).max() > 0.05
 
-    @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
+    @pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
         volume, options = ROWS[row]
         vvgt.ok("render-views", volume, *options, *blocks, "--views 3 --test-views 1 --size 48 -o", tmp_path / "views")
         assert [path.name for path in tmp_path.iterdir()] == ["views"]
 
 
-@pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
+@pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours"])
 def test_pictures_of_blocks_are_those_of_memory(vvgt, at, tmp_path, row):
     volume, options = ROWS[row]
     for name, blocks in (("memory", ()), ("blocks", BLOCKS)):

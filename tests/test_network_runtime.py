@@ -1,8 +1,6 @@
 """The runtime without torch: what it feeds, parts, threads, and models that are not what they must be."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 from network_models import TINY, as_rows, scene
 from onnx_models import geometry_graph, write_card, write_model
 
+from tests.processes import python
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network import runtime
@@ -182,13 +181,10 @@ def test_running_a_model_imports_no_torch(folder):
     code = f"""
 import sys
 sys.modules["torch"] = None  # importing it would raise
-sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
-from network_models import scene
+from tests.network_models import scene
 from vvgt_cli.network.runtime import Model
 print(len(Model.open(Path({str(folder)!r})).improve(*scene())))
 assert not any(name.split(".")[0] in ("torch", "onnx", "onnxscript") for name in sys.modules if sys.modules[name])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "60"
+    assert python("-c", code)[0].strip() == "60"

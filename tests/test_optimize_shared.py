@@ -1,15 +1,12 @@
 """Steps in common: what is known of Gaussians, the regression on it, and the kernel against a twin in float64."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from random_clouds import random_cloud
 
+from tests.processes import python
+from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import OptimizeOptions, optimize, shared, steps
@@ -207,23 +204,12 @@ def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():
     code = (
-        "import hashlib; from test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.step = 1\n"
+        "import hashlib; from tests.test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.step = 1\n"
         "w = s.common(np.random.default_rng(0).normal(size=(13, 12_500)).astype(np.float32))\n"
         "print(hashlib.sha256(b''.join(a.tobytes() for a in w)).hexdigest())"
     )
-    root = str(Path(__file__).parent.parent)
-    places = f"{root}{os.pathsep}{root}/tests"
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"OPENBLAS_NUM_THREADS": n, "NUMBA_NUM_THREADS": n, "PYTHONPATH": places},
-            capture_output=True,
-            check=True,
-            cwd=root,
-        ).stdout
-        for n in ("1", "2")
-    }
-    assert len(found) == 1
+    threads = [{"OPENBLAS_NUM_THREADS": n, "NUMBA_NUM_THREADS": n} for n in ("1", "2")]
+    assert len({python("-c", code, variables=some)[0] for some in threads}) == 1
 
 
 def test_few_gaussians_share_nothing_and_have_the_whole_rate():

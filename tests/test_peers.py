@@ -24,6 +24,12 @@ shutil.copy(start, out)
 """
 
 
+@pytest.fixture(autouse=True)
+def cold(monkeypatch):
+    """Load kernels while clocks run."""
+    monkeypatch.setattr(report, "warm_up", lambda *_: None)
+
+
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
     """What the trainer that stands for others leaves: our closed form."""

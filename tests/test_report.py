@@ -103,7 +103,8 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
     assert found["machine"]["cpu"]
 
 
-def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path):
+def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.commands.report.warm_up", lambda *_: None)
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err
@@ -149,7 +150,7 @@ def test_csv_and_plots_of_a_report(scene_report):
     for name in FILES:
         image = read_png(folder / name)
         assert min(image.shape[:2]) > 300
-        assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
+        assert len(np.unique(image[::8, ::8].reshape(-1, image.shape[2]), axis=0)) > 20
 
 
 def test_nothing_is_overwritten_unasked(scene_report, vvgt):

@@ -5,14 +5,13 @@ import multiprocessing
 import os
 import resource
 import struct
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tests.processes import python
 from vvgt_cli import resources
 from vvgt_cli.errors import UsageError
 from vvgt_cli.resources import free_memory, parse_size, processors, set_memory
@@ -173,16 +172,8 @@ def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_or_read_not_
         path = big(tmp_path)
         join = f"open({str(group / 'cgroup.procs')!r}, 'w').write('0')"
         code = f"{join}\nfrom vvgt_cli.cli.main import main\nmain()\n"
-        paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        told = []
-        for line in (["info", path], ["convert", path, "-o", tmp_path / "a.ply"]):
-            told.append(subprocess.run(
-                [sys.executable, "-c", code, *line], capture_output=True, text=True,
-                env=os.environ | {"PYTHONPATH": paths}, timeout=1200,
-            ))  # fmt: skip
-        assert told[0].returncode == 0, told[0].stderr
-        done = told[1]
-        assert done.returncode == 1, done.stderr
-        assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in done.stderr
+        python("-c", code, "info", path)
+        _, told = python("-c", code, "convert", path, "-o", tmp_path / "a.ply", code=1)
+        assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in told
     finally:
         group.rmdir()

@@ -14,7 +14,7 @@ from vvgt_cli.volume.tiff.reader import read_tiff
 def test_slices_of_tiff_are_read_in_blocks_page_by_page(vvgt, tmp_path, coding):
     import tifffile
 
-    values = np.round(bodies((50, 61, 40)) * 255).astype(np.uint8)
+    values = np.round(bodies((34, 37, 20)) * 255).astype(np.uint8)
     folder = tmp_path / "slices"
     folder.mkdir()
     for z, plane in enumerate(values):
@@ -52,7 +52,7 @@ def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path
 def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt, tmp_path, monkeypatch):
     import tifffile
 
-    values = np.round(bodies((50, 61, 40)) * 255).astype(np.uint8)
+    values = np.round(bodies((34, 37, 20)) * 255).astype(np.uint8)
     (tmp_path / "slices").mkdir()
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
@@ -63,7 +63,7 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
 def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
     import tifffile
 
-    values = np.round(bodies((50, 61, 40))).astype(np.uint8)
+    values = np.round(bodies((34, 37, 20))).astype(np.uint8)
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000

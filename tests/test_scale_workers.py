@@ -5,7 +5,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,15 +13,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests import processes
 from tests.headers import uncertified
 from tests.test_scale import FIT, bodies
 from vvgt_cli.cli.main import run as command
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 
-ROOT = Path(__file__).parent.parent
 SIZE = ("--blocks", "32")
-pytestmark = pytest.mark.usefixtures("whole_march")
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +47,8 @@ def alone(made):
 
 def start(*args, **variables):
     """The command line in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, args)],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **variables}, stderr=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
+    how = {"OMP_NUM_THREADS": "1"} | variables
+    return processes.start(*processes.VVGT, *args, variables=how, stdout=subprocess.DEVNULL)
 
 
 def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, tmp_path):
@@ -166,7 +161,7 @@ def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
         if workers and parts and not killed:
             os.kill(workers[0], signal.SIGKILL)
             killed += 1
-        time.sleep(0.01)
+        time.sleep(0.05)
     assert run.wait(10) == 0, run.stderr.read()
     assert killed == 1
     assert (tmp_path / "two.ply").read_bytes() == alone
@@ -198,7 +193,7 @@ def test_a_killed_worker_of_dask_costs_nothing_but_time(raw, alone, tmp_path):
         if len(workers) > 1 and not killed and list(tmp_path.glob(".two.ply.blocks/counts/*.npz")):
             os.kill(workers[-1], signal.SIGKILL)
             killed += 1
-        time.sleep(0.01)
+        time.sleep(0.05)
     said = run.communicate(timeout=60)[1]
     assert run.returncode == 0, said
     assert killed == 1
@@ -227,14 +222,12 @@ def test_two_runs_to_one_file_do_not_meet(raw, alone, vvgt, tmp_path):
 def test_a_disk_that_takes_no_more_is_a_line_and_the_run_goes_on_when_it_does(raw, alone, vvgt, tmp_path, kilobytes):
     """Files that may not grow any further stand for it: parts of counts, rows of cells."""
     resource = pytest.importorskip("resource")
-    full = subprocess.run(
-        [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, ("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE))],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (kilobytes << 10,) * 2),
-    )  # fmt: skip
-    assert full.returncode == 1
-    assert full.stderr.count("\n") == 1
-    assert "File too large" in full.stderr
+    line = ("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)
+    how = {"OMP_NUM_THREADS": "1"}
+    grow = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (kilobytes << 10,) * 2)  # noqa: E731
+    _, told = processes.python(*processes.VVGT, *line, code=1, variables=how, preexec_fn=grow)
+    assert told.count("\n") == 1
+    assert "File too large" in told
     assert not (tmp_path / "a.ply").exists()
     assert list((tmp_path / ".a.ply.blocks").rglob(".*")) == []  # temporary files
     vvgt.ok("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)

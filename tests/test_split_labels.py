@@ -1,13 +1,12 @@
 """`--split-labels`: the files' Gaussians are those of the whole, each once, and what the whole hides is there too."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.processes import VVGT, python
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
@@ -96,9 +95,7 @@ def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
 
 def test_standard_input_is_read_once(tmp_path: Path) -> None:
     raw = ("--dims", "24", "24", "24", "--dtype", "uint8", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
-    line = [sys.executable, "-m", "vvgt_cli.cli.main", "convert", "-", *raw, *map(str, SMALL)]
-    done = subprocess.run(line, cwd=tmp_path, input=nested(cut=True).tobytes(), capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr.decode()
+    python(*VVGT, "convert", "-", *raw, *SMALL, cwd=tmp_path, given=nested(cut=True).tobytes(), text=False)
     assert len(list(tmp_path.glob("p_*.ply"))) == 2
 
 

@@ -325,10 +325,12 @@ def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -
 
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     vvgt.ok("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply")
-    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-conditions", "--json").out)
+    alone = json.loads(
+        vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-conditions", "--step", 1, "--json").out
+    )
     found = []
     for name in (f"{folder}", f"{folder / 'lod-meta.json'}#1", f"{folder}#2"):
-        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--json")
+        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--step", 1, "--json")
         found.append(json.loads(vvgt(*line).out))
     counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
     assert [scores["gaussians"] for scores in found] == counts[:3]

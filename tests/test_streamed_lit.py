@@ -57,8 +57,9 @@ def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_pat
     assert np.median(np.abs(found.harmonics[ours] - expected.harmonics[theirs])) < 0.01
 
 
-def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: Path) -> None:
-    lit = LIGHTS["shadows"]
+def test_merged_shards_have_the_bytes_of_one_run(vvgt, tmp_path: Path) -> None:
+    volume, lit = tmp_path / "v_64x48x60_uint8.raw", LIGHTS["shadows"]
+    volume.write_bytes(np.round(bodies((64, 48, 60)) * 255).astype(np.uint8).tobytes())
     for blocks in ("32", "64"):
         vvgt.ok("init", volume, *FIT, *lit, "--blocks", blocks, "-o", tmp_path / f"{blocks}.ply")
     for _ in range(2):

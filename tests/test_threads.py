@@ -2,26 +2,18 @@
 
 import os
 import statistics
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
+from tests.processes import VVGT, python, start
 from vvgt_cli.cli.options import THREAD_VARIABLES
-
-ROOT = Path(__file__).parent.parent
 
 
 def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     line = ["convert", "example:blob:24", "--max-gaussians", "400", "--size", "64", "--steps", "4", "-q", "--threads"]
     for threads in ("1", "2", "3"):
-        subprocess.run(
-            [sys.executable, "-m", "vvgt_cli.cli.main", *line, threads, "-o", f"{threads}.ply"], cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": paths}, check=True,
-        )  # fmt: skip
+        python(*VVGT, *line, threads, "-o", f"{threads}.ply", cwd=tmp_path)
     first = (tmp_path / "1.ply").read_bytes()
     assert all((tmp_path / f"{threads}.ply").read_bytes() == first for threads in (2, 3))
 
@@ -29,18 +21,12 @@ def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):
 @pytest.mark.long
 def test_two_at_once_take_at_most_2_3_times_as_long_as_one(tmp_path):
     """Medians of five, alternated: threads that wait leave the processors to the other run."""
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     line = ["convert", "example:blob:64", "--max-gaussians", "20000", "--size", "400", "-q", "--overwrite", "-o"]
 
     def seconds(runs: int) -> float:
         begin = time.monotonic()
-        started = [
-            subprocess.Popen(
-                [sys.executable, "-m", "vvgt_cli.cli.main", *line, f"{i}.ply"], cwd=tmp_path,
-                env={k: v for k, v in os.environ.items() if k not in THREAD_VARIABLES} | {"PYTHONPATH": paths},
-            )
-            for i in range(runs)
-        ]  # fmt: skip
+        free = {k: v for k, v in os.environ.items() if k not in THREAD_VARIABLES}
+        started = [start(*VVGT, *line, f"{i}.ply", cwd=tmp_path, env=free) for i in range(runs)]
         assert [run.wait() for run in started] == [0] * runs
         return time.monotonic() - begin
 

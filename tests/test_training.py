@@ -45,8 +45,6 @@ from vvgt_cli.network.training import loop, sample  # noqa: E402
 from vvgt_cli.network.training.config import config_text, read_config  # noqa: E402
 from vvgt_cli.network.training.sample import gsplat_picture, splat  # noqa: E402
 
-pytestmark = pytest.mark.usefixtures("whole_march")  # runs are compared with those of other processes
-
 STEPPER = replace(
     TINY, variant="wo_vgf", rounds=2, image=replace(TINY.image, views=2),
     geometry=replace(TINY.geometry, head="step", gradients=True, depths=(0, 1, 1, 1, 1), decoder_depths=(0, 1, 1, 1)),
@@ -348,7 +346,7 @@ def test_what_is_not_finite_skips_the_step_and_is_counted(data, tmp_path, monkey
 
 
 def command(folder, data, *before):
-    main = before or (sys.executable, "-m", "vvgt_cli.cli.main")
+    main = before or (sys.executable, "-m", "tests.spared")
     return [*main, "train", "--data", str(data), "--config", str(folder / "given.yaml"), "-o", str(folder / "run")]
 
 
@@ -370,7 +368,7 @@ def test_a_run_that_was_terminated_goes_on_to_the_same_weights(data, straight, t
 def test_two_processes_have_the_loss_of_one(data, straight, tmp_path):
     (tmp_path / "given.yaml").write_text(config_text(CONFIG))
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-                "-m", "vvgt_cli.cli.main")  # fmt: skip
+                "-m", "tests.spared")  # fmt: skip
     ran = subprocess.run(
         command(tmp_path, data, *torchrun), env=ENVIRONMENT, capture_output=True, text=True, timeout=300
     )
@@ -398,7 +396,7 @@ def test_a_step_follows_the_gradient_before_any_training():
 
 def test_a_group_of_processes_says_once_why_it_ended(tmp_path):
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-                "-m", "vvgt_cli.cli.main")  # fmt: skip
+                "-m", "tests.spared")  # fmt: skip
     (tmp_path / "given.yaml").write_text(config_text(CONFIG))
     told = subprocess.run(
         command(tmp_path, tmp_path / "nowhere", *torchrun), env=ENVIRONMENT, capture_output=True, text=True, timeout=300

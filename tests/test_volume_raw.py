@@ -26,7 +26,7 @@ def sample(shape: tuple[int, int, int], dtype: np.dtype, seed: int = 0) -> np.nd
     return rng.integers(info.min, info.max, shape, dtype=dtype.newbyteorder("="), endpoint=True).astype(dtype)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(DTYPES),
     order=st.sampled_from([None, "little", "big"]),

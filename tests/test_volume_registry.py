@@ -1,8 +1,6 @@
 """How a format is found, what an option may do to it, and how errors read."""
 
 import gzip
-import subprocess
-import sys
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.processes import python
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume import ReadOptions, read_volume
@@ -49,7 +48,7 @@ def test_a_name_with_the_wrong_content_is_one_clear_line(tmp_path: Path, suffix:
     refused(VvgtError, r"expected|no field|has no ElementDataFile|unknown layout", read_volume, str(path))
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     head=st.sampled_from(HEADS),
     edits=st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=4)), max_size=4),
@@ -174,4 +173,4 @@ def test_reading_loads_nothing_heavy(tmp_path: Path) -> None:
         "heavy = {'numba', 'vtkmodules', 'vtk', 'pyvista', 'OpenImageIO', 'matplotlib', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "v.nrrd")], check=True, cwd=Path(__file__).parent.parent)
+    python("-c", code, tmp_path / "v.nrrd")

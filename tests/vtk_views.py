@@ -1,13 +1,11 @@
 """Views that VTK draws, in a process of its own: VTK may crash where OpenGL is incomplete."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.processes import python
 from vvgt_cli.dvr import vtk as vtk_renderer
 from vvgt_cli.errors import DataError
 
@@ -19,9 +17,5 @@ def drawn_by_vtk(code: str, folder: Path) -> np.lib.npyio.NpzFile:
     except DataError as error:
         pytest.skip(str(error))
     path = folder / "views.npz"
-    folders = os.pathsep.join([*map(str, Path(__file__).parents[:2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-c", code, path], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": folders}
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", code, path)
     return np.load(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -50,14 +51,17 @@ def fibonacci_views(
     name: str = "view",
 ) -> list[Camera]:
     """Return ``count`` square views on the Fibonacci sphere (conventions: Default views)."""
-    cameras = []
-    for i in range(count):
-        z = 0.9 * (1 - (2 * i + 1) / count)
-        azimuth = 2 * math.pi * ((i / GOLDEN + shift) % 1.0)
-        ring = math.sqrt(1 - z * z)
-        eye = (radius * ring * math.cos(azimuth), radius * ring * math.sin(azimuth), radius * z)
-        cameras.append(look_at(eye, width=size, height=size, fov=fov, name=f"{name}_{i:03d}"))
-    return cameras
+    return [_fibonacci_view(i, count, shift, size, radius, fov, f"{name}_{i:03d}") for i in range(count)]
+
+
+@lru_cache(maxsize=1000)
+def _fibonacci_view(i: int, count: int, shift: float, size: int, radius: float, fov: float, name: str) -> Camera:
+    """Return one of the views; kept, because a conversion asks for the same ones many times."""
+    z = 0.9 * (1 - (2 * i + 1) / count)
+    azimuth = 2 * math.pi * ((i / GOLDEN + shift) % 1.0)
+    ring = math.sqrt(1 - z * z)
+    eye = (radius * ring * math.cos(azimuth), radius * ring * math.sin(azimuth), radius * z)
+    return look_at(eye, width=size, height=size, fov=fov, name=name)
 
 
 def default_views(

@@ -6,6 +6,7 @@ Per segment of length ds, with the scalar s at its middle (Max 1995, eq. 8, by t
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import cast
 
 import numpy as np
@@ -19,20 +20,24 @@ from vvgt_cli.volume import Volume
 SAMPLES = 4096  # evaluated at a time: bounds the memory
 
 
+def corners(points: np.ndarray, dims: Sequence[int]) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """Yield x, y and z (n,) of each of the eight voxels around points (n, 3), clamped, and their weights (n,)."""
+    top = np.array(dims) - 1
+    points = np.clip(points, 0, top)
+    low = np.floor(points).astype(np.int64)
+    ends, shares = (low, np.minimum(low + 1, top)), (1 - (points - low), points - low)
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (shares[up][:, axis] for axis, up in enumerate(corner))
+        yield [ends[up][:, axis] for axis, up in enumerate(corner)], x * y * z
+
+
 def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
     """Return data values (n,) float64 at voxel coordinates (n, 3), (x, y, z), clamped to the edge voxels.
 
     NaN where one of the eight voxels around is not finite.
     """
-    top = np.array(volume.dims) - 1
-    points = np.clip(points, 0, top)
-    low = np.floor(points).astype(np.int64)
-    high = np.minimum(low + 1, top)
-    fraction = points - low
     total = np.zeros(len(points))
-    for corner in np.ndindex(2, 2, 2):
-        x, y, z = (np.where(up, high[:, axis], low[:, axis]) for axis, up in enumerate(corner))
-        weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
+    for (x, y, z), weight in corners(points, volume.dims):
         with np.errstate(invalid="ignore"):
             total += weight * (volume.slope * volume.data[z, y, x].astype(np.float64) + volume.intercept)
     return np.where(np.isfinite(total), total, np.nan)
@@ -51,8 +56,8 @@ def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Return extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
     if scene.grid is None:
         return optics(scene, trilinear(scene.volume, points))
-    *color, tau = (grid_values(scene.grid[..., k], points) for k in range(4))
-    return tau, np.stack(color, axis=-1) / np.where(tau > 0, tau, 1)[:, None]
+    found = grid_values(scene.grid, points)
+    return found[:, 3], found[:, :3] / np.where(found[:, 3:] > 0, found[:, 3:], 1)
 
 
 def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
@@ -60,19 +65,12 @@ def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
 
     Central differences of stored voxels (clamped at the edges), interpolated trilinearly.
     """
-    top = np.array(scene.volume.dims) - 1
-    points = np.clip(points, 0, top)
-    low = np.floor(points).astype(np.int64)
-    fraction = points - low
+    dims, values = scene.volume.dims, scene.values
     gradient = np.zeros((len(points), 3))
-    for corner in np.ndindex(2, 2, 2):
-        at = np.minimum(low + corner, top)
-        weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
-        for axis, unit in enumerate(np.eye(3, dtype=np.int64)):
-            # beyond the last voxel the interpolation's corner stays where it is, its neighbours move on
-            ends = [np.clip(low + corner + sign * unit, 0, top) for sign in (1, -1)]
-            ends = [np.where(unit, end, at) for end in ends]
-            after, before = (scene.values[e[:, 2], e[:, 1], e[:, 0]].astype(np.float64) for e in ends)
+    for at, weight in corners(points, dims):
+        for axis in range(3):
+            ends = [[np.clip(x + sign * (k == axis), 0, dims[k] - 1) for k, x in enumerate(at)] for sign in (1, -1)]
+            after, before = (values[z, y, x].astype(np.float64) for x, y, z in ends)
             with np.errstate(invalid="ignore"):
                 gradient[:, axis] += weight * (after - before) / scene.step[axis]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -81,14 +79,10 @@ def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return values (n,) of a grid (nz, ny, nx) at its coordinates (n, 3), (x, y, z), clamped."""
-    top = np.array(grid.shape[::-1]) - 1
-    points = np.clip(points, 0, top)
-    low = np.floor(points).astype(np.int64)
-    total = np.zeros(len(points))
-    for corner in np.ndindex(2, 2, 2):
-        x, y, z = np.minimum(low + corner, top).T
-        total += np.prod(np.where(corner, points - low, 1 - (points - low)), axis=1) * grid[z, y, x]
+    """Return values (n[, c]) of a grid (nz, ny, nx[, c]) at its coordinates (n, 3), (x, y, z), clamped."""
+    total = np.zeros((len(points), *grid.shape[3:]))
+    for (x, y, z), weight in corners(points, grid.shape[2::-1]):
+        total += weight.reshape(-1, *[1] * (grid.ndim - 3)) * grid[z, y, x]
     return total
 
 

@@ -343,15 +343,10 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
     if len(places) > MOST_NODES or tf.color_map.space != "RGB":
         places = np.linspace(lo, hi, MOST_NODES) if hi > lo else np.array([lo])
     nodes: list[list[Any]] = []
-    for x in places.tolist():
-        below, above = (_node(tf, x, np.nextafter(x, side)) for side in (-np.inf, np.inf))
+    for x, limits in zip(places.tolist(), tf.limits(places).tolist(), strict=True):
+        below, above = ([float(f"{x:.6g}"), round(opacity, 4), _hex(rgb)] for opacity, *rgb in limits)
         nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
     return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
-
-
-def _node(tf: TransferFunction, x: float, beside: float) -> list[Any]:
-    at = np.array([beside])
-    return [float(f"{x:.6g}"), round(float(tf.opacity(at)[0]), 4), _hex(tf.color(at)[0].tolist())]
 
 
 def _hex(rgb: Any) -> str:

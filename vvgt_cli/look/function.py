@@ -280,6 +280,11 @@ class TransferFunction:
         """Return RGB in [0, 1] at data values x (n,), float64 -> (n, 3)."""
         return self.color_map(x)
 
+    def limits(self, x: np.ndarray) -> np.ndarray:
+        """Return [opacity, R, G, B] at the floating-point numbers just below and just above each x (n,), (n, 2, 4)."""
+        beside = np.nextafter(x[:, None], [-np.inf, np.inf])
+        return np.concatenate([self.opacity(beside)[..., None], self.color(beside)], axis=-1)
+
     def node_range(self) -> tuple[float, float]:
         """Return the smallest and largest node position; beyond them the function is constant."""
         points = self.breakpoints()

@@ -100,11 +100,12 @@ def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
     count = len(nodes)
     if (np.ptp(nodes, axis=0) <= most).all():
         return np.full(count, count - 1.0)
-    levels = [(nodes.T, nodes.T)]  # smallest and largest of windows of 1, 2, 4, ... nodes
+    columns = np.ascontiguousarray(nodes.T)
+    levels = [(columns, columns)]  # smallest and largest of windows of 1, 2, 4, ... nodes
     while 2 << (len(levels) - 1) <= count:
         (low, high), half = levels[-1], 1 << (len(levels) - 1)
         levels.append((np.minimum(low[:, :-half], low[:, half:]), np.maximum(high[:, :-half], high[:, half:])))
-    at, least, largest = np.arange(count), nodes.T, nodes.T
+    at, least, largest = np.arange(count), columns, columns
     for k, (low, high) in reversed(list(enumerate(levels))):
         first = np.minimum(at + 1, low.shape[1] - 1)
         below, above = np.minimum(least, low[:, first]), np.maximum(largest, high[:, first])

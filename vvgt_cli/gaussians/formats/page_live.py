@@ -319,14 +319,8 @@ def _nodes(tf: TransferFunction, sampled: int) -> list[dict[str, Any]]:
     if tf.color_map.space != "RGB":
         places.append(np.linspace(tf.color_map.x[0], tf.color_map.x[-1], sampled))
     nodes = []
-    for x in np.unique(np.concatenate(places)).tolist():
-        below, above = (_limit(tf, x, side) for side in (-np.inf, np.inf))
+    at = np.unique(np.concatenate(places))
+    for x, limits in zip(at.tolist(), tf.limits(at).tolist(), strict=True):
+        below, above = ({"x": x, "y": float(f"{y:.8g}"), "rgb": [round(c, 4) for c in rgb]} for y, *rgb in limits)
         nodes += [below] if below == above else [below, above]
     return nodes
-
-
-def _limit(tf: TransferFunction, x: float, side: float) -> dict[str, Any]:
-    """Return the function's one-sided limit at x, evaluated at the adjacent floating-point number."""
-    beside = np.array([np.nextafter(x, side)])
-    y, rgb = float(tf.opacity(beside)[0]), tf.color(beside)[0]
-    return {"x": x, "y": float(f"{y:.8g}"), "rgb": [round(c, 4) for c in rgb.tolist()]}
