@@ -121,6 +121,34 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     person("press", "Control+z")
     person("press", "Control+z")
     assert np.abs(person.picture(tmp_path, "undone.png") - before).max() < 0.02
+    command[3] = "gray"
+    assert run([*command, "-o", str(tmp_path / "bare.html")]) == 0
+    person("open", (tmp_path / "bare.html").as_uri())
+    person("press", "s")
+    person("until", "window.vvgt.where.slices.open")
+    assert person("eval", WINDOWS) == ["all values", "if in HU", ["soft tissue", "lung", "bone", "brain"]]
+
+
+WINDOWS = """(({ selectedOptions: [chosen] }, group) => [chosen.text, group.label, [...group.children].map((one) => one.text)])(
+  ...document.querySelectorAll('#slices .preset, #slices optgroup'))"""
+DOT = "['cx', 'cy'].map((name) => Number(document.querySelector('#live .light .dot').getAttribute(name)))"
+
+
+def test_a_light_is_from_the_upper_left_until_it_is_aimed(person: Person, pages: dict[str, str]) -> None:
+    def choose(kind: str) -> None:
+        change = "select.dispatchEvent(new Event('change'))"
+        person("eval", f"((select) => {{ select.value = '{kind}'; {change}; }})(document.querySelector('.light select'))")
+        person("settled")
+
+    person("open", pages["slices"])
+    person("press", "x")
+    choose("direction")
+    assert person("eval", DOT) == [-13, -13]
+    aimed = person("eval", "window.vvgt.live.lamp.state().from")
+    person("press", "y")
+    choose("headlight")
+    choose("direction")
+    assert person("eval", "window.vvgt.live.lamp.state().from") == aimed
 
 
 @pytest.mark.parametrize("name", PAGES)
