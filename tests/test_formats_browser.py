@@ -29,7 +29,7 @@ pytestmark = pytest.mark.long
 def shoot(url: str, folder: Path, frame: int | None = None, before: str = "") -> tuple[np.ndarray, dict[str, Any]]:
     """Picture (SIZE, SIZE, 3) where the page begins, and what the browser noted."""
     picture, noted = page_picture(url, folder, SIZE, frame=frame, before=before)
-    assert noted["asked"] == []
+    assert noted["asked"] == noted["errors"] == []
     assert noted["text"] == ""
     return picture, noted
 

@@ -123,6 +123,42 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     assert np.abs(person.picture(tmp_path, "undone.png") - before).max() < 0.02
 
 
+WINDOWS = (
+    "(({ selectedOptions: [chosen] }, group) => [chosen.text, group.label, [...group.children].map((one) => one.text)])"
+    "(...document.querySelectorAll('#slices .preset, #slices optgroup'))"
+)
+DOT = "['cx', 'cy'].map((name) => Number(document.querySelector('#live .light .dot').getAttribute(name)))"
+
+
+def test_windows_are_offered_where_hounsfield_units_are_a_guess(person: Person, tmp_path: Path) -> None:
+    nib = pytest.importorskip("nibabel")
+    values = np.repeat(np.array([-1000, 40, 900], np.int16), [12, 10, 2])[:, None, None] + np.zeros((1, 8, 8), np.int16)
+    nib.save(nib.Nifti1Image(values, np.eye(4)), tmp_path / "ct.nii")
+    command = ["convert", str(tmp_path / "ct.nii"), "--tf", "gray", "--live", "--max-gaussians", "500", "--quiet"]
+    assert run([*command, "-o", str(tmp_path / "ct.html")]) == 0
+    person("open", (tmp_path / "ct.html").as_uri())
+    person("press", "s")
+    person("until", "window.vvgt.where.slices.open")
+    assert person("eval", WINDOWS) == ["all values", "if in HU", ["soft tissue", "lung", "bone", "brain"]]
+
+
+def test_a_light_is_from_the_upper_left_until_it_is_aimed(person: Person, pages: dict[str, str]) -> None:
+    def choose(kind: str) -> None:
+        chosen = f"Object.assign(document.querySelector('.light select'), {{ value: '{kind}' }})"
+        person("eval", f"{chosen}.dispatchEvent(new Event('change'))")
+        person("settled")
+
+    person("open", pages["slices"])
+    person("press", "x")
+    choose("direction")
+    assert person("eval", DOT) == [-13, -13]
+    aimed = person("eval", "window.vvgt.live.lamp.state().from")
+    person("press", "y")
+    choose("headlight")
+    choose("direction")
+    assert person("eval", "window.vvgt.live.lamp.state().from") == aimed
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_no_serious_finding_and_no_trap(name: str, person: Person, pages: dict[str, str]) -> None:
     person("open", pages[name])

@@ -51,9 +51,11 @@ def options(**given: Any) -> PlyOptions:
 CT = ["ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "ct-skin"]
 
 
-def presets(function: TransferFunction, name: str, unit: str = "HU", longer: float = 1.0) -> list[dict[str, Any]]:
+def presets(
+    function: TransferFunction, name: str, unit: str = "HU", longer: float = 1.0, **more: Any
+) -> list[dict[str, Any]]:
     """Presets of a scan of a function, per a distance so many times as long as theirs."""
-    known = replace(facts(), lo=-1000.0, hi=400.0, unit=unit, function=function_text(function, -1000.0, 400.0))
+    known = replace(facts(), lo=-1000.0, hi=400.0, unit=unit, function=function_text(function, -1000.0, 400.0), **more)
     return presets_of(known, {"name": name, "unit_distance": longer * 2 / 256})
 
 
@@ -68,6 +70,9 @@ def test_presets_suit_the_values_and_are_those_that_the_file_does_not_have() -> 
     assert [found["name"] for found in presets(bone, "ct-skin")] == CT[1:]
     assert [found["name"] for found in presets(skin, "ct-skin", longer=2)] == CT
     assert [presets(bone, name, unit="") for name in ("ct-bone", "bone")] == [[], []]
+    scan = tuple(np.histogram(np.repeat([-995, 40.0], [300, 200]), 256, (-1000, 400))[0].tolist())
+    assert [found["name"] for found in presets(bone, "bone", unit="", histogram=scan)] == CT[1:]
+    assert presets(bone, "bone", unit="K", histogram=scan) == []
 
 
 @pytest.mark.parametrize("longer", [0.2, 8, 16])

@@ -139,12 +139,14 @@ def test_values_are_hounsfield_units_where_a_function_of_those_says_so(stretched
     source = SourceRequest(Volume(data), tf="ct-soft-tissue", tf_range="rescale" if stretched else "data")
     found = [load(one).slices() for one in (source, replace(source, tf=None, tf_range="data"))]
     assert [one.facts[0]["unit"] for one in found] == ["" if stretched else "HU", ""]
+    assert [one.facts[0]["ct"] for one in found] == [True, True]  # windows to choose from
 
 
 def test_huge_ranges_fit_into_16_bits():
     data = np.random.default_rng(3).normal(size=(20, 20, 20))
     data[0, 0, 0], data[5, 5, 5] = -1e9, 1e9
     [facts], [content], _ = slices_of([(Volume(data), None)])
+    assert not facts["ct"]
     assert np.abs(unpacked(content, facts) - data).max() <= 0.5001 * facts["step"] < 2e4
 
 

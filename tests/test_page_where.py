@@ -366,6 +366,7 @@ def test_a_link_restores_the_picture(marked: str, person: Person, tmp_path: Path
         person("drag", 600, 600, 700, 560)
     before = person.picture(tmp_path, "before.png")
     person("click", "#tools .link")
+    assert person("eval", "document.querySelector('#places').textContent") == "link to this view copied"
     link = person("eval", "location.href")
     assert link.startswith(marked + "#projection=orthographic&view=")
     person("open", link)

@@ -28,11 +28,11 @@ await page.waitForTimeout(3000);
 await page.evaluate(() => {
   window.heard = [];
   addEventListener('message', ({ data }) => window.heard.push(data));
-  for (const what of [{ camera: 'left', cut: { kind: 'plane', normal: [0, 0, 2], at: 0.25 } }, { cut: { kind: 'plane', normal: [0, 0] } }]) {
+  for (const what of [{ camera: 'left', cut: { kind: 'plane', normal: [0, 0, 2], at: 0.25 } }, { cut: { kind: 'plane', normal: [0, 0] } }, { light: { kind: 'sun' } }, { labels: 'skull' }, { cut: null }]) {
     document.querySelector('iframe').contentWindow.postMessage({ vvgt: 'set', ...what }, '*');
   }
 });
-await page.waitForFunction('window.heard.length > 1');
+await page.waitForFunction('window.heard.length > 4');
 const heard = await page.evaluate(() => window.heard.map(({ vvgt, camera, cut, message }) => ({ vvgt, yaw: camera?.yaw, at: cut?.at, normal: cut?.normal, message })));
 const stored = await frame.evaluate(() => { try { return Boolean(localStorage); } catch { return false; } });
 const covered = await frame.evaluate(() => [...document.querySelectorAll('button')].filter((button) => {

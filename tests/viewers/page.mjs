@@ -2,7 +2,7 @@
 // own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
 // axes or null for where the page says that it begins, "frame": number to go to or null, "before": JavaScript to evaluate first, or
 // none, "out": .png, "actions": [{"click" | "drag" | "fill" | "select" | "key": selector or key, "by": [px, px], "text"}] by mouse, touch and keys in a
-// window of "window": [width, height], and "look": .png of all of it afterwards, or none}; prints {"asked": [other URLs], "text": what
+// window of "window": [width, height], and "look": .png of all of it afterwards, or none}; prints {"asked": [other URLs], "errors": [of the console], "text": what
 // the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -19,13 +19,13 @@ const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.window ?? [job.size, job.size];
 const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1 });
 page.setDefaultTimeout(600000);
-const asked = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
+const asked = [], errors = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
 await page.route((url) => /^(https?|wss?):/.test(url.href) && !url.href.startsWith(own), (route) => {
   asked.push(route.request().url());
   return route.abort();
 });
 const broken = new Promise((_, fail) => { page.on('pageerror', (error) => fail(error)); });
-page.on('console', (message) => { if (message.type() === 'error') console.error(message.text()); });
+page.on('console', (message) => { if (message.type() === 'error') errors.push(message.text()); });
 const begin = Date.now();
 await page.goto(job.url);
 const there = 'window.vvgt !== undefined || document.getElementById("said").textContent !== "loading"';
@@ -84,5 +84,5 @@ const url = await Promise.race([broken, page.evaluate(expression)]);
 fs.writeFileSync(job.out, Buffer.from(url.split(',')[1], 'base64'));
 const text = await page.evaluate(() => document.getElementById('said').textContent);
 const frames = await page.evaluate(() => Number(document.querySelector('#series input')?.max ?? 0) + 1);
-console.log(JSON.stringify({ asked, text, seconds, frames }));
+console.log(JSON.stringify({ asked, errors, text, seconds, frames }));
 await browser.close();

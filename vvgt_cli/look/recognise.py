@@ -59,7 +59,7 @@ def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
     if air_and_tissue(counts, edges):
         return True
     first, last = background_bins(counts)
-    return first < last and AIR[0] <= edges[first] and edges[last] <= AIR[1] and edges[-1] > TISSUE[1]
+    return bool(first < last and AIR[0] <= edges[first] and edges[last] <= AIR[1] and edges[-1] > TISSUE[1])
 
 
 def air_and_tissue(counts: np.ndarray, edges: np.ndarray) -> bool:

@@ -55,7 +55,7 @@ def resolve(
     """
     chosen = parse_tf_range(tf_range)
     lo, hi = _data_range(statistics)
-    if tf.otherwise is not None and chosen == "data" and not (hounsfield or _in_hounsfield(statistics)):
+    if tf.otherwise is not None and chosen == "data" and not (hounsfield or look_like_hounsfield(statistics)):
         warnings.warn(
             f"{tf.name}: values {lo:g} to {hi:g} are not in Hounsfield units; shown by {BY[tf.otherwise.domain]}, a "
             "guess: compare with no --tf, or give --tf-range LO,HI",
@@ -91,7 +91,8 @@ def unit_of_values(stated: str, tf: object) -> str:
     return stated or ("HU" if isinstance(tf, TransferFunction) and tf.otherwise is not None else "")
 
 
-def _in_hounsfield(statistics: Statistics) -> bool:
+def look_like_hounsfield(statistics: Statistics) -> bool:
+    """Return whether the histogram of data values is that of Hounsfield units."""
     counts = np.asarray(statistics.histogram, dtype=np.float64)
     return bool(counts.any()) and in_hounsfield(counts, np.asarray(statistics.edges, dtype=np.float64))
 

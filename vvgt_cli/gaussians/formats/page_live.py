@@ -26,7 +26,7 @@ from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import MATTE, MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
-from vvgt_cli.look.resolve import resolve
+from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume.types import triple
 
@@ -266,7 +266,7 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
 
 
 def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the named functions for values in Hounsfield units, or of the kind that the file's is named after.
+    """Return the named functions for values that are or look like Hounsfield units, or of the kind of the file's name.
 
     The file's own function is not among them, unless it was changed and has kept the name.
 
@@ -274,13 +274,14 @@ def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]
         facts: of the layer.
         own: its part of the scene, whose ``unit_distance`` opacities become per.
     """
-    named, found = names(), []
-    kind = "ct" if facts.unit == "HU" else own["name"].split("-")[0] if own["name"] in named else ""
+    named, found, known = names(), [], facts.statistics()
+    hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(known))
+    kind = "ct" if hounsfield else own["name"].split("-")[0] if own["name"] in named else ""
     for name in [name for name in named if name.split("-")[0] == kind]:
         tf = named_function(name)
-        if tf.otherwise is not None and facts.unit != "HU":  # a guess
+        if tf.otherwise is not None and not hounsfield:  # a guess
             continue
-        tf = resolve(tf, facts.statistics(), hounsfield=True)
+        tf = resolve(tf, known, hounsfield=True)
         assert tf.opacity_unit_share is not None
         times = own["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
         tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))

@@ -17,6 +17,7 @@ import numpy as np
 
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.recognise import in_hounsfield
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
 from vvgt_cli.volume.types import Volume
@@ -129,10 +130,11 @@ def _values(
         step = one * max(math.ceil(step / one), 1) if step > one / 2 else one
         lo = volume.intercept + one * math.floor((lo - volume.intercept) / one + EXACT)
     codes = np.rint((np.nan_to_num(values, nan=lo - missing * step) - lo) / step) + missing
-    window = [(a + b) / 2, (b - a) or step]
+    unit = unit_of_values(volume.values_in, tf)
+    ct = unit == "HU" or (not unit and len(known) > 0 and in_hounsfield(*np.histogram(known, 256)))
     facts = {
-        "lo": lo, "step": step, "missing": missing, "level": window[0], "window": window[1],
-        "unit": unit_of_values(volume.values_in, tf), "quantity": volume.quantity,
+        "lo": lo, "step": step, "missing": missing, "level": (a + b) / 2, "window": (b - a) or step,
+        "unit": unit, "ct": ct, "quantity": volume.quantity,
     }  # fmt: skip
     return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16)
 

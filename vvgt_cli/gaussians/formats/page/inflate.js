@@ -1,6 +1,9 @@
 // In a page that is one file, the viewer's program is packed; it becomes a script. What the file holds is kept for saving it again.
 (async () => {
+  const style = document.querySelector('style');  // within its document it would be cloned while empty, which a policy of hashes reports
+  style.remove();
   window.vvgtSource = document.cloneNode(true);
+  for (const one of [document, window.vvgtSource]) one.head.append(style.cloneNode(true));
   const text = atob(document.getElementById('program').textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));

@@ -1,5 +1,5 @@
 // The light of a live page: none, at the eye, or from a direction that is dragged on a ball; and how much of it there is.
-const R = 26, STEP = 0.1;
+const R = 26, STEP = 0.1, FIRST = [-0.5, 0.5];  // FIRST: from the upper left as it is seen, until it is aimed
 const SLIDERS = [['ambient', 1], ['diffuse', 1], ['specular', 1]], NAMES = { ambient: 'ambient', diffuse: 'diffuse', specular: 'gloss' };
 const HTML = `<summary>light</summary><div class="light"><svg viewBox="-30 -30 60 60" tabindex="0" role="application" aria-label="direction of the light; drag, or use the arrow keys">
 <defs><radialGradient id="light-ball" r="0.9"><stop offset="0" stop-color="#fff"/><stop offset="1" stop-color="#222"/></radialGradient></defs>
@@ -13,7 +13,7 @@ export function light(look, { app }, begin, history) {
   root.innerHTML = HTML;
   const find = (selector) => root.querySelector(selector), ball = find('svg'), kind = find('select');
   const camera = app.root.findComponent('camera').entity;
-  let now = { ...begin, from: [...begin.from] }, drawn = '';
+  let now = begin, drawn = '';
 
   const sides = () => [camera.right, camera.up, camera.forward].map(({ x, y, z }) => [x, y, z]);
   const dot = (a, b) => a.reduce((sum, x, k) => sum + x * b[k], 0);
@@ -79,7 +79,8 @@ export function light(look, { app }, begin, history) {
   kind.addEventListener('change', () => {
     history.keep();
     now = { ...now, kind: kind.value };
-    show();
+    if (now.kind === 'direction' && begin.kind !== 'direction' && now.from === begin.from) aim(...FIRST);
+    else show();
   });
   for (const slider of root.querySelectorAll('input')) {
     let moving = false;

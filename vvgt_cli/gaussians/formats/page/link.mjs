@@ -48,6 +48,17 @@ export const liveParts = (live) => live.parts.map(stateOf);
 export const saidBy = (parts) => parts.map(({ key, get }) => [key, get()]).filter(([, text]) => text).map(([key, text]) => `${key}=${text}`).join('&');
 export const linkOf = (parts) => `${location.href.split('#')[0]}#${saidBy(parts)}`;
 
+// whether a text is in the clipboard now; the clipboard's own interface is refused to most frames
+export function copied(text) {
+  const area = Object.assign(document.createElement('textarea'), { value: text }), back = document.activeElement;
+  document.body.append(area);
+  area.select();
+  const done = document.execCommand('copy');
+  area.remove();
+  back?.focus({ preventScroll: true });
+  return done;
+}
+
 // what the address says, else what a saved page begins with
 export async function restore(parts, begins = '') {
   let said;

@@ -3,6 +3,7 @@ import { dot } from './lens.mjs';
 import { functionFile } from './server.mjs';
 
 const OFTEN = 100;  // milliseconds between two messages of a change
+const KINDS = ['none', 'headlight', 'direction'];
 
 const numbers = (list, count, what) => {
   if (!Array.isArray(list) || (count && list.length !== count) || !list.every(Number.isFinite)) throw new Error(`${what}: expected ${count || 'a list of'} numbers`);
@@ -60,9 +61,10 @@ export function messages({ live, lens, views, axes, moving }, app) {
     },
     light(to) {
       const next = { ...light(), ...to };
-      numbers([...numbers(next.from, 3, 'light.from'), next.ambient, next.diffuse, next.specular], 6, 'light');
+      const length = Math.hypot(...numbers(next.from, 3, 'light.from'));
+      if (!KINDS.includes(next.kind) || !length || numbers([next.ambient, next.diffuse, next.specular], 3, 'light').some((x) => x < 0)) throw new Error(`light: expected kind ${KINDS.join(', ')}; from is not 0, the others not below 0`);
       live.cut.keep();
-      live.lamp.set({ ...next, from: fromWorld(next.from) });
+      live.lamp.set({ ...next, from: fromWorld(next.from.map((x) => x / length)) });
     },
     function(to, layer) {
       if (!layer.nodes) throw new Error('function: the layer has labels');
@@ -75,14 +77,15 @@ export function messages({ live, lens, views, axes, moving }, app) {
   };
   addEventListener('message', ({ source, data }) => {
     if (source !== parent || parent === window || data?.vvgt !== 'set') return;
+    let key;
     try {
-      for (const key of Object.keys(set).filter((name) => data[name] !== undefined)) {
+      for (key of Object.keys(set).filter((name) => data[name] !== undefined)) {
         const layer = live?.layers[data.layer ?? 0];
         if (key !== 'camera' && !layer) throw new Error(live ? `layer ${data.layer}: not there` : `${key}: cannot be changed on this page`);
         set[key](data[key], layer);
       }
       moving();
-    } catch (error) { say('error', { message: error.message }); }
+    } catch (error) { say('error', { message: error instanceof TypeError ? `${key}: what is sent has another form than is documented` : error.message }); }
   });
   let told = '', last = 0;
   if (parent !== window) {

@@ -28,7 +28,10 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   const find = (selector) => root.querySelector(selector), fields = [find('.window'), find('.level')], said = find('output');
   let grids = null, labels = [], views = [], base = null, at = [0, 0, 0], shades = null, window_ = [1, 0], version = 0;
 
-  const presets = () => [...(base.unit === 'HU' ? CT : []), ['all values', base.window, base.level]];
+  const presets = () => {
+    const all = ['all values', base.window, base.level], ct = base.ct ? CT : [];
+    return base.unit ? [...ct, all] : [all, ...ct];
+  };
   function shade(window, level) {
     window_ = [Math.max(window, base.step), level];
     const [low, span] = [level - window_[0] / 2, window_[0]];
@@ -52,7 +55,12 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     const valued = !base.labels;
     for (const element of [...fields.map((one) => one.parentNode), find('.preset')]) element.hidden = !valued;
     if (!valued) return go(at);
-    find('.preset').replaceChildren(...presets().map(([name], k) => new Option(name, k)), Object.assign(new Option('own', -1), { hidden: true }));
+    const options = presets().map(([name], k) => new Option(name, k)), guess = Object.assign(document.createElement('optgroup'), { label: 'if in HU' });
+    if (base.ct && !base.unit) {  // what the file does not state may be another scale: to choose, not to begin with
+      guess.append(...options.splice(1));
+      options.push(guess);
+    }
+    find('.preset').replaceChildren(...options, Object.assign(new Option('own', -1), { hidden: true }));
     shade(...presets()[0].slice(1));
     go(at);
   }

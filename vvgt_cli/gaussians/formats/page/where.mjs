@@ -8,7 +8,7 @@ import { handlesOf } from './handles.mjs';
 import { helpRows, listed, listen } from './keys.mjs';
 import { lensOf } from './lens.mjs';
 import { messages } from './messages.mjs';
-import { frameParts, linkOf, liveParts, restore, saidBy, viewParts } from './link.mjs';
+import { copied, frameParts, linkOf, liveParts, restore, saidBy, viewParts } from './link.mjs';
 import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
@@ -132,13 +132,12 @@ export function where(viewer, scene, live, show) {
     sizes.toggle();
     sizes.root.querySelector('button').focus();
   }));
-  button('link', 'link to this view', 'l', async () => {
+  button('link', 'link to this view', 'l', () => {
     const link = linkOf(parts);
     try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
-    const copied = await navigator.clipboard?.writeText(link).then(() => true, () => false);
-    again(copied ? 'link to this view copied' : 'the address bar now links to this view');
+    again(copied(link) ? 'link to this view copied' : parent === window ? 'the address bar now links to this view' : 'this frame may not copy a link');
     setTimeout(again, 4000);
-  });
+  }).hidden = location.protocol === 'about:';  // of a notebook's cell, which has no address
   const whole = document.documentElement;
   if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', '', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
   for (const kind of ['VR', 'AR']) {
