@@ -312,7 +312,8 @@ def load_all(
                 "or --array, or pass --tf",
                 stacklevel=2,
             )
-        check_visible(shown, numbers)
+        if not request.statistics:  # a frame of a series may be dark
+            check_visible(shown, numbers)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if held else None
         sources.append(Source((layer,), volume, numbers, lighting, layout, tuple(request.statistics)))
@@ -336,7 +337,8 @@ def _layered(
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
     numbers = access.statistics(layers[0].volume)
-    _check_seen(layers, access)
+    if not request.statistics:
+        _check_seen(layers, access)
     grid = common_grid(layers, content.stored)
     return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
 
