@@ -150,7 +150,10 @@ class RenderRequest:
                 "each, as -o 'out_{:04d}.png' (or --time N for one time step of a file)"
             )
         shares = self.views(frames)
-        files = self.files(list(chain(*shares)))
+        cameras = list(chain(*shares))
+        files = self.files(cameras)
+        if self.movie and len({(camera.width, camera.height) for camera in cameras}) > 1:
+            raise UsageError(f"-o {where}: views of several sizes; a movie has one: give --size")
         outputs = [Output("-o", file) for file in files]
         outputs += [Output("--exr", str(Path(file).with_suffix(".exr"))) for file in files if self.exr]
         if where.suffix.lower() == ".mp4":
@@ -267,11 +270,14 @@ def _volume(
     if options is not None:
         needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
         found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
-        source = _upright(found.source)
+        source = found.source
     else:
         with run.stage("read") as stage:
-            source = _upright(load(asked))
+            source = load(asked)
             stage.note = describe_source(source)
+    if source.volume.sheared:  # no pinhole camera sees it
+        text = shear_text(source.volume.axes)
+        raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
     where = " in blocks" if found else ""
     if request.rule == MIP:
         run.compile(GREATEST, source.kernel_type())
@@ -286,15 +292,9 @@ def _volume(
     else:
         scene = source.scene()
         draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    return (absorbed(draw), f"X-ray{where}") if request.rule else (draw, f"ray casting{where}")
-
-
-def _upright(source: Source) -> Source:
-    """Refuse a sheared volume, which no pinhole camera sees."""
-    if source.volume.sheared:
-        text = shear_text(source.volume.axes)
-        raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
-    return source
+    if request.rule == XRAY:
+        return lambda camera: grey(draw(camera)[..., 3]), f"X-ray{where}"
+    return draw, f"ray casting{where}"
 
 
 def _opened(request: RenderRequest, name: str) -> tuple[Seen, Gaussians, PlyHeader]:
@@ -333,11 +333,9 @@ def _pictures(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: l
 
 
 def _movie(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
-    """Write one movie, and return its name and what it holds; raise UsageError for views of several sizes."""
+    """Write one movie, and return its name and what it holds."""
     from vvgt_cli.images import over
 
-    if len({(camera.width, camera.height) for camera in cameras}) > 1:
-        raise UsageError(f"-o {request.output}: views of several sizes; a movie has one: give --size")
     rate = SLOW if cameras[0] is cameras[-1] else RATE
     shown = (over(picture, request.background or BLACK) for picture in pictures)
     size = write_movie(request.output, shown, request.overwrite, rate)
@@ -351,11 +349,6 @@ def as_xray(source: Source) -> Source:
     assert isinstance(layer.tf, TransferFunction)
     distance = exposed_distance(layer.tf, source.overall, 2 / source.volume.unit_frame().scale)
     return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
-
-
-def absorbed(draw: Draw) -> Draw:
-    """Return the function that draws what is absorbed in the pictures of ``draw``."""
-    return lambda camera: grey(draw(camera)[..., 3])
 
 
 def mip_of(field: Blocked | Source) -> Draw:
