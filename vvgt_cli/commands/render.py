@@ -17,7 +17,7 @@ from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
-from vvgt_cli.conversion.frames import Series, is_glob_of_volumes
+from vvgt_cli.conversion.frames import Series, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
@@ -177,7 +177,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     run, given = Run(console or Console(), ConversionReport("render")), request.given
     if not isinstance(given, SourceRequest):
         return _render(run, request, given)
-    over_time = request.movie and request.camera is None and request.orbit is None
+    over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
     if not over_time and not is_glob_of_volumes(given.path):
         try:
             return _render(run, request, [given])

@@ -199,9 +199,14 @@ class Series(Batch):
         }
 
 
+def is_glob(path: str) -> bool:
+    """Return whether a path is a glob, and not the name of a file."""
+    return bool(set(path) & set("*?[")) and not os.path.exists(path)
+
+
 def is_glob_of_volumes(path: str) -> bool:
     """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
-    if os.path.exists(path) or not set(path) & set("*?["):
+    if not is_glob(path):
         return False
     files = matching(path)
     if any(file.suffix.lower() not in SUFFIXES for file in files):
@@ -345,7 +350,7 @@ def list_steps(source: SourceRequest) -> list[Step]:
         DataError: a file cannot be read.
     """
     files = [] if os.path.exists(source.path) else matching(source.path)
-    if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
+    if not files and is_glob(source.path):
         raise UsageError(
             f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
             "a file with several time steps"
