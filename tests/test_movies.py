@@ -15,10 +15,11 @@ from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.commands import render as command
 from vvgt_cli.commands.render import write_movie
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.frames import rescale, upright_matrix
 from vvgt_cli.gaussians.rules import rule_of
 from vvgt_cli.images.metrics import psnr
@@ -172,11 +173,36 @@ def test_files_of_gaussians_are_a_movie_over_time(ply, tmp_path, vvgt):
     assert pictures[2].max() < 0.03  # the palette rounds
 
 
+def test_live_files_of_unlike_boxes_and_histograms_have_one_exposure(tmp_path, vvgt):
+    """The same box alone and in one of twice the edge, where most values are 0, has the same X-ray."""
+    ball = np.zeros((8, 8, 8), np.float32)
+    ball[2:6, 2:6, 2:6] = 1
+    np.save(tmp_path / "run_0.npy", ball)
+    np.save(tmp_path / "run_1.npy", np.pad(ball, 4))
+    for k in range(2):
+        live = "--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,1 -o"
+        vvgt.ok("convert", tmp_path / f"run_{k}.npy", live, tmp_path / f"live_{k}.ply")
+    first, second = (read_ply(tmp_path / f"live_{k}.ply")[1] for k in range(2))
+    assert first.scale == 2 * second.scale
+    larger, around = read_ply(tmp_path / "live_1.ply")[0], replace(layout_of(second), centre=first.centre)
+    write_ply(tmp_path / "live_1.ply", larger, around)
+    write_ply(tmp_path / "live_2.ply", larger, replace(around, space="LPS"))
+    vvgt.ok("render", tmp_path / "live_[01].ply", "--rule xray --size 48 -o", tmp_path / "x_{}.png")
+    one, other = (np.asarray(Image.open(tmp_path / f"x_{k}.png"), float)[..., 0] for k in range(2))
+    assert one.max() > 100
+    np.testing.assert_allclose(one.mean(), other.mean(), rtol=0.15)
+    write_ply(tmp_path / "live_3.ply", read_ply(tmp_path / "live_0.ply")[0], replace(layout_of(first), space="RAS"))
+    said = vvgt.fails(1, "render", tmp_path / "live_[23].ply", "-o", tmp_path / "time.gif")
+    assert "live_3.ply: positions in RAS; expected LPS, as in the first frame" in said
+
+
 def test_frames_that_are_no_movie_are_named(run, ply, tmp_path, vvgt):
     for k, hi in enumerate((1, 1, 2)):
         live = f"--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,{hi} -o"
         vvgt.ok("convert", run / "run_9.npy", live, tmp_path / f"live_{k}.ply")
     (tmp_path / "live_3.ply").write_bytes(b"ply\n")
+    for k in range(3):
+        imwrite(tmp_path / f"slice_{k}.tif", np.full((8, 8), k, np.uint8))
     time = ("-o", tmp_path / "time.gif")
     for code, said, *words in (
         (2, "got 3 frames; expected a movie, as -o time.gif", run / "run_*.npy", *LOOK, "-o", tmp_path / "a.png"),
@@ -191,6 +217,7 @@ def test_frames_that_are_no_movie_are_named(run, ply, tmp_path, vvgt):
         (2, "2 views of 3 frames", run / "run_*.npy", *LOOK, "--orbit 2", *time),
         (2, "no such files", tmp_path / "none_*.ply", *time),
         (2, "either --camera FILE or --orbit N", tmp_path / "liv?_0.ply", *time),
+        (2, "either --camera FILE or --orbit N", tmp_path / "slice_?.tif", *time),
         (2, "either --camera FILE or --orbit N", run / "run_9.npy", *LOOK, *time),
         (1, "live_2.ply: its values have another range or function", tmp_path / "live_[0-2].ply", "--rule mip", *time),
         (

@@ -232,16 +232,11 @@ def _frame(
     if isinstance(given, SourceRequest):
         return (*_volume(run, request, given, cameras, stack), None)
     with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request, given)
+        seen, gaussians, header = _opened(request, given, first)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-    valued = request.rule in NAMES or request.function is not None
-    if first is not None and valued and shared_facts([first.live, header.live]) is None:
-        raise DataError(
-            f"{given}: its values have another range or function than those of the first frame; expected frames that "
-            "'vvgt convert --live' makes of one series"
-        )
     if request.rule in NAMES:
-        draw, by = draw_gaussians(given, gaussians, header, request.rule, request.function), request.rule
+        edge = 2.0 * header.scale / first.scale if first and first.scale and header.scale else 2.0
+        draw, by = draw_gaussians(given, gaussians, header, request.rule, request.function, edge), request.rule
         run.compile(GREY)
     else:
         from vvgt_cli.splat import render
@@ -249,13 +244,32 @@ def _frame(
         rule = file_rule(first or header, request.rule)
         run.compile(for_degree(DRAW, gaussians.degree))
         draw, by = lambda camera: render(seen(camera), camera, rule), rule.name
-    return _placed(draw, header, first), by, header
+    return _placed(draw, given, header, first), by, header
 
 
-def _placed(draw: Draw, header: PlyHeader, first: PlyHeader | None) -> Draw:
-    """Return the renderer of a file's Gaussians for cameras in the unit frame of the first file, if both are known."""
+def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
+    """Return the header with the histograms of the first file's values, or raise DataError if they differ in range."""
+    if first.live is None or header.live is None or shared_facts([first.live, header.live]) is None:
+        raise DataError(
+            f"{name}: its values have another range or function than those of the first frame; expected frames that "
+            "'vvgt convert --live' makes of one series"
+        )
+    pairs = zip(header.live.layers, first.live.layers, strict=True)
+    own, *others = [replace(layer, histogram=same.histogram) for layer, same in pairs]
+    return replace(header, live=replace(own, others=tuple(others)))
+
+
+def _placed(draw: Draw, name: str, header: PlyHeader, first: PlyHeader | None) -> Draw:
+    """Return the renderer of a file's Gaussians for cameras in the unit frame of the first file, if both are known.
+
+    Raises:
+        DataError: the files' worlds have different axes or units.
+    """
     if first is None or not (first.scale and first.centre and header.scale and header.centre):
         return draw
+    for one, other in ((header.space, first.space), (header.length_unit, first.length_unit)):
+        if one and other and one != other:
+            raise DataError(f"{name}: positions in {one}; expected {other}, as in the first frame")
     factor, offset = first.scale / header.scale, first.scale * np.subtract(header.centre, first.centre)
     return lambda camera: draw(replace(camera, translation=(camera.rotation @ offset + camera.translation) / factor))
 
@@ -297,12 +311,14 @@ def _volume(
     return draw, f"ray casting{where}"
 
 
-def _opened(request: RenderRequest, name: str) -> tuple[Seen, Gaussians, PlyHeader]:
+def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
     """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
     manifest, function = by_view(name), None if request.rule in NAMES else request.function
     if manifest is None:
         several = isinstance(request.given, tuple) and len(request.given) > 1
         gaussians, header = open_gaussians(name, empty=several)
+        if first is not None and (request.rule in NAMES or request.function is not None):
+            header = _in_range(name, header, first)
         gaussians = recolored(name, gaussians, header, function, empty=several)
         return lambda camera: gaussians, gaussians, header
     levels = StreamedLevels(manifest)
