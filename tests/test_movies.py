@@ -136,6 +136,15 @@ def test_a_label_map_without_labels_is_an_empty_frame(tmp_path, vvgt):
         assert shown == [False, True, True]
 
 
+def test_a_layer_of_a_series_that_shows_nothing_is_named(run, tmp_path, vvgt):
+    far = {"points": [{"x": x, "rgb": [1, 0, 0], "opacity": x - 50} for x in (50, 51)]}
+    (tmp_path / "far.json").write_text(json.dumps(far))
+    layer = f"{run / 'run_9.npy'},tf={tmp_path / 'far.json'}"
+    with pytest.warns(UserWarning, match="run_9, transfer function: nothing is visible: the data lie in") as said:
+        vvgt.ok("render", run / "run_*.npy", *LOOK, "--layer", layer, "-o", tmp_path / "time.gif")
+    assert len({str(one.message) for one in said}) == 1  # of which one is shown
+
+
 def test_a_frame_is_opened_for_its_own_views_after_the_one_before_is_gone(run, tmp_path, monkeypatch):
     opened, held, volume = [], [], command._volume
 
