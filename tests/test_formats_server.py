@@ -18,7 +18,7 @@ import pytest
 
 from tests.processes import start
 from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.commands.view import expanded
+from vvgt_cli.conversion.index import expanded
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 
@@ -193,11 +193,14 @@ def test_globs_become_files_of_gaussians_in_the_order_of_their_numbers(tmp_path,
     monkeypatch.chdir(tmp_path)
     for name in ("a_10.ply", "a_2.ply", "[x].ply", "slice_1.tif", "slice_2.tif"):
         Path(name).write_bytes(b"")
-    assert expanded(["a_*.ply"]) == ["a_2.ply", "a_10.ply"]
-    assert expanded(["[x].ply", "a_?.ply", "none.ply"]) == ["[x].ply", "a_2.ply", "none.ply"]
-    assert expanded(["slice_*.tif"]) == ["slice_*.tif"]  # a volume
+    assert expanded("a_*.ply") == ["a_2.ply", "a_10.ply"]
+    assert expanded("a_?.ply") == ["a_2.ply"]
+    Path("h[1]").mkdir()
+    Path("h[1]/lod-meta.json").write_bytes(b"")
+    for name in ("[x].ply", "none.ply", "h[1]/#1", "slice_*.tif", "a.h5:/[x]"):  # the last two are volumes
+        assert expanded(name) == [name]
     with pytest.raises(UsageError, match="no such files"):
-        expanded(["b_*.ply"])
+        expanded("b_*.ply")
 
 
 @pytest.mark.parametrize(

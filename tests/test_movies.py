@@ -1,22 +1,30 @@
-"""Turntables: every picture is there, in order and in time, and the last leads to the first."""
+"""Turntables and movies over time: every picture is there, in order and in time, and the last leads to the first."""
 
+import json
 import sys
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from tifffile import imwrite
 
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.commands import render as command
 from vvgt_cli.commands.render import write_movie
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.frames import rescale, upright_matrix
+from vvgt_cli.gaussians.rules import rule_of
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.progress import Console
 from vvgt_cli.splat import render
 
 
@@ -68,6 +76,170 @@ def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
     assert even_steps(pictures)
     assert not even_steps(pictures[:15])
     assert list(tmp_path.glob("*.json")) == []
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Three volumes of a ball whose values grow from frame to frame, the first of them dark, as files and as one."""
+    folder = tmp_path_factory.mktemp("run")
+    ball = np.exp(-4 * np.linalg.norm(np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 20)], indexing="ij")), axis=0) ** 2)
+    frames = np.stack([k * ball for k in (0.05, 1, 2)]).astype(np.float32)
+    for k, frame in enumerate(frames):
+        np.save(folder / f"run_{k + 8}.npy", frame)
+    imwrite(folder / "run.ome.tif", frames, ome=True, metadata={"axes": "TZYX"}, photometric="minisblack")
+    return folder
+
+
+LOOK = ("--tf", "viridis:0.1,1", "--size", 24)
+
+
+@pytest.mark.parametrize("blocks", [(), ("--blocks", 16)])
+def test_a_series_of_volumes_is_a_movie_over_time(run, tmp_path, vvgt, blocks):
+    """Each frame is the picture of its volume in the range of all; a dark one is the background."""
+    for name in ("run_*.npy", "run.ome.tif"):
+        vvgt.ok("render", run / name, *LOOK, *blocks, "--background", 0, 0, 1, "-o", tmp_path / f"{name[-3:]}.gif")
+    pictures, times, _ = gif(tmp_path / "npy.gif")
+    np.testing.assert_array_equal(pictures, gif(tmp_path / "tif.gif")[0])
+    assert (pictures.shape, set(times)) == ((3, 24, 24, 3), {200})
+    np.testing.assert_allclose(pictures[0] - (0, 0, 1), 0, atol=0.03)  # the palette rounds
+    for k in (1, 2):
+        vvgt.ok(
+            "render",
+            run / f"run_{k + 8}.npy",
+            *LOOK,
+            "--tf-range 0,2 --background",
+            0,
+            0,
+            1,
+            "-o",
+            tmp_path / f"{k}.png",
+        )
+        with Image.open(tmp_path / f"{k}.png") as alone:
+            assert psnr(np.asarray(alone.convert("RGB"), np.float32) / 255, pictures[k]) > 28
+    done = vvgt.ok("render", run / "run_*.npy", *LOOK, *blocks, "--rule mip --orbit 7 -o", tmp_path / "m_{:02d}.png")
+    assert "7 views" in done.err
+    greatest = [np.asarray(Image.open(tmp_path / f"m_{k:02d}.png"))[..., :3].max() / 255 for k in range(7)]
+    np.testing.assert_allclose(greatest, [0, 0, 0.5, 0.5, 1, 1, 1], atol=0.06)
+    vvgt.ok("render", run / "run_*.npy", *LOOK, *blocks, "--rule xray -o", tmp_path / "x.gif")
+    assert (np.diff(gif(tmp_path / "x.gif")[0].mean(axis=(1, 2, 3))) > 0).all()
+
+
+def test_a_label_map_without_labels_is_an_empty_frame(tmp_path, vvgt):
+    table = {n: {"name": str(n), "color": [1, 0, 0], "opacity": 0.9} for n in (1, 2)}
+    (tmp_path / "table.json").write_text(json.dumps(table))
+    for k in range(3):
+        np.save(tmp_path / f"map_{k}.npy", np.full((8, 8, 8), k, np.uint8))
+    for labels in ("auto", tmp_path / "table.json"):
+        out = ("--size 16 --overwrite -o", tmp_path / "{}.png")
+        vvgt.ok("render", tmp_path / "map_?.npy", "--labels", labels, *out)
+        shown = [np.asarray(Image.open(tmp_path / f"{k}.png"))[..., 3].any() for k in range(3)]
+        assert shown == [False, True, True]
+
+
+def test_a_layer_of_a_series_that_shows_nothing_is_named(run, tmp_path, vvgt):
+    far = {"points": [{"x": x, "rgb": [1, 0, 0], "opacity": x - 50} for x in (50, 51)]}
+    (tmp_path / "far.json").write_text(json.dumps(far))
+    layer = f"{run / 'run_9.npy'},tf={tmp_path / 'far.json'}"
+    with pytest.warns(UserWarning, match="run_9, transfer function: nothing is visible: the data lie in") as said:
+        vvgt.ok("render", run / "run_*.npy", *LOOK, "--layer", layer, "-o", tmp_path / "time.gif")
+    assert len({str(one.message) for one in said}) == 1  # of which one is shown
+
+
+def test_a_frame_is_opened_for_its_own_views_after_the_one_before_is_gone(run, tmp_path, monkeypatch):
+    opened, held, volume = [], [], command._volume
+
+    def watched(run, request, asked, cameras, stack):
+        assert not [one for one in held if one() is not None]
+        stack.callback(opened.append, "closed")
+        opened.append([camera.name for camera in cameras])
+        draw, by = volume(run, request, asked, cameras, stack)
+        held.append(weakref.ref(draw))
+        return draw, by
+
+    monkeypatch.setattr(command, "_volume", watched)
+    source = SourceRequest(str(run / "run_*.npy"), tf="viridis")
+    request = command.RenderRequest(source, str(tmp_path / "a.gif"), orbit=7, size=16)
+    command.render_file(request, Console(quiet=True))
+    names = [camera.name for camera in orbit_views(7)]
+    assert opened == [names[:2], "closed", names[2:4], "closed", names[4:], "closed"]
+
+
+def test_files_of_gaussians_are_a_movie_over_time(ply, tmp_path, vvgt):
+    """Each is where its volume is, seen by the first file's camera and rule; an empty one is black."""
+    gaussians = replace(ply[0], log_scales=ply[0].log_scales - 2)  # thin: what they look like depends on the rule
+    up = replace(orbit_views(1, size=64)[0], rotation=orbit_views(1)[0].rotation @ upright_matrix("x"))
+    options = PlyOptions(scale=1.0, centre=(0, 0, 0), up="x", made_for=64, rule="compensated")
+    write_ply(tmp_path / "f_8", gaussians, options)
+    write_ply(tmp_path / "f_9", gaussians, replace(options, scale=2.0, centre=(0.1, 0, 0), up="none", rule="inria"))
+    head = (tmp_path / "f_8").read_bytes().partition(b"end_header")[0].replace(b"vertex 40", b"vertex 0")
+    (tmp_path / "f_10").write_bytes(head + b"end_header\n")
+    vvgt.ok("render", tmp_path / "f_*", "-o", tmp_path / "time.gif")
+    pictures, times, _ = gif(tmp_path / "time.gif")
+    assert (len(pictures), set(times)) == (3, {200})
+    moved = rescale(gaussians, 0.5, np.zeros(3), np.array([0.1, 0, 0]))
+    for some, picture in zip((gaussians, moved), pictures, strict=False):
+        assert psnr(render(some, up, rule_of("compensated"))[..., :3], picture) > 40
+    assert pictures[2].max() < 0.03  # the palette rounds
+
+
+def test_live_files_of_unlike_boxes_and_histograms_have_one_exposure(tmp_path, vvgt):
+    """The same box alone and in one of twice the edge, where most values are 0, has the same X-ray."""
+    ball = np.zeros((8, 8, 8), np.float32)
+    ball[2:6, 2:6, 2:6] = 1
+    np.save(tmp_path / "run_0.npy", ball)
+    np.save(tmp_path / "run_1.npy", np.pad(ball, 4))
+    for k in range(2):
+        live = "--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,1 -o"
+        vvgt.ok("convert", tmp_path / f"run_{k}.npy", live, tmp_path / f"live_{k}.ply")
+    first, second = (read_ply(tmp_path / f"live_{k}.ply")[1] for k in range(2))
+    assert first.scale == 2 * second.scale
+    larger, around = read_ply(tmp_path / "live_1.ply")[0], replace(layout_of(second), centre=first.centre)
+    write_ply(tmp_path / "live_1.ply", larger, around)
+    write_ply(tmp_path / "live_2.ply", larger, replace(around, space="LPS"))
+    vvgt.ok("render", tmp_path / "live_[01].ply", "--rule xray --size 48 -o", tmp_path / "x_{}.png")
+    one, other = (np.asarray(Image.open(tmp_path / f"x_{k}.png"), float)[..., 0] for k in range(2))
+    assert one.max() > 100
+    np.testing.assert_allclose(one.mean(), other.mean(), rtol=0.15)
+    write_ply(tmp_path / "live_3.ply", read_ply(tmp_path / "live_0.ply")[0], replace(layout_of(first), space="RAS"))
+    said = vvgt.fails(1, "render", tmp_path / "live_[23].ply", "-o", tmp_path / "time.gif")
+    assert "live_3.ply: positions in RAS; expected LPS, as in the first frame" in said
+
+
+def test_frames_that_are_no_movie_are_named(run, ply, tmp_path, vvgt):
+    for k, hi in enumerate((1, 1, 2)):
+        live = f"--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,{hi} -o"
+        vvgt.ok("convert", run / "run_9.npy", live, tmp_path / f"live_{k}.ply")
+    (tmp_path / "live_3.ply").write_bytes(b"ply\n")
+    for k in range(3):
+        imwrite(tmp_path / f"slice_{k}.tif", np.full((8, 8), k, np.uint8))
+    time = ("-o", tmp_path / "time.gif")
+    for code, said, *words in (
+        (2, "got 3 frames; expected a movie, as -o time.gif", run / "run_*.npy", *LOOK, "-o", tmp_path / "a.png"),
+        (
+            2,
+            "got 3 frames; expected a movie, as -o time.gif",
+            run / "run.ome.tif",
+            *LOOK,
+            "--orbit 4 -o",
+            tmp_path / "d",
+        ),
+        (2, "2 views of 3 frames", run / "run_*.npy", *LOOK, "--orbit 2", *time),
+        (2, "no such files", tmp_path / "none_*.ply", *time),
+        (2, "either --camera FILE or --orbit N", tmp_path / "liv?_0.ply", *time),
+        (2, "either --camera FILE or --orbit N", tmp_path / "slice_?.tif", *time),
+        (2, "either --camera FILE or --orbit N", run / "run_9.npy", *LOOK, *time),
+        (1, "live_2.ply: its values have another range or function", tmp_path / "live_[0-2].ply", "--rule mip", *time),
+        (
+            1,
+            "nothing is visible in any of 2 frames",
+            tmp_path / "live_[01].ply",
+            "--tf viridis:0.99,1 --size 24",
+            *time,
+        ),
+        (1, "live_3.ply: no 'end_header'", tmp_path / "live_[03].ply", *time),
+    ):
+        assert said in vvgt.fails(code, "render", *words)
+        assert not (tmp_path / "time.gif").exists()
 
 
 def test_an_mp4_of_an_orbit_over_white(ply, tmp_path, vvgt):

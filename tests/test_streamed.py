@@ -14,7 +14,8 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.view import named_files, streamed_resources
+from vvgt_cli.commands.view import streamed_resources
+from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.shards.cut import Node
 from vvgt_cli.conversion.shards.level_selection import CutErrors, level_errors
 from vvgt_cli.conversion.shards.regions import Made, save

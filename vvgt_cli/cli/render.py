@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option(
     "-o", "--output", required=True, metavar="DIR|FILE",
-    help="One picture such as out.png, a directory for several, created if missing, or a movie such as turn.gif or "
-    "turn.mp4.",
+    help="One picture such as out.png, a directory for several, created if missing, numbered ones such as "
+    "'out_{:04d}.png', or a movie such as turn.gif or turn.mp4.",
 )  # fmt: skip
 @click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
 @click.option(
@@ -53,30 +53,36 @@ def command(
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
     Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif
-    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. The up axis is the one
-    recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels: FOLDER#1
-    is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown under any
-    function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name. Of a volume of values,
-    and of its live .ply, --rule mip shows the greatest value along each ray, from black for the least value of the
-    volume to white for the greatest, and --rule xray the sum of extinction under the function, both opaque and unlit.
+    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. A quoted glob of
+    volumes or of Gaussians, a file of several time steps, or an index of 'vvgt convert' becomes a movie over time, or
+    numbered pictures: 5 frames per second from one view, or several views shared among the frames. The up axis is the
+    one recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels:
+    FOLDER#1 is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown
+    under any function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name. Of a volume of
+    values, and of its live .ply, --rule mip shows the greatest value along each ray, from black for the least value of
+    the volume to white for the greatest, and --rule xray the sum of extinction under the function, both opaque and
+    unlit.
 
     Examples:
       vvgt render head.nrrd --tf ct-bone --size 800 -o head.png
       vvgt render frog.ply --orbit 36 --size 800 -o turn
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
+      vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
     from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.commands.render import RenderRequest, render_file
+    from vvgt_cli.conversion.index import named_files
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians.formats import is_splats
     from vvgt_cli.volume import ReadOptions
 
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    given: str | SourceRequest = file
+    names = tuple(path for _, path in named_files([file]))
+    given: tuple[str, ...] | SourceRequest = names
     function, options = None, block_options_of(blocks)
-    if is_splats(file) or (file == "-" and read["dims"] is None):
+    if any(map(is_splats, names)) or (file == "-" and read["dims"] is None):
         if ReadOptions(**read) != ReadOptions() or options is not None:
             raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
         tf, tf_range, distance, labels, layers = optics.values()

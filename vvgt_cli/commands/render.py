@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,15 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.commands.render_views import draw_in_blocks
+from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
+from vvgt_cli.conversion.frames import Series, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
+from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
+from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -30,6 +35,7 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
+from vvgt_cli.gaussians.formats.page_live import shared_facts
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
@@ -53,12 +59,14 @@ class RenderRequest:
     """Pictures to draw.
 
     Attributes:
-        given: file of Gaussians, "-" for standard input, of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`); or a volume with its look.
-        output: directory for the images, one picture (`PICTURE`), or a movie by its ending
-            (`SUFFIXES`).
+        given: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
+            (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie; or a volume or a series of volumes
+            with its look.
+        output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
+            ending (`SUFFIXES`).
         camera: view-set file, or None.
-        orbit: number of views on a circle around the up axis, or None; not both. A single picture needs neither.
+        orbit: number of views on a circle around the up axis, or None; not both. Single pictures and frames need
+            neither.
         size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
         rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `vvgt_cli.conversion.grey.NAMES`, also for a
             volume; None: the Gaussians' file's.
@@ -69,7 +77,7 @@ class RenderRequest:
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
     """
 
-    given: str | SourceRequest
+    given: tuple[str, ...] | SourceRequest
     output: str
     camera: str | None = None
     orbit: int | None = None
@@ -82,98 +90,188 @@ class RenderRequest:
     blocks: BlockOptions | None = None
 
     @property
-    def single(self) -> bool:
-        """Return whether the output is one picture."""
+    def png(self) -> bool:
+        """Whether the output is one picture, or numbered ones."""
         return Path(self.output).suffix.lower() == PICTURE
 
     @property
     def movie(self) -> bool:
-        """Return whether the output is a movie."""
+        """Whether the output is a movie."""
         return Path(self.output).suffix.lower() in SUFFIXES
 
-    def cameras(self, size: int | None = None, up: str = "none") -> list[Camera]:
-        """Return the views; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults.
+    def views(self, frames: int, size: int | None = None, up: str = "none") -> list[list[Camera]]:
+        """Return the views of each frame; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults.
+
+        Several views are shared evenly among the frames, in their order; all frames have a single one in common.
 
         Raises:
-            UsageError: no views are given, or several for one picture.
+            UsageError: no views are given, several for one picture, or fewer than frames.
         """
-        if (self.camera is None) == (self.orbit is None) and not (self.single and self.camera is None):
-            raise UsageError("give the views with either --camera FILE or --orbit N, or one picture, as -o out.png")
+        still = self.camera is None and (self.png or frames > 1)
+        if (self.camera is None) == (self.orbit is None) and not still:
+            raise UsageError(
+                "give the views with either --camera FILE or --orbit N, or one picture, as -o out.png, or a series for "
+                "a movie, as 'run_*.vti'"
+            )
         if self.camera is not None:
             cameras = read_cameras(self.camera, self.size)
         else:
-            cameras = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
-        if self.single and len(cameras) > 1:
+            circle = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
+            cameras = [to_box_frame(camera, upright_matrix(up))[0] for camera in circle]
+        if self.png and len(cameras) > 1 and not is_pattern(self.output):
             raise UsageError(f"-o {self.output}: one picture of {len(cameras)} views; expected a directory")
-        if self.camera is not None:
-            return cameras
-        return [to_box_frame(camera, upright_matrix(up))[0] for camera in cameras]
+        cameras *= frames if len(cameras) == 1 else 1
+        if len(cameras) < frames:
+            raise UsageError(
+                f"{len(cameras)} views of {frames} frames; expected a view of each, as --orbit {frames}, or one of all"
+            )
+        ends = [k * len(cameras) // frames for k in range(frames + 1)]
+        return [cameras[a:b] for a, b in pairwise(ends)]
 
+    def files(self, cameras: list[Camera]) -> list[str]:
+        """Return the movie, or the picture of each view."""
+        if self.movie:
+            return [self.output]
+        if not self.png:
+            return [str(Path(self.output, f"{camera.name}{PICTURE}")) for camera in cameras]
+        named = is_pattern(self.output)
+        return [put_name("-o", self.output, FRAMES, str(k)) if named else self.output for k in range(len(cameras))]
 
-def _check_directory(request: RenderRequest, names: list[str]) -> None:
-    directory = Path(request.output)
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(f"-o {directory}: is a file; expected a directory for the images")
-    if not directory.parent.is_dir():
-        raise UsageError(f"-o {directory}: no directory {directory.parent}; make it first")
-    if request.overwrite:
-        return
-    for name in names:
-        if (directory / name).exists():
-            raise UsageError(f"-o {directory}: {name} exists; choose another directory or pass --overwrite")
+    def check(self, frames: int) -> list[list[Camera]]:
+        """Return the views of frames yet to be read; raise UsageError or DataError for bad options or outputs."""
+        where = Path(self.output)
+        if self.rule in NAMES and self.background is not None:
+            raise UsageError(f"--background: pictures of --rule {self.rule} are opaque; omit it")
+        if self.movie and self.exr:
+            raise UsageError(f"--exr writes pictures, -o {where} is a movie; give only one of the two")
+        if frames > 1 and not (self.movie or (self.png and is_pattern(self.output))):
+            raise UsageError(
+                f"-o {where}: got {frames} frames; expected a movie, as -o time.gif or -o time.mp4, or a picture of "
+                "each, as -o 'out_{:04d}.png' (or --time N for one time step of a file)"
+            )
+        shares = self.views(frames)
+        cameras = list(chain(*shares))
+        files = self.files(cameras)
+        if self.movie and len({(camera.width, camera.height) for camera in cameras}) > 1:
+            raise UsageError(f"-o {where}: views of several sizes; a movie has one: give --size")
+        outputs = [Output("-o", file) for file in files]
+        outputs += [Output("--exr", str(Path(file).with_suffix(".exr"))) for file in files if self.exr]
+        if where.suffix.lower() == ".mp4":
+            _ffmpeg(str(where))
+        if not (self.movie or self.png):
+            check_folder(where, "images")
+            outputs.append(Output("-o", str(where / VIEWS_FILE)))
+        if self.movie or self.png or where.is_dir():
+            inputs = self.given.paths() if isinstance(self.given, SourceRequest) else self.given
+            check_outputs(outputs, inputs, self.overwrite)
+        return shares
 
 
 def render_file(request: RenderRequest, console: Console | None = None) -> int:
-    """Write one PNG (and EXR) per view and `transforms.json`, one picture, or a movie; return the number of views.
+    """Write one PNG (and EXR) per view and `transforms.json`, single pictures, or a movie; return the number of views.
 
     Raises:
-        UsageError: an image exists, or the directory cannot be made.
+        UsageError: an image exists, or the directory cannot be made; views or an output that do not suit the frames.
         DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
     """
-    console = console or Console()
-    run = Run(console, ConversionReport("render"))
-    cameras = request.cameras()
-    if request.rule in NAMES and request.background is not None:
-        raise UsageError(f"--background: pictures of --rule {request.rule} are opaque; omit it")
-    if request.movie and request.exr:
-        raise UsageError(f"--exr writes pictures, -o {request.output} is a movie; give only one of the two")
-    if request.movie or request.single:
-        inputs = [request.given] if isinstance(request.given, str) else request.given.paths()
-        floats = [Output("--exr", str(Path(request.output).with_suffix(".exr")))] if request.exr else []
-        check_outputs([Output("-o", request.output), *floats], inputs, request.overwrite)
-    else:
-        names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
-        _check_directory(request, [*names, VIEWS_FILE])
-    if request.movie:
-        movie_ready(request.output)
+    run, given = Run(console or Console(), ConversionReport("render")), request.given
+    if not isinstance(given, SourceRequest):
+        return _render(run, request, given)
+    over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
+    if not over_time and not is_glob_of_volumes(given.path):
+        try:
+            return _render(run, request, [given])
+        except SeveralSteps:  # which are the frames
+            pass
+    series = Series(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
+    return _render(run, request, series.sources(), series)
+
+
+def _render(
+    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest], series: Series | None = None
+) -> int:  # fmt: skip
+    """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
+    shares = request.check(len(frames))
+    if series is not None and len(frames) > 1:
+        series.prepare(run)
+        request, frames = replace(request, blocks=series.request.blocks), series.sources()
     with ExitStack() as stack:
-        if isinstance(request.given, str):
-            draw, cameras, by = _gaussians(run, request, request.given)
-        else:
-            draw, by = _volume(run, request, request.given, cameras, stack)
+        draw, by, first = _frame(run, request, frames[0], shares[0], stack)
+        if first is not None:
+            shares = request.views(len(frames), first.made_for, first.up)
+        cameras, opened = list(chain(*shares)), [draw]
+        del draw
+
+        def pictures() -> Iterator[np.ndarray]:
+            bar, done, shown = run.console.bar("render"), 0, len(frames) == 1
+            quiet = Run(Console(quiet=True), run.report)
+            for given, share in zip(frames, shares, strict=True):
+                draw = opened.pop() if opened else _frame(quiet, request, given, share, stack, first)[0]
+                for camera in share:
+                    picture = draw(camera)
+                    yield picture
+                    shown, done = shown or bool(picture[..., 3].any()), done + 1
+                    if bar:
+                        bar(done, len(cameras))
+                del draw
+                stack.close()
+            if not shown:
+                raise DataError(f"nothing is visible in any of {len(frames)} frames; try another function")
+
         with run.stage("render") as stage:
-            note = (_movie if request.movie else _pictures)(request, console, draw, cameras)
+            note = (_movie if request.movie else _pictures)(request, pictures(), cameras)
             stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {by} in {note}"
     return len(cameras)
 
 
-def _gaussians(run: Run, request: RenderRequest, name: str) -> tuple[Draw, list[Camera], str]:
-    """Return the renderer of Gaussians, the views in their file's orientation, and the name of the rule."""
-    from vvgt_cli.splat import render
-
-    if request.rule in NAMES:
-        with run.stage("read") as stage:
-            gaussians, header = open_gaussians(name)
-            stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-        draw = draw_gaussians(name, gaussians, header, request.rule, request.function)
-        run.compile(GREY)
-        return draw, request.cameras(header.made_for, header.up), request.rule
+def _frame(
+    run: Run, request: RenderRequest, given: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
+    first: PlyHeader | None = None,
+) -> tuple[Draw, str, PlyHeader | None]:  # fmt: skip
+    """Return the renderer of a frame, its name, and the header of Gaussians; ``first`` is that of the first frame."""
+    if isinstance(given, SourceRequest):
+        return (*_volume(run, request, given, cameras, stack), None)
     with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request, name)
+        seen, gaussians, header = _opened(request, given, first)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-    rule = file_rule(header, request.rule)
-    run.compile(for_degree(DRAW, gaussians.degree))
-    return lambda camera: render(seen(camera), camera, rule), request.cameras(header.made_for, header.up), rule.name
+    if request.rule in NAMES:
+        edge = 2.0 * header.scale / first.scale if first and first.scale and header.scale else 2.0
+        draw, by = draw_gaussians(given, gaussians, header, request.rule, request.function, edge), request.rule
+        run.compile(GREY)
+    else:
+        from vvgt_cli.splat import render
+
+        rule = file_rule(first or header, request.rule)
+        run.compile(for_degree(DRAW, gaussians.degree))
+        draw, by = lambda camera: render(seen(camera), camera, rule), rule.name
+    return _placed(draw, given, header, first), by, header
+
+
+def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
+    """Return the header with the histograms of the first file's values, or raise DataError if they differ in range."""
+    if first.live is None or header.live is None or shared_facts([first.live, header.live]) is None:
+        raise DataError(
+            f"{name}: its values have another range or function than those of the first frame; expected frames that "
+            "'vvgt convert --live' makes of one series"
+        )
+    pairs = zip(header.live.layers, first.live.layers, strict=True)
+    own, *others = [replace(layer, histogram=same.histogram) for layer, same in pairs]
+    return replace(header, live=replace(own, others=tuple(others)))
+
+
+def _placed(draw: Draw, name: str, header: PlyHeader, first: PlyHeader | None) -> Draw:
+    """Return the renderer of a file's Gaussians for cameras in the unit frame of the first file, if both are known.
+
+    Raises:
+        DataError: the files' worlds have different axes or units.
+    """
+    if first is None or not (first.scale and first.centre and header.scale and header.centre):
+        return draw
+    for one, other in ((header.space, first.space), (header.length_unit, first.length_unit)):
+        if one and other and one != other:
+            raise DataError(f"{name}: positions in {one}; expected {other}, as in the first frame")
+    factor, offset = first.scale / header.scale, first.scale * np.subtract(header.centre, first.centre)
+    return lambda camera: draw(replace(camera, translation=(camera.rotation @ offset + camera.translation) / factor))
 
 
 def _volume(
@@ -182,48 +280,46 @@ def _volume(
     """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
     from vvgt_cli.dvr import RenderSettings, render_view
 
-    settings, options = RenderSettings(), request.blocks or automatic(asked, run.console)
+    settings, options, found = RenderSettings(), request.blocks or automatic(asked, run.console), None
     if options is not None:
         needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
         found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
-        source = _upright(found.source)
-        if request.rule == MIP:
-            run.compile(GREATEST, source.kernel_type())
-            return render_in_box(mip_of(found), source.volume.axes), "MIP in blocks"
-        if request.rule == XRAY:
-            found = found.with_look(as_xray(source))
-            source = found.source
-        run.compile(for_blocks(source.kernels(RAYCAST)), source.kernel_type())
-        draw = draw_in_blocks(found, settings, cameras)
-        return (absorbed(draw), "X-ray in blocks") if request.rule else (draw, "ray casting in blocks")
-    with run.stage("read") as stage:
-        source = _upright(load(asked))
-        stage.note = describe_source(source)
-    if request.rule == MIP:
-        run.compile(GREATEST, source.kernel_type())
-        return render_in_box(mip_of(source), source.volume.axes), "MIP"
-    if request.rule == XRAY:
-        source = as_xray(source)
-    run.compile(source.kernels(RAYCAST), source.kernel_type())
-    scene = source.scene()
-    draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    return (absorbed(draw), "X-ray") if request.rule else (draw, "ray casting")
-
-
-def _upright(source: Source) -> Source:
-    """Refuse a sheared volume, which no pinhole camera sees."""
-    if source.volume.sheared:
+        source = found.source
+    else:
+        with run.stage("read") as stage:
+            source = load(asked)
+            stage.note = describe_source(source)
+    if source.volume.sheared:  # no pinhole camera sees it
         text = shear_text(source.volume.axes)
         raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
-    return source
+    where = " in blocks" if found else ""
+    if request.rule == MIP:
+        run.compile(GREATEST, source.kernel_type())
+        return render_in_box(mip_of(found or source), source.volume.axes), f"MIP{where}"
+    if request.rule == XRAY:
+        source = as_xray(source)
+        found = found and found.with_look(source)
+    kernels = source.kernels(RAYCAST)
+    run.compile(for_blocks(kernels) if found else kernels, source.kernel_type())
+    if found:
+        draw = draw_in_blocks(found, settings, cameras)
+    else:
+        scene = source.scene()
+        draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
+    if request.rule == XRAY:
+        return lambda camera: grey(draw(camera)[..., 3]), f"X-ray{where}"
+    return draw, f"ray casting{where}"
 
 
-def _opened(request: RenderRequest, name: str) -> tuple[Seen, Gaussians, PlyHeader]:
-    """Return the Gaussians for a camera, those for all cameras or the coarsest level, and the header."""
-    manifest = by_view(name)
+def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
+    """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
+    manifest, function = by_view(name), None if request.rule in NAMES else request.function
     if manifest is None:
-        gaussians, header = open_gaussians(name)
-        gaussians = recolored(name, gaussians, header, request.function)
+        several = isinstance(request.given, tuple) and len(request.given) > 1
+        gaussians, header = open_gaussians(name, empty=several)
+        if first is not None and (request.rule in NAMES or request.function is not None):
+            header = _in_range(name, header, first)
+        gaussians = recolored(name, gaussians, header, function, empty=several)
         return lambda camera: gaussians, gaussians, header
     levels = StreamedLevels(manifest)
     coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
@@ -233,47 +329,33 @@ def _opened(request: RenderRequest, name: str) -> tuple[Seen, Gaussians, PlyHead
         field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
         return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), name))
 
-    return seen, recolored(name, coarsest, header, request.function), header
+    return seen, recolored(name, coarsest, header, function), header
 
 
-def _pictures(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
-    """Write PNG and EXR, and `transforms.json` beside several; return the directory or file."""
+def _pictures(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
+    """Write PNG and EXR, and `transforms.json` beside those in a directory; return the output."""
     from vvgt_cli.images import over, write_exr, write_png
 
     where = Path(request.output)
-    if not request.single:
+    if not request.png:
         where.mkdir(exist_ok=True)
-    bar = console.bar("render")
-    for done, camera in enumerate(cameras, 1):
-        image = draw(camera)
-        path = where if request.single else where / f"{camera.name}.png"
+    for file, camera, image in zip(request.files(cameras), cameras, pictures, strict=True):
         if request.exr:
-            write_exr(path.with_suffix(".exr"), image, camera=camera, overwrite=request.overwrite)
-        shown = image if request.background is None else over(image, request.background)
-        write_png(path, shown, request.overwrite)
-        if bar:
-            bar(done, len(cameras))
-    if not request.single:
+            write_exr(Path(file).with_suffix(".exr"), image, camera=camera, overwrite=request.overwrite)
+        write_png(file, image if request.background is None else over(image, request.background), request.overwrite)
+    if not request.png:
         write_text(str(where / VIEWS_FILE), transforms_json(cameras), request.overwrite)
     return str(where)
 
 
-def _movie(request: RenderRequest, console: Console, draw: Draw, cameras: list[Camera]) -> str:
-    """Write one movie, and return its name and what it holds; raise UsageError for views of several sizes."""
+def _movie(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
+    """Write one movie, and return its name and what it holds."""
     from vvgt_cli.images import over
 
-    if len({(camera.width, camera.height) for camera in cameras}) > 1:
-        raise UsageError(f"-o {request.output}: views of several sizes; a movie has one: give --size")
-    bar = console.bar("render")
-
-    def pictures() -> Iterator[np.ndarray]:
-        for done, camera in enumerate(cameras, 1):
-            yield over(draw(camera), request.background or BLACK)
-            if bar:
-                bar(done, len(cameras))
-
-    size = write_movie(request.output, pictures(), request.overwrite)
-    return f"{request.output}: {len(cameras) / RATE:.1f} s, {size / 1e6:.2f} MB"
+    rate = SLOW if cameras[0] is cameras[-1] else RATE
+    shown = (over(picture, request.background or BLACK) for picture in pictures)
+    size = write_movie(request.output, shown, request.overwrite, rate)
+    return f"{request.output}: {len(cameras) / rate:.1f} s, {size / 1e6:.2f} MB"
 
 
 def as_xray(source: Source) -> Source:
@@ -281,13 +363,8 @@ def as_xray(source: Source) -> Source:
     source.require_scalar_field()
     layer = source.layers[0]
     assert isinstance(layer.tf, TransferFunction)
-    distance = exposed_distance(layer.tf, source.statistics, 2 / source.volume.unit_frame().scale)
+    distance = exposed_distance(layer.tf, source.overall, 2 / source.volume.unit_frame().scale)
     return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
-
-
-def absorbed(draw: Draw) -> Draw:
-    """Return the function that draws what is absorbed in the pictures of ``draw``."""
-    return lambda camera: grey(draw(camera)[..., 3])
 
 
 def mip_of(field: Blocked | Source) -> Draw:
@@ -303,7 +380,7 @@ def mip_of(field: Blocked | Source) -> Draw:
     from vvgt_cli.dvr.scene import kernel_values
 
     values, slope, intercept = kernel_values(source.volume)
-    whole = Box(values, None, _of_range(source.statistics, slope, intercept), np.zeros(3, np.int64))
+    whole = Box(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
     part = whole, whole.begin, np.array(source.volume.dims)
     return lambda camera: grey(_greatest(source, [part], camera))
 
@@ -312,7 +389,7 @@ def _blocks(field: Blocked) -> Iterator[Part]:
     """Yield the blocks of a volume."""
     reader, volume = field.reader, field.source.volume
     assert isinstance(reader, Scalars)
-    optics = _of_range(field.source.statistics, reader.rule.slope, reader.rule.intercept)
+    optics = _of_range(field.source.overall, reader.rule.slope, reader.rule.intercept)
     blocks = Boxes(volume.dims, (field.edge, field.edge, field.edge))
     for number in range(len(blocks)):
         lo, hi = blocks.at(number)
@@ -347,25 +424,20 @@ def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
 
 
 SUFFIXES = (".gif", ".mp4")
-RATE = 25  # pictures per second: 4 hundredths each, which GIF can represent
+RATE, SLOW = 25, 5  # pictures per second, a hundredth times 4 and 20, which GIF can represent; SLOW is as pages play
 _QUALITY = "18"  # of x264: visually almost lossless
 _MOST = 1 << 16  # colours that a palette is computed from
 _COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
 
 
-def movie_ready(path: str | Path) -> None:
-    """Check that a movie of this name can be written; raise DataError if a library that it needs is not installed."""
-    if Path(path).suffix.lower() == ".mp4":
-        _ffmpeg(str(path))
-
-
-def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False) -> int:
+def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False, rate: int = RATE) -> int:
     """Write pictures as a looping movie, and return its size in bytes.
 
     Args:
         path: a file that ends in one of `SUFFIXES`.
         pictures: (h, w, 3) float32 RGB in [0, 1] (clipped), at least one, all of the same size.
         overwrite: replace an existing file.
+        rate: pictures per second.
 
     Raises:
         DataError: the library fails or is not installed, or the file cannot be written.
@@ -373,11 +445,11 @@ def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: boo
     """
     frames = (np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8) for picture in pictures)
     with atomic_write(path, overwrite) as temporary:
-        (_gif if Path(path).suffix.lower() == ".gif" else _mp4)(temporary, frames)
+        (_gif if Path(path).suffix.lower() == ".gif" else _mp4)(temporary, frames, rate)
         return temporary.stat().st_size
 
 
-def _gif(path: Path, frames: Iterator[np.ndarray]) -> None:
+def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
     """Write a GIF that loops forever, with one palette for all pictures, so that static parts do not flicker."""
     from PIL import Image
 
@@ -387,7 +459,7 @@ def _gif(path: Path, frames: Iterator[np.ndarray]) -> None:
     colors = colors[:: max(len(colors) // _MOST, 1)]
     palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // RATE, loop=0, optimize=False)
+    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // rate, loop=0, optimize=False)
 
 
 def _ffmpeg(source: str) -> Any:
@@ -400,7 +472,7 @@ def _ffmpeg(source: str) -> Any:
     return imageio_ffmpeg
 
 
-def _mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
+def _mp4(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
     """Write H.264 that all players support: 4:2:0, with the last row or column repeated to get even sizes."""
     library, writer = _ffmpeg(str(path)), None
     try:
@@ -409,7 +481,7 @@ def _mp4(path: Path, frames: Iterator[np.ndarray]) -> None:
             even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if writer is None:
                 writer = library.write_frames(
-                    str(path), (even.shape[1], even.shape[0]), fps=RATE, codec="libx264", macro_block_size=2,
+                    str(path), (even.shape[1], even.shape[0]), fps=rate, codec="libx264", macro_block_size=2,
                     output_params=["-crf", _QUALITY, "-movflags", "+faststart"], ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)

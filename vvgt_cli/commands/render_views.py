@@ -156,10 +156,7 @@ class ViewsRequest:
             UsageError: two functions of one name, or a folder that cannot be made.
         """
         root = Path(self.output)
-        if root.exists() and not root.is_dir():
-            raise UsageError(f"-o {root}: is a file; expected a directory for the views")
-        if not root.parent.is_dir():
-            raise UsageError(f"-o {root}: no directory {root.parent}; make it first")
+        check_folder(root, "views")
         if len(self.tfs) < 2:
             return [root]
         names: dict[str, str] = {}
@@ -169,6 +166,14 @@ class ViewsRequest:
                 raise UsageError(f"--tf {names[name]} and --tf {tf} would both go to {root / name}; rename one")
             names[name] = tf
         return [root / name for name in names]
+
+
+def check_folder(folder: Path, content: str) -> None:
+    """Raise UsageError unless a folder for ``content`` is there or can be made."""
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
 
 
 def function_name(tf: str) -> str:

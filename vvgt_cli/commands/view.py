@@ -26,7 +26,7 @@ from vvgt_cli.conversion.gaussian_files import (
     write_gaussians,
     write_page,
 )
-from vvgt_cli.conversion.index import files_of, is_index
+from vvgt_cli.conversion.index import named_files
 from vvgt_cli.errors import DataError, NoLiveForm, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -42,7 +42,6 @@ from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.volume.tiff.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
 SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
@@ -184,31 +183,6 @@ def _only_gaussians(files: Sequence[str]) -> None:
         )
 
 
-def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return name and path of the files that names, globs and indexes of `vvgt convert` stand for.
-
-    Raises:
-        UsageError: as `expanded`.
-        DataError: as `vvgt_cli.conversion.index.files_of`.
-    """
-    found: list[tuple[str, str]] = []
-    for name in names:
-        name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
-        found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded([name])]
-    return found
-
-
-def expanded(names: Sequence[str]) -> list[str]:
-    """Return the files of names and globs (these sorted by their numbers); raise UsageError if a glob matches none."""
-    files: list[str] = []
-    for name in names:
-        found = [] if os.path.exists(name) or not set(name) & set("*?[") else [str(path) for path in matching(name)]
-        if not found and set(name) & set("*?[") and not os.path.exists(name):
-            raise UsageError(f"{name}: no such files; expected files of Gaussians ({', '.join(SUFFIXES)}), or a volume")
-        files += found if any(map(is_splats, found)) else [name]  # a glob may be a volume: slices
-    return files
-
-
 def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, Extras]:
     """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
     given = request.source
@@ -239,14 +213,13 @@ def _serve(
     controller = PageController(site.resources, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
-        if is_streamed(files[0]):
+        if given := files[0] == STDIN or is_splats(files[0]):
             _refuse_reading(request.source, files[0])
+        if is_streamed(files[0]):
             resources |= streamed_resources(files[0])
         elif len(files) > 1:
-            _refuse_reading(request.source, files[0])
             resources |= _series(clouds)
-        elif files[0] == STDIN or is_splats(files[0]):
-            _refuse_reading(request.source, files[0])
+        elif given:
             gaussians, header = open_gaussians(files[0])
             controller.show(Cloud(gaussians, layout_of(header), controller.name))
         url = stack.enter_context(served(site, request.port))

@@ -14,7 +14,6 @@ from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.index import FRAMES
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
-from vvgt_cli.conversion.previous_frame import previous_frame
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
@@ -110,6 +109,8 @@ class Series(Batch):
 
     def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
         """List the frames; ``page`` limits the Gaussians of live frames."""
+        from vvgt_cli.conversion.previous_frame import previous_frame
+
         self._steps: Sequence[Step] = list_steps(request.source)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
@@ -129,8 +130,7 @@ class Series(Batch):
             console.message(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
             request = replace(request, fit=replace(request.fit, max_gaussians=self._most))
         if request.blocks is None:
-            first = replace(request.source, volume=steps[0].volume, read=steps[0].read)
-            request = replace(request, blocks=automatic(first, console))
+            request = replace(request, blocks=automatic(self.sources()[0], console))
         source = request.source
         with run.stage("frames") as stage:
             found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
@@ -153,10 +153,14 @@ class Series(Batch):
         self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
         self.request = replace(request, source=source)
 
+    def sources(self) -> list[SourceRequest]:
+        """Return the request of each frame, with what all share once that is prepared."""
+        return [replace(self.request.source, volume=step.volume, read=step.read) for step in self._steps]
+
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item for each frame that shows something."""
         console, done, mine = run.console, 0, 0
-        for k, (step, stem) in enumerate(zip(self._steps, self.stems, strict=True)):
+        for k, (step, stem, source) in enumerate(zip(self._steps, self.stems, self.sources(), strict=True)):
             mine += self._shard.holds(k) and not self._dark[k]
             if not wanted(stem):
                 continue
@@ -164,7 +168,6 @@ class Series(Batch):
                 console.message(f"skipped: {step.name} (nothing of it is visible)")
                 continue
             console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
-            source = replace(self.request.source, volume=step.volume, read=step.read)
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
         console.message(f"{done} frames converted, {mine - done} were complete before")
@@ -196,9 +199,14 @@ class Series(Batch):
         }
 
 
+def is_glob(path: str) -> bool:
+    """Return whether a path is a glob, and not the name of a file."""
+    return bool(set(path) & set("*?[")) and not os.path.exists(path)
+
+
 def is_glob_of_volumes(path: str) -> bool:
     """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
-    if os.path.exists(path) or not set(path) & set("*?["):
+    if not is_glob(path):
         return False
     files = matching(path)
     if any(file.suffix.lower() not in SUFFIXES for file in files):
@@ -342,7 +350,7 @@ def list_steps(source: SourceRequest) -> list[Step]:
         DataError: a file cannot be read.
     """
     files = [] if os.path.exists(source.path) else matching(source.path)
-    if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
+    if not files and is_glob(source.path):
         raise UsageError(
             f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
             "a file with several time steps"
@@ -361,6 +369,7 @@ def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
     """List the time of each step of a file, None where it has none, whatever its components are."""
     from vvgt_cli.volume.registry import time_steps
 
+    read = replace(read, stored=True, packed=True)
     if read.component in (COLOR, ALL):
         read = replace(read, component=0)
     try:

@@ -42,17 +42,17 @@ def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
     return rule_of(asked or header.rule or INRIA)
 
 
-def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
+def open_gaussians(source: str | BinaryIO, empty: bool = False) -> tuple[Gaussians, PlyHeader]:
     """Read Gaussians (a path, "-" for a `.ply` on standard input, or a stream of one) into the unit frame.
 
     Raises:
-        DataError: not a file of Gaussians, or an empty one.
+        DataError: not a file of Gaussians, or one without any, unless it may be ``empty``.
     """
     if isinstance(source, str) and source != STDIN:
         gaussians, header = read_splats(source)
     else:
         gaussians, header = read_ply(sys.stdin.buffer if isinstance(source, str) else source)
-    if not len(gaussians):
+    if not (len(gaussians) or empty):
         raise DataError(f"{source}: holds no Gaussians; expected at least one")
     return in_unit_frame(gaussians, header), header
 

@@ -28,9 +28,10 @@ def grey(values: np.ndarray) -> np.ndarray:
 
 
 def draw_gaussians(
-    name: str, gaussians: Gaussians, header: PlyHeader | PlyOptions, rule: str, function: FunctionRequest | None = None
-) -> Draw:
-    """Return the function that draws live Gaussians.
+    name: str, gaussians: Gaussians, header: PlyHeader | PlyOptions, rule: str, function: FunctionRequest | None = None,
+    edge: float = 2.0,
+) -> Draw:  # fmt: skip
+    """Return the function that draws live Gaussians; ``edge``, of their frame, is that of `exposed_distance`.
 
     Raises:
         DataError: Gaussians that carry no values, labels, or several layers; see also `resolve_look`.
@@ -51,6 +52,6 @@ def draw_gaussians(
         return lambda camera: grey(mip(gaussians, camera, facts.lo, facts.hi))
     tf, _ = resolve_look(name, header, function or FunctionRequest())
     assert isinstance(tf, TransferFunction)
-    distance = exposed_distance(tf, facts.statistics(), 2.0)
+    distance = exposed_distance(tf, facts.statistics(), edge)
     table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain * NO_GRAIN)
     return lambda camera: grey(xray(gaussians, table, camera))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -10,9 +11,12 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import read_text
-from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_splats
+from vvgt_cli.gaussians.formats.levels import split_name
+from vvgt_cli.gaussians.formats.streamed import MANIFEST
 from vvgt_cli.gaussians.outputs import Output, write_text
 from vvgt_cli.score.record import SCHEMA, ConversionReport, plain
+from vvgt_cli.volume.tiff.slices import matching
 
 FORMAT = "vvgt-clouds"
 FRAMES, FUNCTIONS, LABELS = "frames", "functions", "labels"  # kinds of batches
@@ -127,3 +131,27 @@ def files_of(path: str | Path) -> list[tuple[str, str]]:
     if gone := [file for _, file in found if not file.is_file()]:
         raise DataError(f"{path}: its file {gone[0]} is missing; run the conversion again")
     return [(name, str(file)) for name, file in found]
+
+
+def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return name and path of the files that names, globs and indexes of `vvgt convert` stand for.
+
+    Raises:
+        UsageError: as `expanded`.
+        DataError: as `files_of`.
+    """
+    found: list[tuple[str, str]] = []
+    for name in names:
+        name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
+        found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
+    return found
+
+
+def expanded(name: str) -> list[str]:
+    """Return the files of a glob, sorted by their numbers, or the name; raise UsageError if a glob matches none."""
+    if not set(name) & set("*?[") or os.path.exists(name) or split_name(name) is not None or ":/" in name:
+        return [name]
+    found = [str(path) for path in matching(name)]
+    if not found:
+        raise UsageError(f"{name}: no such files; expected files of Gaussians ({', '.join(SUFFIXES)}), or a volume")
+    return found if any(map(is_splats, found)) else [name]  # a glob may be a volume: slices

@@ -88,7 +88,9 @@ def parse_layer_look(text: str) -> LayerLook:
     return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
 
 
-def apply_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
+def apply_function(
+    gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions, empty: bool = False
+) -> Gaussians:
     """Return live Gaussians under a function on data values (or labels under a table) and a light, unit frame.
 
     Args:
@@ -96,16 +98,17 @@ def apply_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: Pl
         facts: header of their file.
         tf: the look.
         options: unit distance, light and screen size of the result.
+        empty: the result may be empty.
 
     Raises:
-        DataError: none of them is visible.
+        DataError: none of them is visible, unless the result may be empty.
     """
     assert facts.live is not None
     assert facts.scale is not None
     assert options.unit_distance is not None
     table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
     found = visible_cloud(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
-    if not len(found):
+    if not (len(found) or empty):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
 
@@ -313,7 +316,9 @@ def grid_of(name: str, header: FileFacts) -> Volume:
     return Volume(data, (x, y, z), tuple(affine[:, 3].tolist()), direction, name)
 
 
-def recolored(name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None) -> Gaussians:
+def recolored(
+    name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None, empty: bool = False
+) -> Gaussians:
     """Return the Gaussians of a file under the function that is given, unchanged without one.
 
     Raises:
@@ -322,4 +327,4 @@ def recolored(name: str, gaussians: Gaussians, header: PlyHeader, function: Func
     if function is None:
         return gaussians
     tf, options = resolve_look(name, header, function)
-    return apply_function(gaussians, header, tf, options)
+    return apply_function(gaussians, header, tf, options, empty)

@@ -230,7 +230,7 @@ def layers_of(
             labels = segments_of(str(opened.path), opened.layer)
         elif own:
             labels = opened.path
-        return [_labelled(opened.volumes[0], labels, distance, access)]
+        return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
     numbers = whole or [access.statistics(volume) for volume in sources]
@@ -336,9 +336,14 @@ def _overlapping(
     return found
 
 
-def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access) -> Layer:
+def _labelled(
+    volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access, empty: bool = False
+) -> Layer:
+    """Return a label map under its table; raise DataError if it has no labels, unless it may be ``empty``."""
     numbers = access.labels(volume)
-    if isinstance(labels, str) and labels != AUTO:
+    if empty and not any(numbers):
+        table = distinct(numbers)
+    elif isinstance(labels, str) and labels != AUTO:
         table = read_labels(labels).warned(numbers, volume.name).of(numbers, volume.name)
     elif isinstance(labels, LabelTable):
         table = labels.of(numbers, volume.name)

@@ -312,7 +312,8 @@ def load_all(
                 "or --array, or pass --tf",
                 stacklevel=2,
             )
-        check_visible(shown, numbers)
+        if not request.statistics:  # a frame of a series may be dark
+            check_visible(shown, numbers)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if held else None
         sources.append(Source((layer,), volume, numbers, lighting, layout, tuple(request.statistics)))
@@ -336,21 +337,23 @@ def _layered(
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
     numbers = access.statistics(layers[0].volume)
-    _check_seen(layers, access)
+    _check_seen(layers, access, len(request.statistics))
     grid = common_grid(layers, content.stored)
     return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
 
 
-def _check_seen(layers: Sequence[Layer], access: Access) -> None:
+def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
     """Refuse layers that are all invisible; warn about a single invisible function among others.
 
+    The first ``frame`` layers are those of a frame of a series, which may be dark.
+
     Raises:
-        DataError: every layer is transparent wherever it has values.
+        DataError: every layer is transparent wherever it has values, and none is a frame's.
     """
     from vvgt_cli.look import check_visible
 
-    seen = any(layer.shows for layer in layers)
-    for layer in layers:
+    seen = frame > 0 or any(layer.shows for layer in layers)
+    for layer in layers[frame:]:
         if layer.shows or isinstance(layer.tf, LabelTable):
             continue
         try:
@@ -359,7 +362,8 @@ def _check_seen(layers: Sequence[Layer], access: Access) -> None:
             if not seen:
                 raise
             warnings.warn(f"{layer.volume.name}, {error}", stacklevel=4)
-    check_labels([layer.tf for layer in layers])
+    if not frame:
+        check_labels([layer.tf for layer in layers])
 
 
 def describe_source(source: Source) -> str:
