@@ -150,6 +150,11 @@ def test_huge_ranges_fit_into_16_bits():
     assert np.abs(unpacked(content, facts) - data).max() <= 0.5001 * facts["step"] < 2e4
 
 
+def test_narrow_ranges_are_no_ct():
+    [facts], *_ = slices_of([(Volume(300 + 1e-13 * np.random.default_rng(3).normal(size=(8, 8, 8))), None)])
+    assert not facts["ct"]
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_codes_are_packed_without_loss(dtype):
     codes = np.random.default_rng(4).integers(0, np.iinfo(dtype).max, (3, 4, 5), endpoint=True).astype(dtype)

@@ -1,5 +1,6 @@
 """Memory and processors are the job's: machine, cgroups at every level, limits of the process, and what was asked."""
 
+import ctypes
 import gzip
 import multiprocessing
 import os
@@ -177,3 +178,35 @@ def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_or_read_not_
         assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in told
     finally:
         group.rmdir()
+
+
+def test_freed_memory_is_kept_for_later_arrays_and_counts_as_free():
+    code = """
+import numpy as np
+from vvgt_cli.resources import _status, free_memory, keep_freed_memory, set_memory
+keep_freed_memory()
+before = _status()["VmRSS"]
+held = [np.ones(8 << 20) for _ in range(4)]
+end = np.ones(1 << 17)  # above them: they are not at the end of the heap
+del held
+kept = _status()["VmRSS"] - before
+set_memory(2 << 30)
+print(kept >> 20, (free_memory() - ((2 << 30) - before)) >> 20)
+"""
+    kept, lost = map(int, python("-c", code)[0].split())
+    assert kept > 200 or not hasattr(ctypes.CDLL(None), "mallopt")
+    assert lost > -60
+
+
+@pytest.mark.parametrize("threads", [0, 1])
+def test_a_process_ends_after_its_exit_functions_and_threads(threads):
+    text = f"""
+import atexit, threading, time
+from vvgt_cli.cli.process import leave
+atexit.register(print, "end", flush=True)
+for _ in range({threads}):
+    threading.Thread(target=lambda: (time.sleep(0.2), print("thread", flush=True))).start()
+print("begin", end=" ")
+leave(3)
+"""
+    assert python("-c", text, code=3)[0].split() == ["begin", *threads * ["thread"], "end"]

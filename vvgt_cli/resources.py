@@ -34,14 +34,20 @@ def parse_size(text: str) -> int:
 def keep_freed_memory() -> None:
     """Make the C library keep freed memory for later arrays, where it can (glibc), rather than return it to the system.
 
-    The system clears every page that it hands out, which takes a tenth of a conversion's time on a virtual machine. The
-    peak rises by 3 %.
+    The system clears every page that it hands out, which takes a tenth of a conversion's time on a virtual machine
+    (docs/log/conversion.md).
     """
     trim_threshold, top_pad, mmap_max = -1, -2, -4  # of malloc.h
     with suppress(AttributeError, OSError, TypeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
         for option, value in ((trim_threshold, -1), (top_pad, 64 << 20), (mmap_max, 0)):
             mallopt(option, value)
+
+
+def return_freed_memory() -> None:
+    """Return the memory that `keep_freed_memory` kept to the system, so that it counts as free."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def set_memory(limit: int | None) -> None:
@@ -61,6 +67,7 @@ def free_memory() -> int | None:
     This is the minimum of the free memory of the machine, of every cgroup (v1 and v2) above the process, of the limits
     of the process (RLIMIT_AS, RLIMIT_DATA), and of `set_memory` less what the process and its workers hold.
     """
+    return_freed_memory()
     found = [
         *_machine(),
         *(room for room in map(_free_in_group, _groups("memory")) if room is not None),

@@ -61,7 +61,10 @@ def _fibonacci_view(i: int, count: int, shift: float, size: int, radius: float, 
     azimuth = 2 * math.pi * ((i / GOLDEN + shift) % 1.0)
     ring = math.sqrt(1 - z * z)
     eye = (radius * ring * math.cos(azimuth), radius * ring * math.sin(azimuth), radius * z)
-    return look_at(eye, width=size, height=size, fov=fov, name=name)
+    camera = look_at(eye, width=size, height=size, fov=fov, name=name)
+    for shared in (camera.rotation, camera.translation):
+        shared.setflags(write=False)
+    return camera
 
 
 def default_views(

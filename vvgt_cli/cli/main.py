@@ -21,7 +21,7 @@ from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, leave, 
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console
-from vvgt_cli.resources import keep_freed_memory
+from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
 
 COMMANDS = [  # modules of this room, with underscores
@@ -176,6 +176,7 @@ def _several() -> int:
     status = 0
     for line in sys.stdin:
         status = run(json.loads(line))
+        return_freed_memory()
         if reader := sys.modules.get("vvgt_cli.field.reader"):
             reader.forget()  # files may be written again before the next command
         print(f"{ENDED}{status}", file=sys.stderr, flush=True)

@@ -63,7 +63,8 @@ def end_on_signals() -> None:
 def leave(status: int) -> NoReturn:
     """End the process with a status, without freeing its objects one by one, which takes 0.3 s after a conversion.
 
-    Functions registered with `atexit` run. A process with other threads to wait for ends as usual.
+    Functions registered with `atexit` run, and standard streams are flushed; other open files are not. A process with
+    other threads to wait for ends as usual.
     """
     if all(thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         atexit._run_exitfuncs()

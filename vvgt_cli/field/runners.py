@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import discard_leftovers
-from vvgt_cli.resources import keep_freed_memory, memory_limit
+from vvgt_cli.resources import memory_limit
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
@@ -86,7 +86,6 @@ def _start_worker(threads: int, alive: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
     os.environ["NUMBA_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
-    keep_freed_memory()
     Thread(target=_exit_with_parent, args=(alive,), daemon=True).start()
 
 

@@ -131,7 +131,8 @@ def _values(
         lo = volume.intercept + one * math.floor((lo - volume.intercept) / one + EXACT)
     codes = np.rint((np.nan_to_num(values, nan=lo - missing * step) - lo) / step) + missing
     unit = unit_of_values(volume.values_in, tf)
-    ct = unit == "HU" or (not unit and len(known) > 0 and in_hounsfield(*np.histogram(known, 256)))
+    around = not unit and lo < 0 < hi and 1 < hi - lo < 1e6  # as air's and tissue's are
+    ct = unit == "HU" or (around and in_hounsfield(*np.histogram(known, 256)))
     facts = {
         "lo": lo, "step": step, "missing": missing, "level": (a + b) / 2, "window": (b - a) or step,
         "unit": unit, "ct": ct, "quantity": volume.quantity,

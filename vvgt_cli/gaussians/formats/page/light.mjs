@@ -79,7 +79,7 @@ export function light(look, { app }, begin, history) {
   kind.addEventListener('change', () => {
     history.keep();
     now = { ...now, kind: kind.value };
-    if (now.kind === 'direction' && begin.kind !== 'direction' && now.from === begin.from) aim(...FIRST);
+    if (now.kind === 'direction' && begin.kind !== 'direction' && now.from.every((x, k) => Math.abs(x - begin.from[k]) < 1e-4)) aim(...FIRST);
     else show();
   });
   for (const slider of root.querySelectorAll('input')) {

@@ -52,6 +52,7 @@ export const linkOf = (parts) => `${location.href.split('#')[0]}#${saidBy(parts)
 export function copied(text) {
   const area = Object.assign(document.createElement('textarea'), { value: text }), back = document.activeElement;
   document.body.append(area);
+  area.focus({ preventScroll: true });
   area.select();
   const done = document.execCommand('copy');
   area.remove();

@@ -62,7 +62,7 @@ export function messages({ live, lens, views, axes, moving }, app) {
     light(to) {
       const next = { ...light(), ...to };
       const length = Math.hypot(...numbers(next.from, 3, 'light.from'));
-      if (!KINDS.includes(next.kind) || !length || numbers([next.ambient, next.diffuse, next.specular], 3, 'light').some((x) => x < 0)) throw new Error(`light: expected kind ${KINDS.join(', ')}; from is not 0, the others not below 0`);
+      if (!KINDS.includes(next.kind) || !length || numbers([next.ambient, next.diffuse, next.specular], 3, 'light').some((x) => x < 0 || x > 1000)) throw new Error(`light: expected kind ${KINDS.join(', ')}; from other than 0, the others from 0 to 1000`);
       live.cut.keep();
       live.lamp.set({ ...next, from: fromWorld(next.from.map((x) => x / length)) });
     },
@@ -85,7 +85,7 @@ export function messages({ live, lens, views, axes, moving }, app) {
         set[key](data[key], layer);
       }
       moving();
-    } catch (error) { say('error', { message: error instanceof TypeError ? `${key}: what is sent has another form than is documented` : error.message }); }
+    } catch (error) { say('error', { message: error instanceof TypeError ? `${key}: not in the documented form (${error.message})` : error.message }); }
   });
   let told = '', last = 0;
   if (parent !== window) {
