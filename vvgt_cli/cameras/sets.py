@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -51,7 +52,8 @@ def fibonacci_views(
     name: str = "view",
 ) -> list[Camera]:
     """Return ``count`` square views on the Fibonacci sphere (conventions: Default views)."""
-    return [_fibonacci_view(i, count, shift, size, radius, fov, f"{name}_{i:03d}") for i in range(count)]
+    views = [_fibonacci_view(i, count, shift, size, radius, fov, f"{name}_{i:03d}") for i in range(count)]
+    return [replace(view, rotation=view.rotation.copy(), translation=view.translation.copy()) for view in views]
 
 
 @lru_cache(maxsize=1000)
@@ -61,10 +63,7 @@ def _fibonacci_view(i: int, count: int, shift: float, size: int, radius: float, 
     azimuth = 2 * math.pi * ((i / GOLDEN + shift) % 1.0)
     ring = math.sqrt(1 - z * z)
     eye = (radius * ring * math.cos(azimuth), radius * ring * math.sin(azimuth), radius * z)
-    camera = look_at(eye, width=size, height=size, fov=fov, name=name)
-    for shared in (camera.rotation, camera.translation):
-        shared.setflags(write=False)
-    return camera
+    return look_at(eye, width=size, height=size, fov=fov, name=name)
 
 
 def default_views(
