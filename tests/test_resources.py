@@ -194,7 +194,7 @@ set_memory(2 << 30)
 print(kept >> 20, (free_memory() - ((2 << 30) - before)) >> 20)
 """
     kept, lost = map(int, python("-c", code)[0].split())
-    assert kept > 200 or not hasattr(ctypes.CDLL(None), "mallopt")
+    assert kept > 200 or not hasattr(ctypes.CDLL(None), "mallinfo2")
     assert lost > -60
 
 

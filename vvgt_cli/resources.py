@@ -10,12 +10,14 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.errors import UsageError
 
 PROC = Path("/proc")
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 UNLIMITED = 1 << 60  # cgroup v1 writes a number near 2^63 where there is no limit
+_heap: Any = None  # function that tells how much freed memory is kept, if any is
 _asked: int | None = None  # bytes that the whole process may take (`--memory`)
 
 
@@ -31,22 +33,34 @@ def parse_size(text: str) -> int:
     return int(float(match[1]) * UNITS[match[2]])
 
 
+class _Heap(ctypes.Structure):
+    """What `mallinfo2` returns (malloc.h)."""
+
+    _fields_ = [
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks")),
+        *((name, ctypes.c_size_t) for name in ("uordblks", "fordblks", "keepcost")),
+    ]
+
+
 def keep_freed_memory() -> None:
-    """Make the C library keep freed memory for later arrays, where it can (glibc), rather than return it to the system.
+    """Make the C library keep freed memory for later arrays (glibc 2.33 and later), not return it to the system.
 
     The system clears every page that it hands out, which takes a tenth of a conversion's time on a virtual machine
     (docs/log/conversion.md).
     """
+    global _heap
     trim_threshold, top_pad, mmap_max = -1, -2, -4  # of malloc.h
     with suppress(AttributeError, OSError, TypeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
+        library = ctypes.CDLL(None)
+        _heap = library.mallinfo2
+        _heap.restype = _Heap
         for option, value in ((trim_threshold, -1), (top_pad, 64 << 20), (mmap_max, 0)):
-            mallopt(option, value)
+            library.mallopt(option, value)
 
 
 def return_freed_memory() -> None:
-    """Return the memory that `keep_freed_memory` kept to the system, so that it counts as free."""
-    with suppress(AttributeError, OSError, TypeError):
+    """Return to the system what `keep_freed_memory` keeps."""
+    if _heap is not None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
@@ -67,7 +81,6 @@ def free_memory() -> int | None:
     This is the minimum of the free memory of the machine, of every cgroup (v1 and v2) above the process, of the limits
     of the process (RLIMIT_AS, RLIMIT_DATA), and of `set_memory` less what the process and its workers hold.
     """
-    return_freed_memory()
     found = [
         *_machine(),
         *(room for room in map(_free_in_group, _groups("memory")) if room is not None),
@@ -78,7 +91,8 @@ def free_memory() -> int | None:
 
         others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # idle workers
         found.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
-    return max(min(found), 0) if found else None
+    kept = 0 if _heap is None else _heap().fordblks
+    return max(min(found) + kept, 0) if found else None
 
 
 def processors() -> int:
