@@ -16,6 +16,7 @@ from vvgt_cli.errors import UsageError
 
 PROC = Path("/proc")
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+TOP_PAD = 64 << 20  # bytes by which the heap grows beyond what is asked for
 UNLIMITED = 1 << 60  # cgroup v1 writes a number near 2^63 where there is no limit
 _heap: Any = None  # function that tells how much freed memory is kept, if any is
 _asked: int | None = None  # bytes that the whole process may take (`--memory`)
@@ -54,7 +55,7 @@ def keep_freed_memory() -> None:
         library = ctypes.CDLL(None)
         _heap = library.mallinfo2
         _heap.restype = _Heap
-        for option, value in ((trim_threshold, -1), (top_pad, 64 << 20), (mmap_max, 0)):
+        for option, value in ((trim_threshold, -1), (top_pad, TOP_PAD), (mmap_max, 0)):
             library.mallopt(option, value)
 
 
@@ -80,6 +81,7 @@ def free_memory() -> int | None:
 
     This is the minimum of the free memory of the machine, of every cgroup (v1 and v2) above the process, of the limits
     of the process (RLIMIT_AS, RLIMIT_DATA), and of `set_memory` less what the process and its workers hold.
+    Freed memory that the C library keeps counts as free.
     """
     found = [
         *_machine(),
@@ -91,7 +93,7 @@ def free_memory() -> int | None:
 
         others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # idle workers
         found.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
-    kept = 0 if _heap is None else _heap().fordblks
+    kept = 0 if _heap is None else max(_heap().fordblks - TOP_PAD, 0)  # the end of the heap may be untouched
     return max(min(found) + kept, 0) if found else None
 
 
