@@ -112,7 +112,8 @@ def test_times_are_those_of_the_file(at):
 
 
 def test_an_index_that_is_none_is_a_line(vvgt, at):
-    for text in ("{", '"files": []}', '"schema": 1, "kind": "frames", "files": [{"name": "a", "file": "../a.ply"}]}'):
+    row = '"schema": 1, "kind": "frames", "files": [{"name": "a", "frame": 0, "file": "a.ply"}]'
+    for text in ("{", '"files": []}', row.replace("a.ply", "../a.ply") + "}", row + ', "empty": ["1"]}'):
         Path("bad.json").write_text('{"format": "vvgt-clouds", ' + text)
         for command in (("info", "bad.json"), ("view", "bad.json", "-o", "p.html")):
             assert "not an index of 'vvgt convert'" in vvgt.fails(1, *command)

@@ -8,6 +8,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from tests.headers import uncertified
 from vvgt_cli.conversion.frames import merge_statistics
@@ -64,6 +65,15 @@ def test_frames_are_those_of_single_conversions_and_dark_ones_are_skipped(vvgt, 
     alone = series / "alone.ply"
     vvgt.ok("convert", series / "run_9.npy", "--tf", tf, "-o", alone, *SMALL)
     assert uncertified(alone) == uncertified(made["f_001.ply"])
+    vvgt.ok("render", series / "out" / "f_index.json", "--size", 24, "-o", series / "f_{}.png")
+    seen = [np.asarray(Image.open(series / f"f_{k}.png"))[..., 3].any() for k in range(4)]
+    assert seen == [False, True, True, True]
+    (series / "live").mkdir()
+    vvgt.ok("convert", series / "run_*.npy", "--tf", tf, "-o", series / "live" / "l_{}.ply", *SMALL, "--live")
+    vvgt.ok("render", series / "live" / "l_index.json", "--rule", "mip", "--size", 24, "-o", series / "l.gif")
+    with Image.open(series / "l.gif") as movie:
+        assert movie.n_frames == 4
+        assert np.asarray(movie.convert("L")).max() < 8
 
 
 @pytest.mark.parametrize("how", [("--tf", "viridis"), ("--tf", "TF", "--tf-range", "rescale"), ()])

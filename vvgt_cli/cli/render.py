@@ -72,15 +72,16 @@ def command(
     """
     from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.commands.render import RenderRequest, render_file
-    from vvgt_cli.conversion.index import named_files
+    from vvgt_cli.conversion.index import movie_frames
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians.formats import is_splats
     from vvgt_cli.volume import ReadOptions
 
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    names = tuple(path for _, path in named_files([file]))
-    given: tuple[str, ...] | SourceRequest = names
+    frames = movie_frames(file)
+    names = [path for path in frames if path is not None]
+    given: tuple[str | None, ...] | SourceRequest = frames
     function, options = None, block_options_of(blocks)
     if any(map(is_splats, names)) or (file == "-" and read["dims"] is None):
         if ReadOptions(**read) != ReadOptions() or options is not None:

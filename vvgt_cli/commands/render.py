@@ -60,8 +60,8 @@ class RenderRequest:
 
     Attributes:
         given: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie; or a volume or a series of volumes
-            with its look.
+            (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie, None for an empty one; or a volume
+            or a series of volumes with its look.
         output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
             ending (`SUFFIXES`).
         camera: view-set file, or None.
@@ -77,7 +77,7 @@ class RenderRequest:
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
     """
 
-    given: tuple[str, ...] | SourceRequest
+    given: tuple[str | None, ...] | SourceRequest
     output: str
     camera: str | None = None
     orbit: int | None = None
@@ -162,7 +162,7 @@ class RenderRequest:
             check_folder(where, "images")
             outputs.append(Output("-o", str(where / VIEWS_FILE)))
         if self.movie or self.png or where.is_dir():
-            inputs = self.given.paths() if isinstance(self.given, SourceRequest) else self.given
+            inputs = self.given.paths() if isinstance(self.given, SourceRequest) else list(filter(None, self.given))
             check_outputs(outputs, inputs, self.overwrite)
         return shares
 
@@ -188,7 +188,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
 
 
 def _render(
-    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest], series: Series | None = None
+    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest | None], series: Series | None = None
 ) -> int:  # fmt: skip
     """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
     shares = request.check(len(frames))
@@ -196,7 +196,8 @@ def _render(
         series.prepare(run)
         request, frames = replace(request, blocks=series.request.blocks), series.sources()
     with ExitStack() as stack:
-        draw, by, first = _frame(run, request, frames[0], shares[0], stack)
+        start = next((given, share) for given, share in zip(frames, shares, strict=True) if given is not None)
+        draw, by, first = _frame(run, request, *start, stack)
         if first is not None:
             shares = request.views(len(frames), first.made_for, first.up)
         cameras, opened = list(chain(*shares)), [draw]
@@ -204,9 +205,12 @@ def _render(
 
         def pictures() -> Iterator[np.ndarray]:
             bar, done, shown = run.console.bar("render"), 0, len(frames) == 1
-            quiet = Run(Console(quiet=True), run.report)
+            quiet, blank = Run(Console(quiet=True), run.report), _blank(request.rule)
             for given, share in zip(frames, shares, strict=True):
-                draw = opened.pop() if opened else _frame(quiet, request, given, share, stack, first)[0]
+                if given is None:
+                    draw = blank
+                else:
+                    draw = opened.pop() if opened else _frame(quiet, request, given, share, stack, first)[0]
                 for camera in share:
                     picture = draw(camera)
                     yield picture
@@ -222,6 +226,12 @@ def _render(
             note = (_movie if request.movie else _pictures)(request, pictures(), cameras)
             stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {by} in {note}"
     return len(cameras)
+
+
+def _blank(rule: str | None) -> Draw:
+    """Return the renderer of a frame that holds nothing: transparent, or black where ``rule`` draws opaque pictures."""
+    opaque = float(rule in NAMES)
+    return lambda camera: np.tile(np.array([0, 0, 0, opaque], np.float32), (camera.height, camera.width, 1))
 
 
 def _frame(

@@ -152,6 +152,7 @@ class Series(Batch):
             )
         self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
         self.request = replace(request, source=source)
+        self.facts = {"empty": [k for k, dark in enumerate(self._dark) if dark]}
 
     def sources(self) -> list[SourceRequest]:
         """Return the request of each frame, with what all share once that is prepared."""

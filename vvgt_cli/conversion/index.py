@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import json
 import os
 import re
@@ -108,6 +109,8 @@ def read_index(path: str | Path) -> dict[str, Any]:
         index: dict[str, Any] = json.loads(read_text(Path(path)))
         names = [PurePosixPath(row["file"]) for row in index["files"]]
         known = (index["format"], index["schema"]) == (FORMAT, SCHEMA)
+        numbers = [*index.get("empty", []), *(row.get("frame", 0) for row in index["files"])]
+        known = known and all(isinstance(k, int) for k in numbers)
         known = known and isinstance(index["kind"], str) and all(isinstance(row["name"], str) for row in index["files"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         known, names = False, []
@@ -145,6 +148,23 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
         name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
         found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded(name)]
     return found
+
+
+def movie_frames(name: str) -> tuple[str | None, ...]:
+    """Return the files of `named_files` in order, and None for each frame that an index says to be empty.
+
+    Raises:
+        DataError, UsageError: as `named_files`.
+    """
+    files: list[str | None] = [file for _, file in named_files([name])]
+    if is_index(name):
+        index = read_index(name)
+        taken = [row["frame"] for row in index["files"] if "frame" in row]
+        for k in sorted(index.get("empty", [])):
+            place = bisect.bisect(taken, k)
+            files.insert(place, None)
+            taken.insert(place, k)
+    return tuple(files)
 
 
 def expanded(name: str) -> list[str]:
