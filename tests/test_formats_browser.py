@@ -186,7 +186,7 @@ def test_a_page_runs_under_the_policy_it_names_and_else_says_why_not(live: Path,
     with sent_with(content, policy(content.decode())) as url:
         shot, _ = shoot(url, tmp_path)
     assert (shot.max(axis=-1) > 0.1).mean() > 0.02
-    with sent_with(content, "default-src 'self'") as url, pytest.raises(AssertionError, match="which does not run"):
+    with sent_with(content, "default-src 'self'") as url, pytest.raises(AssertionError, match="needs JavaScript"):
         shoot(url, tmp_path)
 
 

@@ -234,6 +234,29 @@ def test_the_face_of_a_cut_shows_the_slice_and_hides_what_is_behind(
     assert person.picture(tmp_path, "none.png")[middle] == pytest.approx(np.full(3, 0.6), abs=0.05)
 
 
+COVERED = """[...document.querySelectorAll('#tools button, #slices :is(button, input, select)')].filter((one) => {
+  const { left, right, top, bottom, width } = one.getBoundingClientRect();
+  const over = [[left + 2, top + 8], [right - 3, bottom - 8]].map((at) => document.elementFromPoint(...at));
+  return width && !over.every((seen) => one === seen || one.contains(seen));
+}).map((one) => (one.closest('#tools') ? one.title : 'slices'))"""
+
+
+def test_panels_lie_beside_the_buttons(marked: str, person: Person, tmp_path: Path) -> None:
+    """Of a window upright and across, with slices, which lists of facts may cover, and without."""
+    person("open", marked)
+    for size in (person.size, person.size[::-1]):
+        person("resize", *size)
+        for keys in ("", "m", "p", "s", "sm", "si"):
+            person("eval", "document.querySelector('#live.folded .fold')?.click()")
+            for key in keys:
+                person("press", key)
+            person.picture(tmp_path, f"{size[0]}-{keys}.png", bare=False)
+            covered = set(person("eval", COVERED))
+            assert covered - ({"slices"} if keys == "si" else set()) == set(), (size, keys)
+            for key in reversed(keys):
+                person("press", key)
+
+
 def test_damaged_slices_are_said_to_be(marked: str, person: Person, tmp_path: Path) -> None:
     text = Path(marked.removeprefix("file://")).read_text("utf-8")
     (tmp_path / "cut.html").write_text(re.sub(r'(id="slices-0">[^<]{400})[^<]+', r"\1", text), "utf-8")

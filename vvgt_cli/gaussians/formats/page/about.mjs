@@ -12,11 +12,11 @@ export function rowsOf(name, { facts, world, count, live, converted, slices }) {
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],
     ['quality', facts.quality],
-    ['Gaussians', count && (converted ? `${number(converted.count)}, and ${number(count)} to edit` : number(count))],
+    ['Gaussians', count && (converted ? `${number(converted.count)}, and ${number(count)} for other looks` : number(count))],
     ['made for', facts.size && `screens of ${facts.size} px; drawing rule: ${facts.rule}`],
     ['axes', world.anatomical ? `${facts.space}, in mm` : `the file's own${world.unit && `, in ${world.unit}`}`],
     ['drawn with', 'SuperSplat viewer and PlayCanvas engine (MIT)'],
-    ['written', facts.version && `by vvgt ${facts.version}`],
+    ['written by', facts.version && `vvgt ${facts.version}`],
   ].filter(([, value]) => value);
 }
 

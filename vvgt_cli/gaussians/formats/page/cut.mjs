@@ -1,8 +1,8 @@
 // The cut of a live page: a plane, or a box of six faces. What is beyond is not shown; each face is moved in the picture, too (handles.mjs).
 const KINDS = ['no cut', 'cut x', 'cut y', 'cut z', 'free plane', 'box'], FREE = 4, BOX = 5;
 const WHOLE = [0, 1, 0, 1, 0, 1], NONE = { kind: 'none', normal: [0, 0, 1], at: 0.5, flipped: false, box: WHOLE };
-const HTML = `<select class="axis" aria-label="cut" title="cut"></select><input type="range" min="0" max="1000" aria-label="place of the cut">
-<button class="flip" aria-pressed="false" aria-label="other side" title="other side">⇄</button><span class="hint">drag its faces</span>`;
+const HTML = `<select class="axis" aria-label="cut" title="cut"></select><input type="range" min="0" max="1000" aria-label="position of the cut">
+<button class="flip" aria-pressed="false" aria-label="show the other side" title="show the other side">⇄</button><span class="hint">drag the faces</span>`;
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const short = (x, digits) => Number(x.toFixed(digits));
 

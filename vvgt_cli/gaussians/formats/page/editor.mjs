@@ -7,7 +7,7 @@ const WIDE = 276, HIGH = 92, NEAR = matchMedia('(pointer: coarse)').matches ? 22
 const MANY = 14, CLOSE = 0.03;  // nodes that are all offered, and how far fewer of them may be from the function
 const EDITED = 'edited', NONE = -1, ALL = -2;  // what is dragged, if no node
 const WIDER = 60;  // px of a drag upwards after which all is e times as wide
-const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one; drag beside the nodes to shift and widen the whole">
+const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity by value; double click adds a node, Delete removes it; drag beside the nodes to shift or widen the function">
 <defs><linearGradient></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
 <div><button class="preset" aria-expanded="false" title="presets"></button><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>

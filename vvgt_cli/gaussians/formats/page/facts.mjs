@@ -22,8 +22,8 @@ function qualityOf(text) {
   try {
     const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
     if (!Number.isFinite(dB)) return {};
-    const quality = `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)${Number.isFinite(live) ? ', under its own function and light' : ''}`, better = Number.isFinite(live) ? 'convert it for this look without --live' : 'give it more Gaussians or steps';
-    return { quality, far: dB < POOR ? `This is far from the volume, ${dB.toFixed(1)} dB: dots and pits may not be in the data, and detail may be missing. To see it, ${better}.` : '' };
+    const quality = `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)${Number.isFinite(live) ? ', under its own function and light' : ''}`, better = Number.isFinite(live) ? 'convert the volume for this look, without --live' : 'use more Gaussians or steps';
+    return { quality, far: dB < POOR ? `Low quality (${dB.toFixed(1)} dB): dots and pits may not be in the data, and detail may be missing. For a closer picture, ${better}.` : '' };
   } catch { return {}; }
 }
 

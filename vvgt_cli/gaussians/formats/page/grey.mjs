@@ -1,7 +1,7 @@
 // MIP and X-ray of live Gaussians (vvgt_cli/splat/grey.py has the formulas): the engine's shaders that draw them, without an order.
 import { BLEND_MAX, BLEND_PREMULTIPLIED } from 'playcanvas';
 
-export const KINDS = ['look', 'MIP', 'X-ray'];
+export const KINDS = ['colours', 'MIP', 'X-ray'];
 const SCREEN = `
 	vvgtGrey = vec4(0.0);
 	if (vvgtKind > 0.5) {

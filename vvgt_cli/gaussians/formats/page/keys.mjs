@@ -8,15 +8,15 @@ const FIELDS = 'input, select, textarea', OWN = `${FIELDS}, #live, #slices, .lis
 // rows of the help: [keys, what]; `buttons` are {title, key}
 export function helpRows(buttons, { live, values, picks, sliced }) {
   return [
-    ['drag', 'turn'], ['right drag, two fingers', 'move'], ['wheel, pinch', 'nearer, farther'],
-    ...(picks ? [['click', `${live ? 'value or label, and ' : ''}place under the pointer`], ['Enter', 'as a click in the middle of the view'], ['double click', 'turn about that place']] : []),
-    ['arrow keys', 'turn; with Shift: move'], ['+ −', 'nearer, farther'],
+    ['drag', 'turn'], ['right drag, two fingers', 'move'], ['wheel, pinch', 'zoom'],
+    ...(picks ? [['click', `show the position${live ? ' and the value or label' : ''} there`], ['Enter', 'click in the middle of the view'], ['double click', 'turn about that point from now on']] : []),
+    ['arrow keys', 'turn; with Shift: move'], ['+ −', 'zoom'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
-    ...(live?.next ? [['K', 'the look, MIP, X-ray']] : []),
+    ...(live?.next ? [['K', 'switch between colours, MIP and X-ray']] : []),
     ...(live ? [['Ctrl+Z', 'undo']] : []),
-    ...(sliced ? [['in a slice', 'drag for window (across) and level (up), click to move the cross, wheel or arrow keys to step']] : []),
-    ...(values ? [['function', 'drag a node or use the arrow keys; double click adds one, Delete removes it. Drag beside the nodes, or Page Up and Down: shift the whole (across), widen it (up, or with Shift)']] : []),
-    ['Esc', 'close, clear'],
+    ...(sliced ? [['in a slice', 'drag across for the window, up or down for the level; click to move the cross; wheel or arrow keys to step']] : []),
+    ...(values ? [['function', 'drag a node or use the arrow keys; double click adds a node, Delete removes it. Drag beside the nodes to shift (across) or widen (up) the function; Page Up and Down shift it, with Shift widen it']] : []),
+    ['Esc', 'close panels, clear the clicked point'],
   ];
 }
 

@@ -4,7 +4,7 @@ const SLIDERS = [['ambient', 1], ['diffuse', 1], ['specular', 1]], NAMES = { amb
 const HTML = `<summary>light</summary><div class="light"><svg viewBox="-30 -30 60 60" tabindex="0" role="application" aria-label="direction of the light; drag, or use the arrow keys">
 <defs><radialGradient id="light-ball" r="0.9"><stop offset="0" stop-color="#fff"/><stop offset="1" stop-color="#222"/></radialGradient></defs>
 <circle r="${R}" fill="url(#light-ball)"/><circle class="dot" r="4" fill="#fc3" stroke="#000"/></svg>
-<div><select aria-label="light" title="light"><option value="none">no light</option><option value="headlight">at the eye</option><option value="direction">from a direction</option></select>
+<div><select aria-label="light" title="light"><option value="none">no light</option><option value="headlight">headlight</option><option value="direction">from a direction</option></select>
 ${SLIDERS.map(([name, most]) => `<label><span>${NAMES[name]}</span><input type="range" min="0" max="${most}" step="0.01" data-name="${name}"></label>`).join('')}</div></div>`;
 
 // The section of the panel; `history` has keep() before a change, changed() after it, and add({key, state, set}) for what undo and links go back to.

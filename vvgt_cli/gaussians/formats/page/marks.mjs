@@ -71,7 +71,7 @@ export function marksOf(worldNow, changed, save) {
     get list() { return list; },
     get begun() { return begun; },
     // what is still to be done, in words
-    get hint() { return list.length < MOST ? `${kind}: click point ${begun.length + 1} of ${POINTS[kind]}` : `${MOST} are the most`; },
+    get hint() { return list.length < MOST ? `${kind}: click point ${begun.length + 1} of ${POINTS[kind]}` : `at most ${MOST}`; },
     take({ world }) {
       if (list.length >= MOST) return;
       begun = [...begun, world];

@@ -7,7 +7,7 @@ import { organs } from './organs.mjs';
 import { sketches } from './shot.mjs';
 
 const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
-<output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="drawn as" title="drawn as (k)"></select>`;
+<output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="draw as" title="draw as (k)"></select>`;
 const STEPS = 200, SMALL = 84;  // that undo goes back; px of a small picture
 
 // the file's name and what kind it is

@@ -44,7 +44,7 @@ function download(content, name) {
 }
 
 const send = (to, what) => fetch(to, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(what) });
-const reason = async (answer) => (answer.status === 400 ? answer.text() : `the server answers ${answer.status}`);
+const reason = async (answer) => (answer.status === 400 ? answer.text() : `the server answered ${answer.status}`);
 
 // What is shown in place of the first Gaussians, where they are.
 function substitute({ app }) {
@@ -91,7 +91,7 @@ export async function served(panel, viewer, server, converted) {
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
   row.textContent = 'Save';
-  text.setAttribute('role', 'status');
+  [kind, text].forEach((one) => one.setAttribute('role', 'status'));
   root.append(text, row);
   const better = substitute(viewer);
   const look = ({ named, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), named()) });
@@ -107,10 +107,9 @@ export async function served(panel, viewer, server, converted) {
   const improved = () => number !== null && !panel.alone() && (!converted || (!panel.lit() && JSON.stringify(shown()) === begun));
   function put() {
     better.put(improved());
-    const [what, ...rest] = (improved() ? told : 'preview').split(/(?=, |: )/);
+    const [what, why = ''] = (improved() ? told : 'preview').split(/: (.*)/s);
     kind.textContent = server?.converts || converted ? what : '';
-    kind.append(Object.assign(document.createElement('span'), { textContent: rest[0] ?? '' }));  // where there is room
-    if (!busy) say(rest.length ? told : '');
+    if (!busy) say(why);
   }
 
   function end(line = '', failed = false) {

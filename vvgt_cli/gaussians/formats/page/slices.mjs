@@ -7,8 +7,8 @@ const STILL = 6, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];  // px that a click
 const CT = [['soft tissue', 400, 40], ['lung', 1500, -600], ['bone', 1800, 400], ['brain', 80, 40]];
 const OVER = 0.5;  // how much of a label's colour is seen over values
 const HTML = `<header><b>slices</b><select class="grid" aria-label="volume" title="volume"></select><select class="preset" aria-label="window" title="window"></select>
-<label>W <input class="window" type="number" step="any" min="0"></label><label>L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
-const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="0">';
+<label title="window: width of the range of greys">W <input class="window" type="number" step="any" min="0"></label><label title="level: middle of the range of greys">L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
+const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="1">';
 
 // facts of the grids; those of a server are fetched, and held by elements as in a file
 async function held(slices) {
@@ -60,7 +60,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
       guess.append(...options.splice(1));
       options.push(guess);
     }
-    find('.preset').replaceChildren(...options, Object.assign(new Option('own', -1), { hidden: true }));
+    find('.preset').replaceChildren(...options, Object.assign(new Option('custom', -1), { hidden: true }));
     shade(...presets()[0].slice(1));
     go(at);
   }
@@ -110,7 +110,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
 
   function drawView(view) {
     const { canvas, letters, along, up, across, slider, name } = view, ratio = devicePixelRatio, to = canvas.getContext('2d');
-    slider.value = Math.round(at[across]);
+    slider.value = Math.round(at[across]) + 1;
     canvas.setAttribute('aria-label', `${name} slice ${slider.value} of ${base.dims[across]}: arrow keys step, drag for window and level, click to move the cross`);
     const { left, top, wide, high, pixel } = frameOf(view), [x, y] = pixel(at);
     [canvas.width, canvas.height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
@@ -157,9 +157,9 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
 
   function figureOf(view) {
     const figure = Object.assign(document.createElement('figure'), { innerHTML: FIGURE }), [canvas, slider] = figure.children, made = { ...view, figure, canvas, slider };
-    slider.max = base.dims[view.across] - 1;
+    slider.max = base.dims[view.across];
     slider.setAttribute('aria-label', `${view.name} slice`);
-    slider.addEventListener('input', () => step(view.across, Number(slider.value) - Math.round(at[view.across])));
+    slider.addEventListener('input', () => step(view.across, Number(slider.value) - 1 - Math.round(at[view.across])));
     let down = null;
     canvas.addEventListener('pointerdown', (event) => {
       if (event.button || !event.isPrimary) return;

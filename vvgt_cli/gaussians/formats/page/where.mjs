@@ -17,7 +17,7 @@ import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
 import { slicesOf } from './slices.mjs';
 import { element } from './svg.mjs';
 
-const LEFT = 12;  // px
+const LEFT = 12, NARROW = 700;  // px; of a picture in which the panel would lie over what is clicked
 const AWAY = 2, UP = 1.3;  // m in a headset, to the middle of the body, whose longest edge is 2 m: away, and above the floor
 const icon = (path) => `<svg viewBox="0 0 18 18" aria-hidden="true"><path d="${path}"/></svg>`;
 const ICONS = {
@@ -99,6 +99,10 @@ export function where(viewer, scene, live, show) {
     buttons.push({ title, key, press, made });
     return made;
   };
+  const spread = () => {  // how wide the buttons are, which panels stay beside
+    const boxes = buttons.map(({ made }) => made.getBoundingClientRect()).filter(({ width }) => width);
+    document.body.style.setProperty('--tools', `${Math.max(...boxes.map(({ right }) => right)) - Math.min(...boxes.map(({ left }) => left))}px`);
+  };
   const look = (angles) => { fit(angles); again(); };
   let last = null;
   const view = (k, opposite) => {
@@ -111,19 +115,20 @@ export function where(viewer, scene, live, show) {
   }
   button('fit', 'fit into the window', 'f', () => look(lens.pose()));
   button('reset', 'reset the view', 'r', () => { last = null; look(firstAngles(scene)); });
-  const projection = button('perspective', 'orthographic or perspective', 'o', () => { lens.flat = !lens.flat; again(); });
+  const projection = button('perspective', 'switch between perspective and orthographic', 'o', () => { lens.flat = !lens.flat; again(); });
   const measure = (now) => {
     if (now) marks.toggle();
     else marks.stop();
+    if (marks.open && svg.clientWidth < NARROW) document.querySelector('#live:not(.folded) .fold')?.click();
     lens.canvas.classList.toggle('measuring', marks.open);
     clicked = null;
     again();
   };
-  const measuring = button('measure', 'rulers, angles and notes: click their points', 'm', () => measure(true));
+  const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(true));
   measuring.hidden = Boolean(scene.streamed);
-  const slicing = slices && button('slices', 'slices of the volume, beside the picture', 's', () => slices.toggle());
+  const slicing = slices && button('slices', 'slices of the volume', 's', () => slices.toggle());
   const picture = (size) => pictureOf(viewer, svg, size).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
-  sizes.of(button('picture', 'save the picture as PNG, in the window\'s size, twice or four times as large', 'p', () => {
+  sizes.of(button('picture', 'save a picture (PNG)', 'p', () => {
     sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
       const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
       made.addEventListener('click', () => { sizes.close(); lens.canvas.focus({ preventScroll: true }); picture(size); });
@@ -132,16 +137,16 @@ export function where(viewer, scene, live, show) {
     sizes.toggle();
     sizes.root.querySelector('button').focus();
   }));
-  button('link', 'link to this view', 'l', () => {
+  button('link', 'copy a link to this view', 'l', () => {
     const link = linkOf(parts);
     try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
-    again(copied(link) ? 'link to this view copied' : parent === window ? 'the address bar now links to this view' : 'this frame may not copy a link');
+    again(copied(link) ? 'link to this view copied' : parent === window ? 'the address bar now links to this view' : 'this frame is not allowed to copy a link');
     setTimeout(again, 4000);
   }).hidden = location.protocol === 'about:';  // of a notebook's cell, which has no address
   const whole = document.documentElement;
   if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', '', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
   for (const kind of ['VR', 'AR']) {
-    const made = button('xr', kind === 'VR' ? 'virtual reality' : 'augmented reality', '', () => viewer.startXR(kind.toLowerCase()).catch(() => {})), offer = () => { made.hidden = !viewer.state[`canStart${kind}`]; };
+    const made = button('xr', kind === 'VR' ? 'virtual reality' : 'augmented reality', '', () => viewer.startXR(kind.toLowerCase()).catch(() => {})), offer = () => { made.hidden = !viewer.state[`canStart${kind}`]; spread(); };
     made.textContent = kind;
     viewer.events.on(`canStart${kind}:changed`, offer);
     offer();
@@ -217,6 +222,8 @@ export function where(viewer, scene, live, show) {
     draw();
   });
   take(dataNow());
+  spread();
+  addEventListener('resize', spread);
   const fit = stayFree(lens, scene, draw);
   Object.defineProperty(state, 'clicked', { get: () => clicked });
   Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size), get world() { return world; }, get facts() { return facts; } });
