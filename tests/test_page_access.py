@@ -178,6 +178,14 @@ def test_no_serious_finding_and_no_trap(name: str, person: Person, pages: dict[s
     assert person("tabs") == {"unseen": [], "missed": []}
 
 
+def test_facts_say_what_a_page_holds_and_its_light(person: Person, pages: dict[str, str]) -> None:
+    rows = "[...document.querySelectorAll('#about dt')].map((one) => [one.textContent, one.nextSibling.textContent])"
+    person("open", pages["labels"])
+    assert dict(person("eval", rows))["contains"].startswith("Gaussians, names of labels, slices of the volume")
+    person("open", pages["fixed"])
+    assert dict(person("eval", rows))["light"] == "headlight; ambient 0.4, diffuse 0.6, gloss 0.0"
+
+
 def test_a_page_that_is_far_from_its_volume_says_so_until_it_is_closed(person: Person, pages: dict[str, str]) -> None:
     seen = "(({ hidden, textContent }) => (hidden ? '' : textContent))(document.querySelector('#notice'))"
     person("open", pages["slices"])

@@ -249,9 +249,11 @@ def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
     assert (rows >= 0).sum() == 3 * 5 * 5
     assert len(facts["labels"]) == 1
     alone = vvgt.ok("view", scan / "labels.nii.gz", "--labels", "auto", "-o", page, "--overwrite", "--no-live")
-    assert "names of 1 labels" in alone.err
+    assert "names of 1 label," in alone.err
     assert [set(np.unique(rows)) for _, rows in held(page)] == [{-1, 0}]
     assert "--no-slices" in vvgt.fails(2, "view", scan / "scan.nii.gz", "--no-slices")
+    live = vvgt.ok("convert", scan / "labels.nii.gz", "--labels", "auto", "--live", "--overwrite", "-o", page, *HOW[:4])
+    assert "both.html holds Gaussians, names of 1 label," in live.err
     two = ("--tf", "gray", "--tf", "viridis")
     vvgt.ok("convert", scan / "scan.nii.gz", *two, "-o", page, *HOW)
     assert held(page) == []

@@ -119,9 +119,10 @@ def contents(options: PlyOptions, name: str, names: Sequence[str] = (), slices: 
         slices: of its volume.
     """
     layers = () if options.live is None else options.live.layers
-    parts = ["Gaussians", *(["data values, their histogram"] if layers else [])]
+    valued = any(not layer.labels for layer in layers)
+    parts = ["Gaussians", *(["data values, their histogram"] if valued else [])]
     labels = sum(len(layer.labels) for layer in layers) or (slices.labels if slices else 0)
-    parts += [f"names of {labels} labels"] if labels else []
+    parts += [f"names of {labels} label{'s' * (labels > 1)}"] if labels else []
     stated = [layer.name for layer in layers if layer.name] if len(layers) > 1 else list(names)
     parts += [f"the names {', '.join(stated[:3])}{', ...' if len(stated) > 3 else ''}"] if stated else []
     parts += [str(slices)] if slices else []

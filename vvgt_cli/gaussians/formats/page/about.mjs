@@ -6,11 +6,11 @@ export function rowsOf(name, { facts, world, count, live, converted, slices }) {
   const kinds = new Set(live?.layers.map(({ labels }) => (labels.length ? 'labels' : 'function')));
   return [
     ['name', name],
-    ['contains', [`Gaussians${live ? ', the data values under them and their histogram' : ''}`, ...(live?.layers.some(({ labels }) => labels.length) ? ['names of labels'] : []), ...(slices ? ['slices of the volume'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
+    ['contains', [`Gaussians${kinds.has('function') ? ', the data values under them and their histogram' : ''}`, ...(kinds.has('labels') ? ['names of labels'] : []), ...(slices ? ['slices of the volume'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
     ['look', live ? `${[...kinds, 'light'].join(' and ')} can be changed` : 'fixed'],
     ['function', live ? live.layers.map(({ name }) => name).filter(Boolean).join('; ') : facts.function],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
-    ['light', live ? null : facts.light],
+    ['light', live ? null : facts.light?.replace(/^(\S+) (\S+) (\S+) (\S+) (.*)/, '$5; ambient $1, diffuse $2, gloss $3')],
     ['quality', facts.quality],
     ['Gaussians', count && (converted ? `${number(converted.count)}, and ${number(count)} for other looks` : number(count))],
     ['made for', facts.size && `screens of ${facts.size} px; drawing rule: ${facts.rule}`],
