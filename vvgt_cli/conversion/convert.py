@@ -143,7 +143,7 @@ def run_conversion(
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
     regions = made is None and start is None and isinstance(field, Blocked) and by_regions(request)
     if start is not None:
-        field.views = start.views(field.views)
+        field.renderer = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
     report_target(run, work.fit, request.megabytes)
     if made is not None or regions:

@@ -98,7 +98,7 @@ class Blocked:
         prepare_look: maps a source of the same volumes to that source with statistics, reader and visible voxels.
         pictures: rendered or expected pictures, by digest.
         grid: the grid of base cells, once they are integrated.
-        views: renderer of its pictures; None selects the field itself.
+        renderer: renders its pictures; None selects the field itself.
     """
 
     source: Source
@@ -110,11 +110,12 @@ class Blocked:
     prepare_look: Callable[[Source], tuple[Source, Reader, float]]
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
-    views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+    renderer: ViewRenderer | None = None
 
-    def __post_init__(self) -> None:
-        """Use the field itself as the renderer if none is given."""
-        self.views = self.views or self
+    @property
+    def views(self) -> ViewRenderer:
+        """Implement `Field.views`."""
+        return self.renderer or self
 
     @cached_property
     def frame(self) -> Frame:
