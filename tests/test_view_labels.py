@@ -1,6 +1,8 @@
 # ruff: noqa: F811
 """Labels of `vvgt view`: saved as the page shows them, and converted so."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from vvgt_cli.commands.live_site import Cloud, PageController, parse_labels
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.live_facts import LABEL_ROW
+from vvgt_cli.look.labels import distinct
 from vvgt_cli.look.lighting import LightOptions
 
 Z, Y, X = np.mgrid[:12, :12, :12] // 6
@@ -64,7 +67,9 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> Non
     console = MessageConsole(told.append)
     volume = LoadedVolume(source, "eight", console)
     volume.send_live(console)
-    volume.convert((parse_labels(rows({2: 1.0})), None), console)
+    known = distinct(range(1, 9)).labels
+    named = [replace(label, name=f"cube {label.number}") for label in known]
+    volume.convert((parse_labels(rows({2: 1.0}), named), None), console)
     _, made, scored = [one for one in told if isinstance(one, Converted | Scored)]
     assert isinstance(made, Converted)
     gaussians = Cloud.of(made.ply, "x").gaussians
@@ -72,4 +77,5 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> Non
     assert isinstance(scored, Scored)
     assert Cloud.of(made.ply, "x").options.certificate is None
     assert Cloud.of(scored.ply, "x").options.certificate is not None
+    assert json.loads(Cloud.of(made.ply, "x").options.legend or "") == {"labels": [["cube 2", "4000ff"]], "of": 1}
     np.testing.assert_allclose(np.median(gaussians.colors, axis=0), (0.25, 0, 1), atol=0.05)

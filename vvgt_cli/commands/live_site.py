@@ -7,7 +7,7 @@ import io
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -26,14 +26,14 @@ from vvgt_cli.gaussians.formats.page_live import Extras, live_page_data, parse_l
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
-from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
+from vvgt_cli.gaussians.live_facts import MAX_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.label_files import table_of
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import triple
 
 JSON, BYTES, HTML = "application/json", "application/octet-stream", "text/html; charset=utf-8"
 SLICES = "slices.json"
@@ -103,21 +103,18 @@ class Cloud:
             raise DataError(f"the cloud has several layers; expected a look for each instead of {what}")
         return facts
 
-    def _function(self, facts: LiveFacts, tf: TransferFunction, several: int = 1) -> tuple[Table, LiveFacts]:
+    def _function(self, facts: LiveFacts, tf: TransferFunction, layer_count: int = 1) -> tuple[Table, LiveFacts]:
         """Return a layer's table and facts under a function."""
         if facts.labels:
             raise DataError("the cloud carries labels; expected labels, not a function")
         assert tf.opacity_unit_distance is not None
         distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
         table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
-        return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
+        return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, layer_count))
 
     def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
         """Return a layer's palette and facts under labels that a page sends."""
-        entries = {label.number: label for label in parse_labels(sent).labels}
-        if sorted(entries) != sorted(label.number for label in facts.labels):
-            raise DataError("the page's labels differ from the cloud's; expected all of these")
-        labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
+        labels = parse_labels(sent, facts.labels).labels
         return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
 
     def with_labels(self, sent: Any, light: Any = None) -> Cloud:
@@ -167,20 +164,18 @@ class Cloud:
         return replace(self, gaussians=found, options=options, ply=None)
 
 
-def parse_labels(sent: Any) -> LabelTable:
-    """Return the labels of a page, a list of number, color (RGB in [0, 1]) and opacity, or raise DataError."""
+def parse_labels(sent: Any, known: Sequence[Label]) -> LabelTable:
+    """Return the labels of a cloud as a page sends them: a list of number, color (RGB in [0, 1]) and opacity.
+
+    Raise DataError for another list, or labels of another cloud.
+    """
     what = "the page's labels"
-    if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
-        raise DataError(f"{what}: expected a list of at most {MOST_LABELS} objects")
-    found = []
-    for entry in sent:
-        number, color, opacity = entry.get("number"), entry.get("color"), entry.get("opacity")
-        if not isinstance(number, int) or not isinstance(color, list) or len(color) != 3:
-            raise DataError(f"{what}: expected number, color (three numbers) and opacity")
-        if not all(isinstance(x, int | float) and 0 <= x <= 1 for x in (*color, opacity)):
-            raise DataError(f"{what}: label {number}; expected color and opacity in [0, 1]")
-        found.append(Label(number, str(number), triple(list(map(float, color))), float(opacity)))
-    return LabelTable(what, tuple(sorted(found, key=lambda label: label.number)))
+    if not isinstance(sent, list) or not 0 < len(sent) <= MAX_LABELS or not all(isinstance(e, dict) for e in sent):
+        raise DataError(f"{what}: expected a list of at most {MAX_LABELS} objects")
+    looks = {label.number: label for label in table_of({str(one.get("number")): one for one in sent}, what).labels}
+    if sorted(looks) != sorted(label.number for label in known):
+        raise DataError(f"{what} differ from the cloud's; expected all of these")
+    return LabelTable(what, tuple(replace(looks[label.number], name=label.name) for label in known))
 
 
 def parse_function(sent: Any) -> TransferFunction:
@@ -297,7 +292,10 @@ class PageController:
         job: Job = None
         if sent is not None:
             light = sent.pop("light", None) if isinstance(sent, dict) else None
-            look = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
+            live = self.first().options.live
+            known = () if live is None else live.labels
+            labelled = isinstance(sent, dict) and "labels" in sent
+            look = parse_labels(sent["labels"], known) if labelled else parse_function(sent)
             check_labels([look])
             job = look, None if light is None else LightOptions.of(parse_light(light, self.first().options))
         with self.converter.lock:

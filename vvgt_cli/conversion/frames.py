@@ -17,12 +17,12 @@ from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_content
+from vvgt_cli.field.layered import ALL, COLOR, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
-from vvgt_cli.look.label_files import holds_table, read_labels
-from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.label_files import holds_table, table_for
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
@@ -243,7 +243,7 @@ def survey(
     """
     first: Content | None = None
     numbers, digests = [], []
-    mapped, found = labels not in (None, NONE), set[int]()
+    mapped, found = labels not in (None, NO_LABELS), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
@@ -328,18 +328,12 @@ def _functions(
     from vvgt_cli.look.resolve import parse_tf_range
 
     if frames.labels is not None and frames.first.single_volume:
-        return (_table(source.labels, frames.labels),), unit_distance(source.unit_distance, frames.grid)
+        table = table_for(source.labels or AUTO, frames.labels, "the series")
+        return (table,), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))
     given = read if read is not None and frames.first.single_volume else shown[0]
     return shown, unit_distance(source.unit_distance, frames.grid, given)
-
-
-def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
-    """Return the table of a series of label maps; automatic colours depend on the label's number alone."""
-    if isinstance(labels, str) and labels != AUTO:
-        return read_labels(labels).warned(found, "the series")
-    return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
 def list_steps(source: SourceRequest) -> list[Step]:

@@ -8,7 +8,6 @@ hide are also converted alone, and their hidden Gaussians added; so are labels t
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,22 +21,19 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import AUTO, IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
-from vvgt_cli.field.layered import NONE as NO_LABELS
+from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.label_files import read_labels
-from vvgt_cli.look.labels import Label, LabelTable, check_labels
+from vvgt_cli.look.labels import AUTO, NO_LABELS, Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.space import metres
-
-LONGEST = 80  # characters of a label's name in a file name
 
 
 @dataclass(frozen=True)
@@ -166,7 +162,8 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
     for whole_map in maps:
         volume, table, extents = whole_map.volume, whole_map.tf, extents_of(whole_map.volume)
         assert isinstance(table, LabelTable)
-        for label in table.warned(extents, volume.name, split=True).labels:
+        table.warn_hidden(extents, volume.name, split=True)
+        for label in table.labels:
             extent = extents.get(float(label.number))
             if label.shown_opacity > 0 and extent is not None:
                 shown.append((volume, table, label, extent))
@@ -176,7 +173,7 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
     for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
         again = numbers.count(label.number) > 1  # of segments that overlap
-        stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
+        stem = f"{volume.name.rpartition(' ')[2]}-{label.stem}" if again else label.stem
         facts = label.facts() | extent.measures(volume)
         if layer:
             facts["parents"] = (layer, *label.parents)
@@ -252,8 +249,3 @@ def shares(voxels: Sequence[int], budget: int) -> list[int]:
     weight = np.array(voxels, np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
-
-
-def file_name(label: Label) -> str:
-    """Return the unique number of a label and its name in plain characters."""
-    return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name)[:LONGEST].strip('-')}".strip("-")

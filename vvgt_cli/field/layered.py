@@ -22,8 +22,8 @@ from vvgt_cli.look import (
     unit_distance,
 )
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.label_files import holds_table, read_labels, segments_of
-from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.label_files import holds_table, segments_of, table_for
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
@@ -31,7 +31,6 @@ from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
 
-AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # values of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
@@ -188,11 +187,11 @@ def is_plain(
     opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
     """Return whether the content is one scalar field under a function, and not a recognised label map."""
-    if not opened.single_volume or layers or labels not in (None, NONE):
+    if not opened.single_volume or layers or labels not in (None, NO_LABELS):
         return False
     return (
         tf is not None
-        or labels == NONE
+        or labels == NO_LABELS
         or not (holds_table(opened.path) or recognised(opened.volumes[0], access.labels))
     )
 
@@ -222,7 +221,7 @@ def layers_of(
         UsageError: there is both a label table and a function.
     """
     labels = _chosen_labels(opened, tf, labels, access)
-    if labels not in (None, NONE):
+    if labels is not None and labels != NO_LABELS:
         own = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
             return _overlapping(opened, labels, own, distance, access)
@@ -250,15 +249,15 @@ def _chosen_labels(
     """Return the requested labels, or ``auto`` for a recognised label map; arguments as in `layers_of`."""
     volume = opened.volumes[0]
     if opened.overlapping:
-        if tf is not None or labels == NONE:
+        if tf is not None or labels == NO_LABELS:
             raise UsageError(
                 f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: omit "
                 "--tf and --labels none, or take one layer with --component N"
             )
         return labels or AUTO
-    if labels not in (None, NONE) and not opened.single_volume:
+    if labels not in (None, NO_LABELS) and not opened.single_volume:
         raise UsageError(f"{volume.name}: several components; expected a label map: choose one with --component N")
-    if labels not in (None, NONE) and tf is not None:
+    if labels not in (None, NO_LABELS) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
     if labels is None and tf is None and opened.single_volume:
         own = holds_table(opened.path)
@@ -320,7 +319,7 @@ def _white(opened: Content) -> float:
 
 
 def _overlapping(
-    opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None, access: Access
+    opened: Content, labels: str | LabelTable, own: bool, distance: str | None, access: Access
 ) -> list[Layer]:
     """Return overlapping layers (.seg.nrrd) or segments (DICOM), each under its own table, or all under one.
 
@@ -337,20 +336,13 @@ def _overlapping(
 
 
 def _labelled(
-    volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access, empty: bool = False
+    volume: Volume, labels: str | LabelTable, distance: str | None, access: Access, empty: bool = False
 ) -> Layer:
     """Return a label map under its table; raise DataError if it has no labels, unless it may be ``empty``."""
-    numbers = access.labels(volume)
-    if empty and not any(numbers):
-        table = distinct(numbers)
-    elif isinstance(labels, str) and labels != AUTO:
-        table = read_labels(labels).warned(numbers, volume.name).of(numbers, volume.name)
-    elif isinstance(labels, LabelTable):
-        table = labels.of(numbers, volume.name)
-    elif any(numbers):
-        table = distinct(numbers)
-    else:
+    labels_there = access.labels(volume)
+    if not any(labels_there) and not empty:
         raise DataError(f"{volume.name}: no label other than 0; expected some to show")
+    table = table_for(labels, labels_there, volume.name) if any(labels_there) else distinct(labels_there)
     shows = any(label.opacity > 0 for label in table.labels)
     return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
 

@@ -17,7 +17,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.layered import NONE, Content, content_of, open_content
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.runners import InProcess, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
@@ -25,6 +25,7 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.look.label_files import holds_table
+from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
@@ -146,7 +147,7 @@ def blocked(
 
 def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
     """Return the volume, its values still in the file, and bytes per voxel where they are not those of its type."""
-    given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
+    given, layered = request.volume, request.labels not in (None, NO_LABELS) or bool(request.layers)
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
         content = open_content(given, read)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, content_of, is_plain, layers_of
+from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_plain, layers_of
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.labels import LabelTable, check_labels
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
@@ -66,7 +66,7 @@ class SourceRequest:
         """Return the paths of all files that will be read."""
         given = [self.volume, self.tf, self.labels, self.read.mask]
         given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
-        return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
+        return [path for path in given if isinstance(path, str) and path not in (AUTO, NO_LABELS)]
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:

@@ -15,7 +15,7 @@ from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.labels import LabelTable, hex_color, labels_legend
 from vvgt_cli.look.lighting import Lighting, parse_lighting
 from vvgt_cli.version import VERSION
 
@@ -317,7 +317,7 @@ def _finite(words: list[str]) -> list[float]:
     return values
 
 
-MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: space in a header is limited
+MAX_LEGEND_NODES, MAX_LEGEND = 32, 2500  # nodes, characters: space in a header is limited
 
 
 def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "") -> str | None:
@@ -332,25 +332,17 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
         quantity: what the values are, "" if unknown.
     """
     if tables := [one for one in (tf if isinstance(tf, list) else [tf]) if isinstance(one, LabelTable)]:
-        shown = [label for table in tables for label in table.labels if label.opacity > 0]
-        rows = [[label.name, _hex(label.color)] for label in shown[:MOST_LABELS]]
-        while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
-            rows.pop()
-        return text
+        return labels_legend([label for table in tables for label in table.labels], MAX_LEGEND)
     if not isinstance(tf, TransferFunction):
         return None
     places = np.unique(np.concatenate([[lo, hi], tf.opacity_nodes.x, tf.color_map.x]).clip(lo, hi))
-    if len(places) > MOST_NODES or tf.color_map.space != "RGB":
-        places = np.linspace(lo, hi, MOST_NODES) if hi > lo else np.array([lo])
+    if len(places) > MAX_LEGEND_NODES or tf.color_map.space != "RGB":
+        places = np.linspace(lo, hi, MAX_LEGEND_NODES) if hi > lo else np.array([lo])
     nodes: list[list[Any]] = []
     for x, limits in zip(places.tolist(), tf.limits(places).tolist(), strict=True):
-        below, above = ([float(f"{x:.6g}"), round(opacity, 4), _hex(rgb)] for opacity, *rgb in limits)
+        below, above = ([float(f"{x:.6g}"), round(opacity, 4), hex_color(rgb)] for opacity, *rgb in limits)
         nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
     return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
-
-
-def _hex(rgb: Any) -> str:
-    return "".join(f"{round(255 * min(max(float(c), 0.0), 1.0)):02x}" for c in rgb)
 
 
 def checked(text: str) -> str:

@@ -23,6 +23,7 @@ from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import OPAQUE, law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.labels import merge_labels
 from vvgt_cli.look.lighting import MATTE, MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
@@ -148,8 +149,7 @@ def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     """Return common facts about one layer of each file, None if there are none."""
     first = facts[0]
     if all(one.labels for one in facts):
-        labels = {(label.number, label.name): label for one in reversed(facts) for label in one.labels}
-        return replace(first, labels=tuple(labels[key] for key in sorted(labels)))
+        return replace(first, labels=merge_labels(label for one in facts for label in one.labels))
     looks = {(bool(one.labels), one.lo, one.hi, one.function) for one in facts}
     return first if len(looks) == 1 else None
 
@@ -186,9 +186,9 @@ def with_shared_labels(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -
     live = gaussians.live.copy()
     for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
         if one.labels != all_.labels:
-            rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
+            rows = {label.key: row for row, label in enumerate(all_.labels)}
             mine = live[:, LAYER_ID] == number if facts.others else np.full(len(live), True)
-            to = np.array([rows[label.number, label.name] for label in one.labels])
+            to = np.array([rows[label.key] for label in one.labels])
             live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 

@@ -144,12 +144,12 @@ def _labels(
     table: LabelTable, volume: Volume, dims: tuple[int, int, int]
 ) -> tuple[dict[str, Any], np.ndarray]:  # fmt: skip
     """Return facts and codes (nz, ny, nx) of labels, as many as fit."""
-    labels = [one for one in table.labels if one.number != 0 or one.opacity > 0][: CODES - 1]
+    labels = table.structures[: CODES - 1]
     numbers = np.array([one.number for one in labels], np.float64)
     found = sampled(volume, dims)
     row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
     codes = np.where(numbers[row] == found, row + 1, 0).astype(np.uint8 if len(labels) < 256 else np.uint16)
-    return {"labels": [{"name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in labels]}, codes
+    return {"labels": [label.page_entry() for label in labels]}, codes
 
 
 def packed(codes: np.ndarray) -> bytes:
