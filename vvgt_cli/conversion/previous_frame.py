@@ -18,6 +18,7 @@ from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
 
 
 WARM_START = "starting from the previous frame"
-STEPS = 50  # of gradient descent at a time
-ROUNDS = 2  # of `STEPS` at most
+ROUNDS = 2  # of `WARM_STEPS` at most
 LEVEL = 0.25 / 255  # difference of a pixel that counts as none
 VIEWS = 18  # training views per frame, which take turns
 WORSE = 0.2  # dB on the check views below the last cold frame, beyond which a frame starts cold
@@ -155,12 +155,12 @@ class PreviousFrame(WarmStart):
         assert work.check is not None
         judged, psnr = _changed_blocks(work.check, found), 0.0
         asked = work.fit.steps
-        left = ROUNDS * STEPS if asked is None else min(asked, ROUNDS * STEPS)
+        left = ROUNDS * WARM_STEPS if asked is None else min(asked, ROUNDS * WARM_STEPS)
         while left > 0:
-            steps = min(STEPS, left)
+            steps = min(WARM_STEPS, left)
             left -= steps
             options = OptimizeOptions.of(
-                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=STEPS
+                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
             result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
             result = as_stored(widen_small(result, work.fit.size)[0])

@@ -17,6 +17,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import suits_small_views, view_count
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
@@ -26,7 +27,6 @@ from vvgt_cli.gaussians.live import TAU, Table
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
-STEPS = 50  # of gradient descent at most
 FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
 WORSE = 2.0  # the same after the steps, since other looks allow other errors
 FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
@@ -83,7 +83,8 @@ class PreviousLook(WarmStart):
         """Refine the recoloured Gaussians; return the reason why they are not good enough, None if they are."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
-        steps, small = min(work.fit.steps or STEPS, STEPS), suits_small_views(work.made(), work.fit.size)
+        steps = min(work.fit.steps or WARM_STEPS, WARM_STEPS)
+        small = suits_small_views(work.made(), work.fit.size)
         stages = (
             TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
             Refinement(steps, steps, small),

@@ -20,7 +20,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
-from vvgt_cli.conversion.plan import FEWEST_STEPS
+from vvgt_cli.conversion.plan import most_steps, steps_in_time
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
 from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
@@ -138,9 +138,7 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
 def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | None:
     """Return the refiner of a request's steps, as many as there is time for; None for no steps."""
     fit, limits = request.fit, request.limits
-    ended = limits.target_psnr is not None or limits.time_budget is not None
-    steps = fit.most_steps(ended)
-    degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
+    steps, degree = most_steps(fit, limits), degree_of(request, field.source)
     chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
     if chosen.is_file():
         steps = int(chosen.read_text("ascii"))
@@ -148,10 +146,9 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     elif steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
-        steps = min(steps, max(int(left / each), 0))
-        if steps < fewest:
+        steps = steps_in_time(steps, left, lambda steps: steps * each)
+        if not steps:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
-            steps = 0
         with atomic_write(chosen, overwrite=True) as temporary:
             temporary.write_text(str(steps), "ascii")
     if not steps:
