@@ -242,7 +242,7 @@ def survey(
         UsageError: the segments of a frame overlap.
     """
     first: Content | None = None
-    numbers, digests = [], []
+    stats, digests = [], []
     mapped, found = labels not in (None, NO_LABELS), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
@@ -255,14 +255,14 @@ def survey(
             mapped = holds_table(content.path) or recognised(content.volumes[0])
         if mapped and content.single_volume:
             found.update(labels_in(content.volumes[0]))
-        numbers.append([statistics(volume) for volume in content.classified])
+        stats.append([statistics(volume) for volume in content.classified])
         digests += [volume_digest(volume) for volume in content.volumes]
         if bar:
             bar(k + 1, len(steps))
     if first is None:
         raise UsageError("the series has no frames; expected one or more")
-    whole = tuple(merge_statistics(rows) for rows in zip(*numbers, strict=True))
-    own = [[(n.lo, n.hi) for n in rows] for rows in numbers]
+    whole = tuple(merge_statistics(rows) for rows in zip(*stats, strict=True))
+    own = [[(n.lo, n.hi) for n in rows] for rows in stats]
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 

@@ -232,9 +232,9 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
 
 def function_table(source: Source) -> Table:
     """Return the lookup table of the function of a source, with lengths in the unit frame."""
-    numbers, tf = source.overall, source.tf
+    stats, tf = source.overall, source.tf
     assert isinstance(tf, TransferFunction)
-    facts = LiveFacts.of(source.volume, numbers, tf)
+    facts = LiveFacts.of(source.volume, stats, tf)
     distance = source.unit_distance * source.volume.unit_frame().scale
     return Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
 

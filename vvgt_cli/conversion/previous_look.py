@@ -142,9 +142,9 @@ def _look_alone(
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 
-    numbers, scale = source.statistics, source.volume.unit_frame().scale
+    stats, scale = source.statistics, source.volume.unit_frame().scale
     grain = 2 / max(source.volume.dims)
-    table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
+    table = Table.of_function(look.tf, stats.lo, stats.hi, look.unit_distance * scale, grain)
     sums = table.of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)

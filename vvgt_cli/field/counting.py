@@ -297,9 +297,9 @@ def with_limits(whole: Tally, volume: Volume) -> Tally:
         Unsuitable: no voxel has a finite value, or the scaling makes values infinite.
     """
     if counted(volume):
-        numbers = integer_statistics(whole.counts, volume)
-        ends = (numbers.lo - volume.intercept) / volume.slope, (numbers.hi - volume.intercept) / volume.slope
-        return replace(whole, lo=numbers.lo, hi=numbers.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
+        stats = integer_statistics(whole.counts, volume)
+        ends = (stats.lo - volume.intercept) / volume.slope, (stats.hi - volume.intercept) / volume.slope
+        return replace(whole, lo=stats.lo, hi=stats.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
     if not whole.finite:
         inf = volume.data.size - whole.nan
         raise Unsuitable(

@@ -232,11 +232,11 @@ def layers_of(
         return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
-    numbers = whole or [access.statistics(volume) for volume in sources]
-    shown = functions_of(opened, numbers, function, tf_range)
+    stats = whole or [access.statistics(volume) for volume in sources]
+    shown = functions_of(opened, stats, function, tf_range)
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
-    for volume, one, its in zip(sources, shown, numbers, strict=True):
+    for volume, one, its in zip(sources, shown, stats, strict=True):
         given = function if function is not None and opened.single_volume else one
         there = bool(one.support(its.lo, its.hi))
         layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened), there))
@@ -270,23 +270,23 @@ def _chosen_labels(
 
 def functions_of(
     opened: Content,
-    numbers: Sequence[Statistics],
+    stats: Sequence[Statistics],
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float] = "data",
 ) -> list[TransferFunction]:
-    """Return a function on data values per volume of `Content.classified`; ``numbers`` are the volumes' statistics."""
+    """Return a function on data values per volume of `Content.classified`; ``stats`` are the volumes' statistics."""
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
-        return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
+        return [resolve(tf, stats[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
     if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
-            return [from_histogram(numbers[0], one.hounsfield, one.density)]
-        return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
+            return [from_histogram(stats[0], one.hounsfield, one.density)]
+        return [resolve(tf, stats[0], tf_range, one.hounsfield)]
     if opened.components_message:
         _warn_all_channels(opened, tf)
-    names = opened.names or [""] * len(numbers)
-    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+    names = opened.names or [""] * len(stats)
+    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(stats)]
 
 
 def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
@@ -369,7 +369,7 @@ def _channel(
     number: int,
     name: str,
     color: tuple[float, float, float] | None,
-    numbers: Statistics,
+    stats: Statistics,
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
 ) -> TransferFunction:
@@ -378,10 +378,10 @@ def _channel(
 
     rgb = channel_color(number, color)
     if tf is not None:
-        shown = resolve(tf, numbers, tf_range)
+        shown = resolve(tf, stats, tf_range)
         lo, hi = shown.node_range()
         return replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
-    lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
+    lo, hi = percentiles(stats, np.array([DARK, BRIGHT]))
     return _function(
         f"channel {number}{f' {name}' if name else ''}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb
     )

@@ -209,10 +209,10 @@ def _reader(source: Source, access: BlockAccess) -> tuple[Reader, float]:
 
     volume, frame = source.volume, source.volume.unit_frame()
     if not source.gridded:
-        task, whole, numbers = access.counts(volume)
+        task, whole, stats = access.counts(volume)
         rule = kernel_rule(volume, lambda: whole.stored)
         optics = build_tables(
-            source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
+            source.tf, (stats.lo, stats.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
             voxel=float(np.mean(frame.step)),
         )  # fmt: skip

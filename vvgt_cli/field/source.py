@@ -298,10 +298,10 @@ def load_all(
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # report its errors first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
-    numbers = content.statistics if held else access.statistics(volume)
+    stats = content.statistics if held else access.statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
-        whole = request.statistics[0] if request.statistics else numbers
+        whole = request.statistics[0] if request.statistics else stats
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
@@ -313,10 +313,10 @@ def load_all(
                 stacklevel=2,
             )
         if not request.statistics:  # a frame of a series may be dark
-            check_visible(shown, numbers)
+            check_visible(shown, stats)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if held else None
-        sources.append(Source((layer,), volume, numbers, lighting, layout, tuple(request.statistics)))
+        sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 
 
@@ -336,10 +336,10 @@ def _layered(
             ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
-    numbers = access.statistics(layers[0].volume)
+    stats = access.statistics(layers[0].volume)
     _check_seen(layers, access, len(request.statistics))
     grid = common_grid(layers, content.stored)
-    return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
+    return Source(tuple(layers), grid, stats, lighting, series=tuple(request.statistics))
 
 
 def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
@@ -368,10 +368,10 @@ def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
 
 def describe_source(source: Source) -> str:
     """Return one line that describes a source: grid, type, values, function, unit distance."""
-    volume, numbers = source.volume, source.statistics
+    volume, stats = source.volume, source.statistics
     grid = " x ".join(map(str, volume.dims))
-    holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
-    values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
+    holes = [f"{n} {what} (transparent)" for n, what in ((stats.nan_count, "NaN"), (stats.inf_count, "inf")) if n]
+    values = ", ".join([f"values {stats.lo:g} to {stats.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
     light += " (its own; --light none omits it)" if light and source.lighting == source.tf.lighting else ""
@@ -381,16 +381,16 @@ def describe_source(source: Source) -> str:
 
 def volume_record(source: Source) -> dict[str, Any]:
     """Return the volume's entry in a report."""
-    volume, numbers = source.volume, source.statistics
+    volume, stats = source.volume, source.statistics
     return {
         "name": volume.name,
         "dims": volume.dims,
         "dtype": volume.data.dtype.name,
         "spacing": volume.spacing,
         "space": volume.space or "none",
-        "range": (numbers.lo, numbers.hi),
-        "nan": numbers.nan_count,
-        "inf": numbers.inf_count,
+        "range": (stats.lo, stats.hi),
+        "nan": stats.nan_count,
+        "inf": stats.inf_count,
     }
 
 

@@ -75,7 +75,7 @@ class LiveFacts:
 
     @classmethod
     def of(
-        cls, volume: Volume, known: Statistics, look: TransferFunction | LabelTable, layer_count: int = 1
+        cls, volume: Volume, stats: Statistics, look: TransferFunction | LabelTable, layer_count: int = 1
     ) -> LiveFacts:
         """Return the facts for a volume, its statistics and look; ``layer_count`` is the file's number of layers.
 
@@ -87,8 +87,8 @@ class LiveFacts:
                 raise NoLiveForm(f"{volume.name}: {len(labels)} labels; a live form has at most {MAX_LABELS}")
             numbers = [float(label.number) for label in labels]
             return cls(min(numbers, default=0.0), max(numbers, default=0.0), volume.dims, labels=labels)
-        counts = tuple(int(n) for n in known.histogram)
-        lo, hi = known.lo, known.hi
+        counts = tuple(int(n) for n in stats.histogram)
+        lo, hi = stats.lo, stats.hi
         unit, function = unit_of_values(volume.values_in, look), function_text(look, lo, hi, layer_count)
         return cls(lo, hi, volume.dims, counts, unit, function, quantity=volume.quantity)
 
