@@ -22,7 +22,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import held_frames, patch, patched
+from vvgt_cli.gaussians.formats.page_frames import stored_frames, patch, patched
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
@@ -206,7 +206,7 @@ def rows(file: Path) -> np.ndarray:
 def test_frames_share_what_stands_still_whatever_their_comments_say():
     gaussians = random_cloud(600, 1, 0.05, 0.3, (0.0, 1.0))
     clouds = [(f"{k}", splats_of(gaussians, PlyOptions(function="f" * n))) for k, n in enumerate((3, 12, 5, 12))]
-    held = held_frames(clouds)
+    held = stored_frames(clouds)
     assert [frame.whole for frame in held] == [None, 0, 0, 0]
     for (name, splats), (content, _) in zip(clouds[1:], held[1:], strict=True):
         found = read_compressed_ply(patched(held[0].content, content), name)

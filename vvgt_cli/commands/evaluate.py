@@ -185,11 +185,11 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     """
     if header.live is None or (request.labels is None and request.tf is None and not request.layers):
         return gaussians
-    held = ["labels" if one.labels else "values" for one in header.live.layers]
+    carried = ["labels" if one.labels else "values" for one in header.live.layers]
     shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]
-    if held != shown:
+    if carried != shown:
         raise UsageError(
-            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(held)}; expected the volume and "
+            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
             "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))

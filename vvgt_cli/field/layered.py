@@ -26,7 +26,7 @@ from vvgt_cli.look.label_files import holds_table, segments_of, table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
+from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
@@ -89,9 +89,9 @@ class Content:
 
         return PreparedVolume.of(self.volumes[0])
 
-    def held(self) -> Content:
+    def loaded(self) -> Content:
         """Return the same content, with lazily computed arrays loaded into memory."""
-        volumes = tuple(map(held, self.volumes))
+        volumes = tuple(map(loaded, self.volumes))
         return (
             self if all(a is b for a, b in zip(volumes, self.volumes, strict=True)) else replace(self, volumes=volumes)
         )
@@ -120,7 +120,7 @@ class InMemory:
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
         """Implement `Access.open`."""
-        return open_content(source, read) if isinstance(source, str) else content_of(source).held()
+        return open_content(source, read) if isinstance(source, str) else content_of(source).loaded()
 
     def statistics(self, volume: Volume) -> Statistics:
         """Implement `Access.statistics`."""

@@ -238,7 +238,7 @@ def composed(
     """
     pieces, bundles, kind = pieces_of(dims), rays.bundles(), rays.kind
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
-    held: dict[int, np.ndarray] = {}
+    mapped: dict[int, np.ndarray] = {}
     for number in numbers:
         path = store.path(kind, number, SUFFIX)
         offset = 0
@@ -246,17 +246,17 @@ def composed(
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:
-            held[number] = _mapped(path, offset)
+            mapped[number] = _mapped(path, offset)
     for bundle, found in zip(bundles, shown, strict=True):
         each = len(bundle.offsets)
         color, through = np.zeros((len(bundle.pixels) * each, 3)), np.ones(len(bundle.pixels) * each)
         for piece in front_to_back(pieces, bundle.eye, list(found)):
             number, part = found[piece]
-            ray, rgba = held[number]["ray"][part], held[number]["rgba"][part]
+            ray, rgba = mapped[number]["ray"][part], mapped[number]["rgba"][part]
             color[ray] += through[ray, None] * rgba[:, :3]
             through[ray] *= 1.0 - rgba[:, 3]
         for number in {number for number, _ in found.values()}:
-            give_back(held[number])
+            give_back(mapped[number])
         yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
 
 

@@ -292,13 +292,13 @@ def load_all(
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
     content = access.open(request.volume, request.read)
-    held = content is request.volume and access is IN_MEMORY  # for several functions
+    reused = content is request.volume and access is IN_MEMORY  # for several functions
     if not is_plain(content, functions[0], request.labels, request.layers, access):
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # report its errors first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
-    stats = content.statistics if held else access.statistics(volume)
+    stats = content.statistics if reused else access.statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics[0] if request.statistics else stats
@@ -315,7 +315,7 @@ def load_all(
         if not request.statistics:  # a frame of a series may be dark
             check_visible(shown, stats)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
-        layout = content.layout if held else None
+        layout = content.layout if reused else None
         sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 

@@ -25,7 +25,7 @@ from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import held_frames
+from vvgt_cli.gaussians.formats.page_frames import stored_frames
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.frames import up_matrix
@@ -221,7 +221,7 @@ def html_of_several(
     """
     held = [("program", "text/plain", asset(PROGRAM))]
     held += [(key, "application/octet-stream", content) for key, content in embedded.items()]
-    shown = held_frames(clouds)
+    shown = stored_frames(clouds)
     held += [(f"{prefix}-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'

@@ -20,7 +20,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageEr
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, magnitude
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.stored import Slices, stored_or_held
+from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.types import Volume
 
 EXTRA = "microscopy"
@@ -82,7 +82,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
         field = magnitude(np.stack(bands, axis=-1))
     elif not picture.mapped:
         read = partial(picture.read, time, channel)
-        field = stored_or_held(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
+        field = stored_or_loaded(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
     else:
         field = picture.read(time, channel, box)
         if not field.flags.c_contiguous:

@@ -25,7 +25,7 @@ from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, re
 from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
-HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
+MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
 DEPTH = 64  # slices that are read at once where the volume is walked through
 FEW = 4096  # pieces of which every pair is compared
@@ -153,7 +153,7 @@ class _Pieces:
                 return self._kept[k]
             made = self._opened(k)
             self._kept[k] = made
-            while len(self._kept) > 1 and (len(self._kept) > OPEN or self._bytes() > HELD):
+            while len(self._kept) > 1 and (len(self._kept) > OPEN or self._bytes() > MAX_KEPT):
                 self._kept.popitem(last=False)
             return made
 
