@@ -22,7 +22,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import stored_frames, patch, patched
+from vvgt_cli.gaussians.formats.page_frames import patch, patched, stored_frames
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
@@ -240,7 +240,7 @@ def check_page(folder: Path) -> None:
     """The page holds what the files do, and the frames that go on as little as differs."""
     text = (folder / "f.html").read_text("utf-8")
     frames = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])["frames"]
-    held = [base64.b64decode(re.search(rf'id="{frame["held"]}">([^<]*)</script>', text)[1]) for frame in frames]
+    held = [base64.b64decode(re.search(rf'id="{frame["element"]}">([^<]*)</script>', text)[1]) for frame in frames]
     assert [frame.get("whole") for frame in frames] == [None, 0, 0, 0]
     whole = [held[0], *(patched(held[0], runs) for runs in held[1:])]
     for k, content in enumerate(whole):

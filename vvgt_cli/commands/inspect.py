@@ -22,7 +22,7 @@ from vvgt_cli.gaussians import as_ply, describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
-from vvgt_cli.gaussians.formats.page_live import HELD
+from vvgt_cli.gaussians.formats.page_live import VALUES_ID
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
@@ -314,7 +314,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
     text = Path(file).read_text("utf-8") if page else ""
-    live = bool(layers) or f'id="{HELD}-0"' in text
+    live = bool(layers) or f'id="{VALUES_ID}-0"' in text
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
     scanned = header.space in ("RAS", "LPS")

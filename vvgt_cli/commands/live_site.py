@@ -202,8 +202,8 @@ def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, 
     else:
         [splats], [planes], facts = live_page_data([(cloud.gaussians, cloud.options)])
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
-        held = base64.b64encode(planes).decode("ascii")
-        elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
+        encoded_planes = base64.b64encode(planes).decode("ascii")
+        elements = f'<script type="{BYTES}" id="{facts["elements"][0]}">{encoded_planes}</script>\n{SCRIPT}'
         more = {"live": facts, "server": {"converts": converts and len(facts["layers"]) == 1, "name": cloud.name}}
     if sliced:
         more["slices"] = {"from": SLICES}
@@ -278,7 +278,7 @@ class PageController:
         found = self.slices()
         if found is None:
             raise DataError("slices: the volume has colours; expected values or labels")
-        contents = {key: base64.b64encode(content).decode("ascii") for key, content in found.held.items()}
+        contents = {key: base64.b64encode(content).decode("ascii") for key, content in found.elements.items()}
         return json.dumps({"facts": found.facts, "contents": contents}).encode()
 
     def function(self, sent: Any) -> Resource:

@@ -31,7 +31,7 @@ from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume.types import triple
 
-HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
+VALUES_ID = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
 SAMPLED, FEW = 96, 12  # nodes for colours that are not interpolated linearly in RGB: of the file's function, of presets
 ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
@@ -82,17 +82,18 @@ def live_html_of_several(
     light = clouds[0][2].light
     if light is not None and light.headlight + len(light.directions) > 1:
         warnings.warn(f"{name}: the page shows one light at a time, and begins with the first", stacklevel=2)
-    held = dict(zip(facts["held"], planes, strict=True)) | (slices.held if slices else {})
+    contents = dict(zip(facts["elements"], planes, strict=True)) | (slices.elements if slices else {})
     more: dict[str, Any] = {"live": facts} | (slices.scene if slices else {})
     if converted is not None:
-        held["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
+        contents["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
         found = clouds[0][2].certificate
         score = "" if found is None else f", {found.psnr:.1f} dB"
         more["converted"] = {
-            "file": "converted.compressed.ply", "held": "splats-0", "said": f"converted{score}", "count": len(converted)
+            "file": "converted.compressed.ply", "element": "splats-0", "said": f"converted{score}",
+            "count": len(converted),
         }  # fmt: skip
     named = [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)]
-    return html_of_several(named, name, held, more, "splats" if converted is None else "live")
+    return html_of_several(named, name, contents, more, "splats" if converted is None else "live")
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
@@ -207,7 +208,7 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
         own |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, own)}
     axes = _axes(upright(options).up)
     return found | {
-        "held": [f"{HELD}-{k}" for k in range(len(clouds))],
+        "elements": [f"{VALUES_ID}-{k}" for k in range(len(clouds))],
         "planes": planes_of(facts),
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),

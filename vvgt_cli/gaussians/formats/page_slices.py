@@ -63,9 +63,9 @@ class Slices(NamedTuple):
         return {"slices": self.facts}
 
     @property
-    def held(self) -> dict[str, bytes]:
+    def elements(self) -> dict[str, bytes]:
         """Contents by the ids of their elements."""
-        return {one["held"]: content for one, content in zip(self.facts, self.contents, strict=True)}
+        return {one["element"]: content for one, content in zip(self.facts, self.contents, strict=True)}
 
     def __str__(self) -> str:
         """Describe the grids for whoever sends the page."""
@@ -108,7 +108,7 @@ def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> 
         facts.append(
             {
                 "layer": number, "title": title, "dims": list(dims), "bits": 8 * codes.itemsize,
-                "affine": affine.ravel().tolist(), "held": f"slices-{number}",
+                "affine": affine.ravel().tolist(), "element": f"slices-{number}",
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
