@@ -132,7 +132,7 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
     assert stages["views"].note.startswith("24 of 200 px")
     assert "blocks" in stages["check views"].note
     header = read_ply(tmp_path / "a.ply")[1]
-    assert (header.made_for, header.rule) == (600, "inria")
+    assert (header.screen_size, header.rule) == (600, "inria")
     other = done(tmp_path, FitOptions(600, 600, steps=48, rule="playcanvas"), overwrite=True)
     by = {(condition["rule"], condition["size"]): condition["psnr"] for condition in report.conditions}
     assert {(condition["rule"], condition["size"]): condition["psnr"] for condition in other.conditions}[
@@ -290,7 +290,7 @@ def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatc
         return plan_of(self, workload, *rest, **begun)
 
     monkeypatch.setattr(Planner, "plan", note)
-    monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.made())))
+    monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.current())))
     done(tmp_path, FitOptions(1000, 48))
     assert made[0] < 300
     assert seen == [1000, made[0]]
@@ -371,7 +371,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
     with pytest.raises(AssertionError, match="before the one that makes them"):
-        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).made()
+        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).current()
 
 
 def test_the_default_refines_and_reports_what_it_skipped(tmp_path):

@@ -64,7 +64,7 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
             Palette.of_labels(organs.labels, 0.02),
         )
     )
-    laid = options(live=replace(first, others=(other, organs)), up="none", made_for=300)
+    laid = options(live=replace(first, others=(other, organs)), up="none", screen_size=300)
     compare(baked(some, table), laid, table, tmp_path)
 
 

@@ -94,7 +94,7 @@ def test_another_light_and_another_size(session, earlier):
     assert unlit.report.refinement["standard"] == earlier.report.refinement["psnr_after"]  # by itself, not the last
     small = {**GOAL, "size": 64}
     assert started_warm(other := session.convert(SHELL, small, after=earlier))
-    assert other.ply.made_for == 64
+    assert other.ply.screen_size == 64
 
 
 @pytest.mark.parametrize(

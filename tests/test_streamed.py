@@ -18,7 +18,7 @@ from vvgt_cli.commands.view import streamed_resources
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.shards.cut import Node
 from vvgt_cli.conversion.shards.level_selection import CutErrors, level_errors
-from vvgt_cli.conversion.shards.regions import Made, save
+from vvgt_cli.conversion.shards.regions import StoredGaussians, save
 from vvgt_cli.conversion.shards.streamed import Part, WrittenFiles, divide
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
@@ -234,7 +234,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
         save(store, "closed", 0, [Node([gaussians], [np.ones(2)], None)], {})
         parts, places = divide(np.array([[50]]))
         assert places == [[{"file": 0, "offset": 0, "count": 50}]]
-        task = WrittenFiles(Made(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
+        task = WrittenFiles(StoredGaussians(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
         task.forget_changed()
         Pass(InProcess(), store, lambda _: None)(task, "write")
         assert task.size(0) == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())

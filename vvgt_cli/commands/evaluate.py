@@ -132,7 +132,7 @@ def _cell(value: Any) -> str:
 @contextmanager
 def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
     """Open the volume, by default in the file's own anatomical space, light and unit distance."""
-    size, asked = request.size or header.made_for or SIZE, request.source.light
+    size, asked = request.size or header.screen_size or SIZE, request.source.light
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
@@ -243,7 +243,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
     from vvgt_cli.images import write_png
 
     source = volume.source
-    size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)
+    size, rule = request.size or header.screen_size or SIZE, file_rule(header, request.rule)
     with run.stage("reference") as stage:
         own = _reference_psnr(volume, size, request.step)
         stage.note = f"its own error {own:.1f} dB"

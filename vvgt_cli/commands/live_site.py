@@ -158,7 +158,7 @@ class Cloud:
         from vvgt_cli.conversion.live import apply_light
 
         lighting = self.options.light if light is None else parse_light(light, self.options)
-        pixel = pixel_width(self.options.made_for or SIZE)
+        pixel = pixel_width(self.options.screen_size or SIZE)
         found = as_stored(apply_light(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
         return replace(self, gaussians=found, options=options, ply=None)

@@ -198,7 +198,7 @@ def _render(
     with ExitStack() as stack:
         draw, by, first = _frame(run, request, frames[0], shares[0], stack)
         if first is not None:
-            shares = request.views(len(frames), first.made_for, first.up)
+            shares = request.views(len(frames), first.screen_size, first.up)
         cameras, opened = list(chain(*shares)), [draw]
         del draw
 

@@ -203,7 +203,7 @@ def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOp
         return
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
-        size, rule = options.made_for or SIZE, rule_of(options.rule or INRIA)
+        size, rule = options.screen_size or SIZE, rule_of(options.rule or INRIA)
         cameras, found = default_views("test", size=size), []
         for i in PREVIEW_VIEWS:
             blocks = spread_blocks(size, size, i)
@@ -231,7 +231,7 @@ def report_format_cost(
     if not _stores_pictures(output, options):
         return
     with run.stage("read back") as stage:
-        size, rule = options.made_for or SIZE, options.rule or INRIA
+        size, rule = options.screen_size or SIZE, options.rule or INRIA
         before, after = (
             score_test_views(
                 scene, to_box_frame(g, volume), size, RenderSettings(), rule=rule, perceptual=False, only=PREVIEW_VIEWS

@@ -85,7 +85,7 @@ class Plan:
         """Return the expected seconds after a stage."""
         return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
 
-    def for_made(self, count: int, degree: int, finish: list[Stage]) -> Plan:
+    def for_finished(self, count: int, degree: int, finish: list[Stage]) -> Plan:
         """Return the plan for ``count`` finished Gaussians with harmonics of ``degree``: few stages, then scores."""
         return replace(
             self, gaussians=count, workload=replace(self.workload, gaussians=count), bytes=file_bytes(count, degree),

@@ -114,10 +114,10 @@ class PreviousFrame(WarmStart):
         shown = last.shown
         if found.blocks.any():  # else no view was drawn
             turn = self._turn % len(shown)
-            shown = (*shown[:turn], work.made(), *shown[turn + 1 :])
+            shown = (*shown[:turn], work.current(), *shown[turn + 1 :])
             self._turn += 1
-        self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
-        self._moved = _count_differing(last.gaussians, work.made())
+        self._last = replace(last, source=work.field.source, gaussians=work.current(), shown=shown)
+        self._moved = _count_differing(last.gaussians, work.current())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         return True
 
@@ -126,7 +126,7 @@ class PreviousFrame(WarmStart):
         if not any(isinstance(stage, Refinement) for stage in plan.stages) or work.check is None:
             return
         if work.train is not None and work.train_rule is not None and work.train_settings is not None:
-            made = work.made()
+            made = work.current()
             cameras = work.train.cameras
             shown = (made,) * max(len(cameras) // VIEWS, 1)
             self._last = _Frame(
@@ -162,7 +162,7 @@ class PreviousFrame(WarmStart):
             options = OptimizeOptions.of(
                 "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
-            result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
+            result = refine(work.run, work.current(), Views(cameras, images), judged, options, free=free)
             result = as_stored(widen_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)

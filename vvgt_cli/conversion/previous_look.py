@@ -84,7 +84,7 @@ class PreviousLook(WarmStart):
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
         steps = min(work.fit.steps or WARM_STEPS, WARM_STEPS)
-        small = suits_small_views(work.made(), work.fit.size)
+        small = suits_small_views(work.current(), work.fit.size)
         stages = (
             TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
             Refinement(steps, steps, small),
@@ -92,7 +92,7 @@ class PreviousLook(WarmStart):
         judge = CheckViews()
         work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
-        if work.psnr(work.made()) < standard - FAR:
+        if work.psnr(work.current()) < standard - FAR:
             return "the look differs too much"
         work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])
         for stage in stages:

@@ -107,7 +107,7 @@ def apply_function(
     assert facts.scale is not None
     assert options.unit_distance is not None
     table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
-    found = visible_cloud(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
+    found = visible_cloud(gaussians, table, options.light, pixel_width(options.screen_size or SIZE))
     if not (len(found) or empty):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found

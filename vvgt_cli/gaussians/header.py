@@ -42,7 +42,7 @@ class FileFacts:
         scale, centre: the volume's `UnitFrame`; a file in world space needs both.
         unit_distance: world length that opacity refers to.
         unit_distance_label: how that distance was chosen; None is written as "given".
-        made_for: edge of the target screen in pixels.
+        screen_size: edge of the target screen in pixels.
         rule: name of the rendering rule that the Gaussians are made for.
         space: anatomical space of the world, "RAS", "LPS" or "none"; written with the affine.
         affine: 3 x 4 row-major, from voxel index (i, j, k, 1) of the volume to world position.
@@ -63,7 +63,7 @@ class FileFacts:
     centre: tuple[float, float, float] | None = None
     unit_distance: float | None = None
     unit_distance_label: str | None = None
-    made_for: int | None = None
+    screen_size: int | None = None
     rule: str | None = None
     space: str | None = None
     affine: tuple[float, ...] | None = None
@@ -242,7 +242,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
     if word == "size":
         if words[1] != "rule" or len(words) != 3 or not words[0].isdecimal() or not 0 < int(words[0]) <= 2**20:
             raise ValueError(text)
-        return {"made_for": int(words[0]), "rule": words[2]}
+        return {"screen_size": int(words[0]), "rule": words[2]}
     if word == "camera":
         return {"camera": camera_of(words)}
     if word == "space":
@@ -295,8 +295,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")
     if facts.camera is not None:
         lines.append(f"comment vvgt camera {' '.join(repr(float(v)) for v in facts.camera)}")
-    if facts.made_for is not None:
-        lines.append(f"comment vvgt size {facts.made_for} rule {facts.rule or 'inria'}")
+    if facts.screen_size is not None:
+        lines.append(f"comment vvgt size {facts.screen_size} rule {facts.rule or 'inria'}")
     if facts.light is not None:
         lines.append(f"comment vvgt light {facts.light.text()}")
     if facts.optics is not None:

@@ -212,7 +212,7 @@ def save(store: BlockStore, kind: str, number: int, nodes: Sequence[Node], more:
 
 
 @dataclass(frozen=True)
-class Made:
+class StoredGaussians:
     """The Gaussians of a cut, in the store.
 
     Attributes:
@@ -258,7 +258,7 @@ class Made:
 
 def make_regions(
     run: Run, run_pass: Pass, cut: Cut, thresholds: np.ndarray, refiner: Refiner | None = None, least: bool = True
-) -> Made:
+) -> StoredGaussians:
     """Make the Gaussians of a cut region by region; results of an interrupted run are reused.
 
     Args:
@@ -283,7 +283,7 @@ def make_regions(
         workers, edge = run_pass.runner.workers, int((regions.width * cut.plan.grid.tile).max())
         steps_of = "" if refiner is None else f"{refiner.descent.steps} steps in each of "
         stage.note = f"{steps_of}{len(task)} regions of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
-    return Made(cut.store, kind, regions.ends)
+    return StoredGaussians(cut.store, kind, regions.ends)
 
 
 PIXEL = 3.0  # width of a pixel of the training views, in median standard deviations of the middle axis

@@ -23,7 +23,7 @@ from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import most_steps, steps_in_time
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
 from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
-from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
+from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
@@ -126,13 +126,13 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
     make_blocks(run, request, field)
     cut = cut_of(run, field.run_pass)
-    threshold, made, _ = closed_form(run, field.run_pass, cut)
+    threshold, stored, _ = closed_form(run, field.run_pass, cut)
     over = cut.over_tiles(threshold)
     refiner = refiner_of(run, request, field)
     if refiner is not None:
         thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
-        made = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
-    return concatenate([gaussians for gaussians, _ in chain(made.regions(), [] if over is None else [over])])
+        stored = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
+    return concatenate([gaussians for gaussians, _ in chain(stored.regions(), [] if over is None else [over])])
 
 
 def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | None:
@@ -289,9 +289,9 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     from vvgt_cli.closed_form.lit import directions
 
     plan, size, free, store = cut.plan, cut.plan.size, free_memory(), run_pass.store
-    threshold, made, removed = closed_form(run, run_pass, cut)
+    threshold, stored, removed = closed_form(run, run_pass, cut)
     over = cut.over_tiles(threshold)
-    count = int(made.field("counts").sum()) + (0 if over is None else len(over[0]))
+    count = int(stored.field("counts").sum()) + (0 if over is None else len(over[0]))
     axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
     degree = plan.written_degree
     if output != STDOUT:
@@ -299,7 +299,7 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, size) < free else None
     with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
         sink.write(ply_header(count, degree, plan.ply))
-        for gaussians, normals in chain(made.regions(), [] if over is None else [over]):
+        for gaussians, normals in chain(stored.regions(), [] if over is None else [over]):
             normals = None if normals is None else directions(normals @ turned)
             sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
             if kept is not None:
@@ -319,7 +319,7 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
             run.report.scores, stage.note = asdict(found), score_text(found, size)
 
 
-def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, Made, int]:
+def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, StoredGaussians, int]:
     """Make the Gaussians of a plan's budget, or fewer where most are faint.
 
     Returns:
@@ -329,17 +329,17 @@ def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, Made, int]:
         DataError: a block is damaged.
     """
 
-    def cut_for(budget: int) -> tuple[tuple[float, Made], int, bool]:
+    def cut_for(budget: int) -> tuple[tuple[float, StoredGaussians], int, bool]:
         threshold = cut.tiled_tree.threshold(budget)
         thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
         found = make_regions(run, run_pass, cut, thresholds, least=False)
         logits = found.field("opacity_logits-0")
         return (threshold, found), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
 
-    (threshold, made), removed = thin(cut.plan.budget, cut_for)
+    (threshold, stored), removed = thin(cut.plan.budget, cut_for)
     if removed:
         run.skip(f"{removed} Gaussians", TOO_FAINT)
-    return threshold, made, removed
+    return threshold, stored, removed
 
 
 @contextmanager

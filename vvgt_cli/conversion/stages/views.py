@@ -124,7 +124,7 @@ class TrainingViews(Stage):
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:
-            settings = ray_settings(work.field.views, work.made(), self.edge, work.train_rule, _spread(footprint))
+            settings = ray_settings(work.field.views, work.current(), self.edge, work.train_rule, _spread(footprint))
         cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
             images = render_views(work.field.views, cameras, settings, progress=work.run.console.bar(self.name))

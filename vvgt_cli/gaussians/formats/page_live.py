@@ -212,7 +212,7 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
         "planes": planes_of(facts),
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
-        "dilation": DILATION * pixel_width(options.made_for or SIZE) ** 2,
+        "dilation": DILATION * pixel_width(options.screen_size or SIZE) ** 2,
         "axes": axes.tolist(),
         "box": [
             np.min([cloud.means.min(axis=0) for cloud in clouds], axis=0).tolist(),
