@@ -33,7 +33,7 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
@@ -348,7 +348,7 @@ def _write_file(run: Run, request: ConvertRequest, found: Conversion, again: boo
     assert request.output is not None
     page = is_page(request.output) and request.ply.comments
     limit = None if request.megabytes is None else 1e6 * request.megabytes
-    extras = found.extras(request.editor, request.slices, run, limit) if page else NOTHING
+    extras = found.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
     write_gaussians(
         run, request.output, found.gaussians, found.ply, request.overwrite or again, found.normals(),
         "certificate" if again else "write", more, extras,

@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.streamed import is_streamed
@@ -110,7 +110,7 @@ class Result:
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NOTHING
+            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NO_EXTRAS
             return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
 
     def layout(
@@ -165,7 +165,7 @@ class Result:
             run: times the stages.
             limit: bytes of the page, which its slices must leave room for.
         """
-        return NOTHING
+        return NO_EXTRAS
 
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
