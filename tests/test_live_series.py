@@ -67,7 +67,7 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
 
 
 def test_a_page_of_many_frames_is_bounded(vvgt, frames, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(series, "MOST_LIVE", 100)
+    monkeypatch.setattr(series, "MAX_LIVE", 100)
     done = vvgt("convert", frames / "f?.npy", "--live", "-o", tmp_path / "p.html", *SMALL)
     assert (done.code, "3 frames on one page: 33 Gaussians each, fewer than --max-gaussians" in done.err) == (0, True)
     assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["elements"]) == 3

@@ -163,7 +163,7 @@ def test_codes_are_packed_without_loss(dtype):
 
 
 def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MOST", 64)
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MAX_CELLS", 64)
     data = np.zeros((8, 8, 8), np.uint16)
     data[3:5], data[5:7], data[7:] = 7, 300, 9  # 9 is not in the table
     table = LabelTable("t", (Label(0, "air", (0, 0, 0), 0.0), Label(7, "<b>", (1, 0, 0)), Label(300, "c", (0, 1, 0))))

@@ -302,7 +302,7 @@ def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, ru
     return total / len(cameras)
 
 
-LEAST, MOST = 0.25, 30.0  # times the mean that an error counts at a score: what is flat keeps cells for other views
+MIN_FACTOR, MAX_FACTOR = 0.25, 30.0  # times the mean, for errors at a score: what is flat keeps cells for other views
 UNSEEN = 0.08  # of the mean blending weight in views: Gaussians below are hidden (0.1: fogs lose, 0.05: less gain)
 SHARED = 1.0  # mean scores that the cells above count for: an error of few pixels says little
 
@@ -337,7 +337,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         factor[level] = np.where(
             predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
         )
-    result: np.ndarray = score * np.clip(factor, LEAST, MOST)
+    result: np.ndarray = score * np.clip(factor, MIN_FACTOR, MAX_FACTOR)
     return result
 
 

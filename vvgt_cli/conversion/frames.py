@@ -35,7 +35,7 @@ from vvgt_cli.volume.tiff.slices import matching
 if TYPE_CHECKING:
     from vvgt_cli.look import TransferFunction
 
-MOST_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
+MAX_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Series(Batch):
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
         self.previous = previous_frame(request, shard.count)
-        self._most = max(MOST_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
+        self._most = max(MAX_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
 
     def prepare(self, run: Run) -> None:
         """Read all frames once, for what they share.

@@ -30,7 +30,7 @@ from vvgt_cli.jit.ahead import LIVE
 FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
 WORSE = 2.0  # the same after the steps, since other looks allow other errors
 FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
-MOST = 50.0  # greatest ratio of extinctions
+MAX_RATIO = 50.0  # greatest ratio of extinctions
 OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
 WARM_START = "starting from the earlier conversion"
@@ -122,7 +122,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     old, a = _look_alone(before, source, gaussians, samples)
     new, b = _look_alone(source, source, gaussians, samples)
     least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
-    ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
+    ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MAX_RATIO, MAX_RATIO), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
     alike = 1 - np.linalg.norm(new.colors - old.colors, axis=1) / OTHER

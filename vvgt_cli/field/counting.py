@@ -21,7 +21,7 @@ from vvgt_cli.field.reader import CLASSIFIED, Place
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 from vvgt_cli.volume.blocks import Packed
-from vvgt_cli.volume.label_maps import MOST
+from vvgt_cli.volume.label_maps import MAX_LABELS
 from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.stored import read_block
 
@@ -67,7 +67,7 @@ class CountBlocks:
             values = read_block(volume, begin, end)
             part = tally(values, volume, self.limits)
             found = part if found is None else found.plus(part)
-            if self.labels and len(unique) <= MOST:
+            if self.labels and len(unique) <= MAX_LABELS:
                 unique = np.union1d(unique, values[np.isfinite(values)])
             for n in range(wanted):
                 if z <= places[n, 2] < end[2]:
@@ -197,8 +197,8 @@ class BlockAccess:
                 task = replace(task, kind=task.kind.replace(COUNTS, LABELS), labels=True)
                 self._run(task)
             stored = task.unique()
-        if len(stored) > MOST:
-            raise Unsuitable(f"{volume.name}: more than {MOST} distinct values; expected a label map")
+        if len(stored) > MAX_LABELS:
+            raise Unsuitable(f"{volume.name}: more than {MAX_LABELS} distinct values; expected a label map")
         values = np.unique(volume.slope * stored + volume.intercept)
         if (values != np.round(values)).any():
             odd = values[values != np.round(values)][0]

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 COLOR, ALL = "color", "all"  # values of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
-MOST_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
+MAX_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
 DARK, BRIGHT = 0.5, 0.998  # quantiles of a channel's voxels between which its opacity rises
 
 
@@ -142,7 +142,7 @@ def content_of(source: Volume | Content) -> Content:
 def open_content(source: str, read: ReadOptions) -> Content:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    Components are returned for "color" and "all", for a file of colours, and by default for up to `MOST_CHANNELS`
+    Components are returned for "color" and "all", for a file of colours, and by default for up to `MAX_CHANNELS`
     channels of a microscope.
 
     Raises:
@@ -154,7 +154,7 @@ def open_content(source: str, read: ReadOptions) -> Content:
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
         by_default = not (asked or error.color or overlapping)
-        if by_default and not (error.channels and error.count <= MOST_CHANNELS):
+        if by_default and not (error.channels and error.count <= MAX_CHANNELS):
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(f"{source}: {error.count} components; expected 3 or 4 for --component color") from None

@@ -24,7 +24,7 @@ from vvgt_cli.gaussians.live import OPAQUE, law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import merge_labels
-from vvgt_cli.look.lighting import MATTE, MOST, Lighting
+from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
 from vvgt_cli.look.resolve import look_like_hounsfield, resolve
@@ -243,9 +243,9 @@ def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
     toward = sent.get("from")
     if not isinstance(toward, list) or len(toward) != 3:
         raise DataError("the page's light: expected from, three numbers")
-    if not all(isinstance(x, int | float) and abs(x) <= MOST for x in (*toward, *map(sent.get, numbers))) or not any(
-        toward
-    ):
+    if not all(
+        isinstance(x, int | float) and abs(x) <= MAX_LIGHT for x in (*toward, *map(sent.get, numbers))
+    ) or not any(toward):
         raise DataError(f"the page's light: expected finite numbers for from, {', '.join(numbers)}")
     if sent["kind"] == "none":
         return None

@@ -22,12 +22,12 @@ from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
 from vvgt_cli.volume.types import Volume
 
-MOST = 1 << 22  # cells of all grids of a page
+MAX_CELLS = 1 << 22  # cells of all grids of a page
 FEWEST = 1 << 15  # where there is less room, none
 SMALLEST = FEWEST * 2 * 4 / 3 + 4096  # bytes that those take on a page at most
 CLOSER = 0.95  # of the room: grids that did not fit are made for this share of it
 LEVELS = 4096  # steps of the range of most values
-MOST_OF = (0.1, 99.9)  # percentiles that bound most values
+MOST_VALUES = (0.1, 99.9)  # percentiles that bound most values
 CODES = 1 << 16
 EXACT = 1e-6  # steps by which rounding may move a mean of equal values
 
@@ -84,7 +84,7 @@ def slices_of(layers: Sequence[Layer | None], room: float | None = None) -> Slic
     Returns:
         None if no layer has a grid, or there is no room for `FEWEST` cells.
     """
-    most, found = MOST, _grids(layers, MOST)
+    most, found = MAX_CELLS, _grids(layers, MAX_CELLS)
     while found is not None and room is not None and found.size > room:
         if most <= FEWEST:
             return None
@@ -122,7 +122,7 @@ def _values(
     values = averaged(volume, dims)
     known = values[np.isfinite(values)]
     lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    a, b = map(float, np.percentile(known, MOST_OF)) if len(known) else (0.0, 0.0)
+    a, b = map(float, np.percentile(known, MOST_VALUES)) if len(known) else (0.0, 0.0)
     missing = int(len(known) < values.size)
     step = max(((b - a) or (hi - lo)) / LEVELS, (hi - lo) / (CODES - 3)) or 1.0
     if volume.data.dtype.kind in "iub":  # whole steps between stored values, so that these are exact

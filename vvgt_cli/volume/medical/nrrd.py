@@ -33,7 +33,7 @@ _ENCODINGS = {
     "ascii": "text",
 }  # fmt: skip
 _SPATIAL_KINDS = {"domain", "space", "???", "none"}
-MOST_FILES = 100_000
+MAX_FILES = 100_000
 _SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
@@ -280,7 +280,7 @@ def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
         try:
             lo, hi, step = (int(w) for w in words[1:4])
             number = re.fullmatch(r"([^%]*)%(0?)(\d*)d([^%]*)", words[0])
-            if number is None or step == 0 or not 0 <= (hi - lo) // step < MOST_FILES:
+            if number is None or step == 0 or not 0 <= (hi - lo) // step < MAX_FILES:
                 raise ValueError
         except ValueError:
             raise DataError(
@@ -293,7 +293,7 @@ def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
     else:
         return None
     axes = int(rest[0]) if rest and rest[0].isdecimal() else n - 1
-    if not names or len(names) > MOST_FILES or not 1 <= axes <= n:
+    if not names or len(names) > MAX_FILES or not 1 <= axes <= n:
         raise DataError(f"{path}: data file {named!r} with {len(names)} names of {axes} axes each; expected slices")
     return names, axes
 

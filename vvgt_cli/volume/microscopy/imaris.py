@@ -21,7 +21,7 @@ from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6
-MOST = 1_000_000  # time steps or channels
+MAX_COUNT = 1_000_000  # time steps or channels
 
 
 def is_imaris(file: Any) -> bool:
@@ -84,7 +84,7 @@ def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarr
 def _count(group: Any, what: str, inside: str = "DataSet") -> int:
     """Count the groups ``what 0``, ``what 1``, ... in a row."""
     group = group[inside] if inside else group
-    return next(k for k in range(MOST) if f"{what} {k}" not in group)
+    return next(k for k in range(MAX_COUNT) if f"{what} {k}" not in group)
 
 
 def _shape(file: Any, level: int) -> tuple[int, int, int]:

@@ -24,7 +24,7 @@ from vvgt_cli.volume.types import Volume
 CHUNK_MAGIC = 0x0ABECEDA
 MAP_END = b"ND2 CHUNK MAP SIGNATURE 0000001!"
 END, CHUNK = struct.Struct("<32sQ"), struct.Struct("<IIQ")  # the end of the file; before every chunk
-MOST = 10_000_000  # frames
+MAX_FRAMES = 10_000_000  # frames
 
 
 def read_nd2(path: Path, options: ReadOptions) -> Volume:
@@ -39,7 +39,7 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         place = _position(file, sizes, options, path)
         loops = [a for a in sizes if a not in "CYXS"]
         frames = int(np.prod([sizes[a] for a in loops], dtype=object))
-        found = sum(k in there for k in range(min(frames, MOST)))
+        found = sum(k in there for k in range(min(frames, MAX_FRAMES)))
         if found < frames:
             raise DataError(f"{path}: of {frames} frames {found} are there; check that the file is whole")
         names, colors = _channels(file)

@@ -49,7 +49,7 @@ PIXELS = {
 }  # fmt: skip
 NONE, JPEG_XR, ZSTD, ZSTD_HEADED = 0, 4, 5, 6
 OTHERS = {1: "JPEG", 2: "LZW"}
-MOST = 1 << 31  # pixels from the first to the last of an axis
+MAX_SIDE = 1 << 31  # pixels from the first to the last of an axis
 SPARSE = 1000  # times as many pixels as all tiles have
 
 
@@ -126,7 +126,7 @@ def tiles_of(path: Path) -> tuple[list[Tile], str]:
 
 
 def _tile(spans: dict[str, tuple[int, int, int]], facts: tuple[int, int, int, int], path: Path) -> Tile:
-    if not {"X", "Y"} <= set(spans) or any(not (1 <= n < MOST and abs(k) < MOST) for k, n, _ in spans.values()):
+    if not {"X", "Y"} <= set(spans) or any(not (1 <= n < MAX_SIDE and abs(k) < MAX_SIDE) for k, n, _ in spans.values()):
         raise DataError(f"{path}: a tile of {str(spans)[:200]}; expected X and Y of at least one pixel")
     (x, width, _), (y, height, _) = spans["X"], spans["Y"]
     at = {a: first for a, (first, _, _) in spans.items() if a not in "XY"}

@@ -25,7 +25,7 @@ from vvgt_cli.volume.tiff.pages import lazy_files
 from vvgt_cli.volume.tiff.reader import read_tiff
 from vvgt_cli.volume.types import Volume
 
-MOST = 100_000  # files
+MAX_FILES = 100_000  # files
 
 
 def matching(pattern: str) -> list[Path]:
@@ -54,8 +54,8 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     Errors are those of `Reader.read`.
     """
     files, others = _of_one_format(files) if len(files) > 1 else (files, [])
-    if len(files) > MOST:
-        raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
+    if len(files) > MAX_FILES:
+        raise DataError(f"{source}: {len(files)} files; expected at most {MAX_FILES} slices")
     if not files:
         raise DataError(f"{source}: no slices ({', '.join(SUFFIXES)})")
     if others:
