@@ -65,8 +65,8 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
         length = float((high - low).max() + 6 * np.median(sigma))
     alpha, largest = opacity(gaussians), sigma.max(axis=1)
 
-    def share(of: np.ndarray) -> float:
-        return float(np.average(of, weights=np.maximum(alpha, 1e-12)))
+    def share(values: np.ndarray) -> float:
+        return float(np.average(values, weights=np.maximum(alpha, 1e-12)))
 
     def faint() -> Figure:
         return Figure("share of Gaussians", float(np.mean(alpha < MIN_ALPHA)), 0.5)

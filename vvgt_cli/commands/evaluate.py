@@ -287,7 +287,7 @@ def _look_around(
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
     with run.stage("conditions") as stage, _together(volume, wanted):
         seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))
-        conditions = score_conditions(gaussians, seen, own=rule.name)
+        conditions = score_conditions(gaussians, seen, headset=rule.name)
         evaluation.conditions = [asdict(condition) for condition in conditions]
         stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]

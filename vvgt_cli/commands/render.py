@@ -59,7 +59,7 @@ class RenderRequest:
     """Pictures to draw.
 
     Attributes:
-        given: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
+        source: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
             (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie; or a volume or a series of volumes
             with its look.
         output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
@@ -77,7 +77,7 @@ class RenderRequest:
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
     """
 
-    given: tuple[str, ...] | SourceRequest
+    source: tuple[str, ...] | SourceRequest
     output: str
     camera: str | None = None
     orbit: int | None = None
@@ -162,7 +162,7 @@ class RenderRequest:
             check_folder(where, "images")
             outputs.append(Output("-o", str(where / VIEWS_FILE)))
         if self.movie or self.png or where.is_dir():
-            inputs = self.given.paths() if isinstance(self.given, SourceRequest) else self.given
+            inputs = self.source.paths() if isinstance(self.source, SourceRequest) else self.source
             check_outputs(outputs, inputs, self.overwrite)
         return shares
 
@@ -174,7 +174,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         UsageError: an image exists, or the directory cannot be made; views or an output that do not suit the frames.
         DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
     """
-    run, given = Run(console or Console(), ConversionReport("render")), request.given
+    run, given = Run(console or Console(), ConversionReport("render")), request.source
     if not isinstance(given, SourceRequest):
         return _render(run, request, given)
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
@@ -225,18 +225,18 @@ def _render(
 
 
 def _frame(
-    run: Run, request: RenderRequest, given: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
+    run: Run, request: RenderRequest, source: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
     first: PlyHeader | None = None,
 ) -> tuple[Draw, str, PlyHeader | None]:  # fmt: skip
     """Return the renderer of a frame, its name, and the header of Gaussians; ``first`` is that of the first frame."""
-    if isinstance(given, SourceRequest):
-        return (*_volume(run, request, given, cameras, stack), None)
+    if isinstance(source, SourceRequest):
+        return (*_volume(run, request, source, cameras, stack), None)
     with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request, given, first)
+        seen, gaussians, header = _opened(request, source, first)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
     if request.rule in NAMES:
         edge = 2.0 * header.scale / first.scale if first and first.scale and header.scale else 2.0
-        draw, by = draw_gaussians(given, gaussians, header, request.rule, request.function, edge), request.rule
+        draw, by = draw_gaussians(source, gaussians, header, request.rule, request.function, edge), request.rule
         run.compile(GREY)
     else:
         from vvgt_cli.splat import render
@@ -244,7 +244,7 @@ def _frame(
         rule = file_rule(first or header, request.rule)
         run.compile(for_degree(DRAW, gaussians.degree))
         draw, by = lambda camera: render(seen(camera), camera, rule), rule.name
-    return _placed(draw, given, header, first), by, header
+    return _placed(draw, source, header, first), by, header
 
 
 def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
@@ -315,7 +315,7 @@ def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple
     """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
     manifest, function = by_view(name), None if request.rule in NAMES else request.function
     if manifest is None:
-        several = isinstance(request.given, tuple) and len(request.given) > 1
+        several = isinstance(request.source, tuple) and len(request.source) > 1
         gaussians, header = open_gaussians(name, empty=several)
         if first is not None and (request.rule in NAMES or request.function is not None):
             header = _in_range(name, header, first)

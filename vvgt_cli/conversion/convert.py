@@ -337,20 +337,20 @@ def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], N
     if request.writes < 2:
         return None
 
-    def write(found: Conversion) -> None:
-        _write_file(run, request, found, more="; complete; scoring next")
+    def write(conversion: Conversion) -> None:
+        _write_file(run, request, conversion, more="; complete; scoring next")
 
     return write
 
 
-def _write_file(run: Run, request: ConvertRequest, found: Conversion, again: bool = False, more: str = "") -> None:
+def _write_file(run: Run, request: ConvertRequest, conversion: Conversion, again: bool = False, more: str = "") -> None:
     """Write the file, a page with all its contents, or ``again`` with its certificate; ``more`` ends the message."""
     assert request.output is not None
     page = is_page(request.output) and request.ply.comments
     limit = None if request.megabytes is None else 1e6 * request.megabytes
-    extras = found.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
+    extras = conversion.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
     write_gaussians(
-        run, request.output, found.gaussians, found.ply, request.overwrite or again, found.normals(),
+        run, request.output, conversion.gaussians, conversion.ply, request.overwrite or again, conversion.normals(),
         "certificate" if again else "write", more, extras,
     )  # fmt: skip
 

@@ -74,7 +74,7 @@ class Survey:
 
     Attributes:
         count: number of frames.
-        own: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
+        ranges: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
         whole: statistics of each component over all frames.
         first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
@@ -82,7 +82,7 @@ class Survey:
     """
 
     count: int
-    own: list[list[tuple[float, float]]]
+    ranges: list[list[tuple[float, float]]]
     whole: tuple[Statistics, ...]
     first: Content
     content: str
@@ -140,7 +140,7 @@ class Series(Batch):
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
             shown, distance = _functions(source, found)
-            self._dark = [not source.layers and _invisible(shown, own) for own in found.own]
+            self._dark = [not source.layers and _invisible(shown, ranges) for ranges in found.ranges]
             lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
             stage.note = (
                 f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
@@ -312,9 +312,9 @@ def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
     return Statistics(lo, hi, sum(p.nan_count for p in volumes), sum(p.inf_count for p in volumes), histogram, edges)
 
 
-def _invisible(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
+def _invisible(shown: Sequence[TransferFunction | LabelTable], ranges: Sequence[tuple[float, float]]) -> bool:
     """Return whether nothing of a frame is visible."""
-    return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
+    return not any(tf.support(*limits) for tf, limits in zip(shown, ranges, strict=True))
 
 
 def _functions(

@@ -128,7 +128,7 @@ class ConvertRequest:
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
-        several: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
+        shares_output: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
     """
 
     source: SourceRequest
@@ -145,7 +145,7 @@ class ConvertRequest:
     editor: bool = False
     slices: bool = False
     all_views: bool = False
-    several: bool = False
+    shares_output: bool = False
     command: str | None = None
     title: str | None = None
     blocks: BlockOptions | None = None
@@ -178,7 +178,7 @@ class ConvertRequest:
         if self.limits.max_megabytes is not None or target is None:
             return self.limits.max_megabytes
         limited = not self.live if known is None else known.suffix == ".html"
-        return target.megabytes if limited and not self.several else None
+        return target.megabytes if limited and not self.shares_output else None
 
     @property
     def scored_whole(self) -> bool:

@@ -222,12 +222,12 @@ def layers_of(
     """
     labels = _chosen_labels(opened, tf, labels, access)
     if labels is not None and labels != NO_LABELS:
-        own = labels == AUTO and holds_table(opened.path)
+        own_table = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
-            return _overlapping(opened, labels, own, distance, access)
-        if own and opened.layer is not None:
+            return _overlapping(opened, labels, own_table, distance, access)
+        if own_table and opened.layer is not None:
             labels = segments_of(str(opened.path), opened.layer)
-        elif own:
+        elif own_table:
             labels = opened.path
         return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
@@ -260,9 +260,9 @@ def _chosen_labels(
     if labels not in (None, NO_LABELS) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
     if labels is None and tf is None and opened.single_volume:
-        own = holds_table(opened.path)
-        if own or recognised(volume, access.labels):
-            reason = "its segments" if own else "its name and its few integers"
+        own_table = holds_table(opened.path)
+        if own_table or recognised(volume, access.labels):
+            reason = "its segments" if own_table else "its name and its few integers"
             warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
             return AUTO
     return labels
@@ -319,7 +319,7 @@ def _white(opened: Content) -> float:
 
 
 def _overlapping(
-    opened: Content, labels: str | LabelTable, own: bool, distance: str | None, access: Access
+    opened: Content, labels: str | LabelTable, own_tables: bool, distance: str | None, access: Access
 ) -> list[Layer]:
     """Return overlapping layers (.seg.nrrd) or segments (DICOM), each under its own table, or all under one.
 
@@ -328,7 +328,7 @@ def _overlapping(
     found = []
     for k, volume in enumerate(opened.volumes):
         if any(access.labels(volume)):
-            table = segments_of(str(opened.path), k) if own else labels
+            table = segments_of(str(opened.path), k) if own_tables else labels
             found.append(_labelled(volume, table, distance, access))
     if not found:
         raise DataError(f"{opened.path}: no label other than 0 in any layer; expected some to show")

@@ -197,20 +197,20 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
     return found
 
 
-def _is_opacity(given: list[float], path: Path, text: str) -> bool:
+def _is_opacity(alphas: list[float], path: Path, text: str) -> bool:
     """Return whether column A of a table is opacity (3D Slicer), not transparency (FreeSurfer).
 
-    FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``given`` is A / 255
+    FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``alphas`` is A / 255
     of every label but 0.
     """
     comments = " ".join(line for line in text.splitlines() if line.startswith("#")).lower()
-    if not any(given):
+    if not any(alphas):
         return False
-    if min(given) >= 1 or "color table file" in comments or "slicer" in comments:
+    if min(alphas) >= 1 or "color table file" in comments or "slicer" in comments:
         return True
     if "freesurfer" in comments or "label name" in comments:
         return False
-    opacity = 2 * sum(a > 0.5 for a in given) > len(given)
+    opacity = 2 * sum(a > 0.5 for a in alphas) > len(alphas)
     slicer = "opacity, as in 3D Slicer; for transparency begin the table with '#No. Label Name: R G B A'"
     freesurfer = "transparency, as in FreeSurfer; for opacity let its name end in .ctbl (or call A Color_A in a .csv)"
     warnings.warn(f"{path.name}: column A is read as {slicer if opacity else freesurfer}", stacklevel=2)

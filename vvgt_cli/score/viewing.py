@@ -203,26 +203,29 @@ def texture_cameras(size: int) -> list[Camera]:
     return found
 
 
-def texture_note(found: Texture) -> str:
+def texture_note(texture: Texture) -> str:
     """Return texture as a message."""
-    if found.ours is None:
+    if texture.ours is None:
         return "nothing in it is opaque and smooth"
     return (
-        f"{found.ours:.2f} levels of 255, the volume {found.reference:.2f}; "
-        f"worst tenth {found.ours_worst:.2f} and {found.reference_worst:.2f}"
+        f"{texture.ours:.2f} levels of 255, the volume {texture.reference:.2f}; "
+        f"worst tenth {texture.ours_worst:.2f} and {texture.reference_worst:.2f}"
     )
 
 
 def score_conditions(
-    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES), own: str = INRIA.name
+    gaussians: Gaussians,
+    seen: Iterable[ConditionView],
+    rules: Collection[str] = tuple(RULES),
+    headset: str = INRIA.name,
 ) -> list[ViewingCondition]:
-    """Score every rule at every place, on the blocks of `condition_views`; worst first. ``own`` is a headset's rule."""
+    """Score every rule at every place, on the blocks of `condition_views`; worst first. ``headset`` is the rule of one."""
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
     errors: dict[tuple[str, Place], list[float]] = {}
     for view in seen:
-        for rule in (own,) if view.place.where else rules:
+        for rule in (headset,) if view.place.where else rules:
             ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
             shown = ours if view.blocks is None else view.blocks.pick(ours)
             errors.setdefault((rule, view.place), []).append(psnr(view.reference, shown))

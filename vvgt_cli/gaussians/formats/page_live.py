@@ -181,14 +181,14 @@ def live_page_data(clouds: Sequence[tuple[Gaussians, PlyOptions]]) -> tuple[list
     return splats, planes, _facts(ordered, facts, clouds[0][1])
 
 
-def with_shared_labels(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
-    """Return Gaussians with their label rows changed from those of their ``own`` facts to those of ``facts``."""
+def with_shared_labels(gaussians: Gaussians, before: LiveFacts, after: LiveFacts) -> Gaussians:
+    """Return Gaussians with their label rows changed from those of their ``before`` facts to those of ``after``."""
     assert gaussians.live is not None
     live = gaussians.live.copy()
-    for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
+    for number, (one, all_) in enumerate(zip(before.layers, after.layers, strict=True)):
         if one.labels != all_.labels:
             rows = {label.key: row for row, label in enumerate(all_.labels)}
-            mine = live[:, LAYER_ID] == number if facts.others else np.full(len(live), True)
+            mine = live[:, LAYER_ID] == number if after.others else np.full(len(live), True)
             to = np.array([rows[label.key] for label in one.labels])
             live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
@@ -203,9 +203,9 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
     """Return the facts that the viewer needs in addition to the bytes; ``options`` are those of the first cloud."""
     distances = [layer.distance or options.unit_distance or 1.0 for layer in facts.layers]
     found = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
-    for own, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
-        own |= {"opacity_unit_distance": distance}
-        own |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, own)}
+    for entry, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
+        entry |= {"opacity_unit_distance": distance}
+        entry |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, entry)}
     axes = _axes(upright(options).up)
     return found | {
         "elements": [f"{VALUES_ID}-{k}" for k in range(len(clouds))],
@@ -266,25 +266,25 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
     return _nodes(read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED)
 
 
-def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]:
+def presets_of(facts: LiveFacts, entry: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the named functions for values that are or look like Hounsfield units, or of the kind of the file's name.
 
     The file's own function is not among them, unless it was changed and has kept the name.
 
     Args:
         facts: of the layer.
-        own: its part of the scene, whose ``unit_distance`` opacities become per.
+        entry: its part of the scene, whose ``unit_distance`` opacities become per.
     """
     named, found, known = names(), [], facts.statistics()
     hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(known))
-    kind = "ct" if hounsfield else own["name"].split("-")[0] if own["name"] in named else ""
+    kind = "ct" if hounsfield else entry["name"].split("-")[0] if entry["name"] in named else ""
     for name in [name for name in named if name.split("-")[0] == kind]:
         tf = named_function(name)
         if tf.otherwise is not None and not hounsfield:  # a guess
             continue
         tf = resolve(tf, known, hounsfield=True)
         assert tf.opacity_unit_share is not None
-        times = own["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
+        times = entry["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
         tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
         light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
         if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):

@@ -97,13 +97,13 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
 
 def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
-    colors, own = picture.colors, not picture.rgb
-    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, own)
+    colors, separate = picture.colors, not picture.rgb
+    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, separate)
 
 
 def choose_channel(
     n: int, names: Sequence[str], dtype: np.dtype, wanted: int | str | None, source: str,
-    colors: Sequence[Color] = (), rgb: bool = False, own: bool = True,
+    colors: Sequence[Color] = (), rgb: bool = False, separate: bool = True,
 ) -> int | None:  # fmt: skip
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
 
@@ -115,7 +115,7 @@ def choose_channel(
         source: for messages.
         colors: RGB in [0, 1] of the channels, where they have any.
         rgb: they are red, green, blue and perhaps opacity.
-        own: they are channels of their own, not samples of pixels.
+        separate: they are channels of their own, not samples of pixels.
 
     Raises:
         SeveralComponents: several and none chosen.
@@ -138,7 +138,7 @@ def choose_channel(
     if wanted is not None:
         raise UsageError(f"{what}, not {wanted!r}; {expected}")
     raise SeveralComponents(
-        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), own, names
+        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), separate, names
     )
 
 

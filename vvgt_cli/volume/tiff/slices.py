@@ -184,11 +184,11 @@ _SIZES = {  # field of the size along x: of those along y and z, of the pixels a
 Spacing = tuple[float, float, float]
 
 
-def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | None) -> tuple[Spacing, str] | None:
+def log_spacing(first: Path, size: tuple[int, int], step: int, spacing: Spacing | None) -> tuple[Spacing, str] | None:
     """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None, and a warning, if unsure.
 
     Slices must have the ``size`` (x, y) in pixels that the log states. Their distance goes by the ``step`` of their
-    numbers, or the log's. Sizes that are ``given`` replace the log's. If there are several logs, the one
+    numbers, or the log's. Sizes that are given as ``spacing`` replace the log's. If there are several logs, the one
     with the longest name that the name of the ``first`` slice begins with counts.
 
     Raises:
@@ -203,8 +203,8 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | 
     along_x = next(key for key in _SIZES if key in log)
     along_y, along_z, pixels, axes, unit = _SIZES[along_x]
     unit = log.get("xtekct/units") or unit
-    if given is not None:
-        return given, unit
+    if spacing is not None:
+        return spacing, unit
     x, y, z = (log.floats(key, log.need(key), 1)[0] for key in (along_x, along_y or along_x, along_z or along_x))
     stated = [log[key] for axis in axes if (key := pixels.format(axis)) in log]
     between = "reconstruction/section to section step"
