@@ -30,7 +30,7 @@ from vvgt_cli.closed_form.tree import (
     value_score,
 )
 from vvgt_cli.closed_form.visibility import Visibility, visibility
-from vvgt_cli.dvr.render import Box
+from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
@@ -194,7 +194,7 @@ def form_of(
     ``progress`` is called with the completed share.
     """
     report = progress or (lambda share: None)
-    box = Box(half, step)
+    box = BoxFrame(half, step)
     cameras = cameras or default_views("train", size=MARCH_SIZE)
     seen = visibility(box, cells, cameras, progress=lambda share: report(0.5 * share))
     if values:

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import IO, Any, NoReturn
 
-from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Start
-from vvgt_cli.commands.live_site import Cloud, page_files, stored
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
+from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
 from vvgt_cli.conversion.convert import convert_in_memory, open_field
 from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.live import convert_live, live_refusal
@@ -122,7 +122,7 @@ class LoadedVolume:
 
     def _with_page(self, conversion: Conversion) -> Converted:
         """Return a conversion with its page: the libraries that a page needs are loaded here already."""
-        cloud = Cloud.of(_file(conversion), self.name)
+        cloud = ServedCloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
         sliced = not all(layer.colors for layer in conversion.field.source.layers)
         return Converted(cloud.ply, page_files(cloud, converts=True, sliced=sliced), cloud.live)
@@ -152,7 +152,7 @@ def main() -> None:
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
     try:
-        start: Start = pickle.load(orders)
+        start: Setup = pickle.load(orders)
     except Exception:
         _exit(folder)
     set_memory(start.memory)

@@ -47,7 +47,7 @@ def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class ServedCloud:
     """Gaussians that a page shows.
 
     Attributes:
@@ -63,7 +63,7 @@ class Cloud:
     ply: bytes | None = None
 
     @classmethod
-    def of(cls, ply: bytes, name: str) -> Cloud:
+    def of(cls, ply: bytes, name: str) -> ServedCloud:
         """Read a `.ply`."""
         gaussians, header = open_gaussians(io.BytesIO(ply))
         return cls(gaussians, layout_of(header), name, ply)
@@ -73,7 +73,7 @@ class Cloud:
         """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str, live: Cloud | None = None, slices: Slices | None = None) -> Resource:
+    def file(self, suffix: str, live: ServedCloud | None = None, slices: Slices | None = None) -> Resource:
         """Return the file to save, in the format of an ending; ``live`` is the form for the editor of a page."""
         extras = Extras(None if live is None or not live.live else (live.gaussians, live.options), slices)
         if (other := format_of(f"x.{suffix}")) is not None:
@@ -83,7 +83,7 @@ class Cloud:
             return Resource(BYTES, lambda: self.ply or b"")
         return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
-    def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
+    def with_function(self, tf: TransferFunction, light: Any = None) -> ServedCloud:
         """Return the cloud under a function on data values with a unit distance, and a light (None: the file's).
 
         Raise DataError for several layers or labels, DataError or UsageError for an invalid light.
@@ -117,7 +117,7 @@ class Cloud:
         labels = parse_labels(sent, facts.labels).labels
         return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
 
-    def with_labels(self, sent: Any, light: Any = None) -> Cloud:
+    def with_labels(self, sent: Any, light: Any = None) -> ServedCloud:
         """Return the cloud with other colours and opacities of its labels (``sent`` as in `parse_labels`).
 
         Raises:
@@ -127,7 +127,7 @@ class Cloud:
         check_labels([LabelTable("the page's labels", facts.labels)])
         return self._shown(palette, light, replace(self.options, live=facts))
 
-    def with_layers(self, sent: Any, light: Any = None) -> Cloud:
+    def with_layers(self, sent: Any, light: Any = None) -> ServedCloud:
         """Return the cloud with other looks of its layers; ``sent`` has a function or labels for each.
 
         Raises:
@@ -153,7 +153,7 @@ class Cloud:
         options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
         return self._shown(LayerTables(tuple(tables)), light, options)
 
-    def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
+    def _shown(self, table: Looks, light: Any, options: PlyOptions) -> ServedCloud:
         """Return the cloud baked under looks and a light: the page's, or else the file's."""
         from vvgt_cli.conversion.live import apply_light
 
@@ -191,7 +191,7 @@ def parse_function(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
+def page_files(cloud: ServedCloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
     """Return the text of a page, named "", and the file that it loads; raise DataError if a library is missing.
 
     It ``converts`` a volume for functions if that has a single layer, and shows its slices if it is ``sliced``.
@@ -226,7 +226,7 @@ class PageController:
         """Create the state of a page without Gaussians."""
         self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
-        self.first: Callable[[], Cloud] | None = None
+        self.first: Callable[[], ServedCloud] | None = None
         self.read_slices: Callable[[], Slices | None] = lambda: None
         self._reading = threading.Lock()
         self.better: bytes | None = None
@@ -246,7 +246,7 @@ class PageController:
         with converter.lock:
             converter.submit(None)
 
-    def show(self, cloud: Cloud) -> None:
+    def show(self, cloud: ServedCloud) -> None:
         """Show the Gaussians of a file, live if possible."""
         self.first = lambda: cloud
         try:
@@ -337,7 +337,7 @@ class PageController:
         slices = self.slices() if sent["file"] == "html" else None
         if number is None or better is None:
             return cloud.file(sent["file"], slices=slices)
-        conversion = Cloud.of(better, self.name)
+        conversion = ServedCloud.of(better, self.name)
         if not {"function", "labels"} & set(sent):
             return conversion.file(sent["file"], slices=slices)
         options = replace(cloud.options, certificate=conversion.options.certificate)
@@ -363,7 +363,7 @@ class PageController:
             self._better(number, message)
 
     def _first(self, made: Converted) -> None:
-        self.first = cache(lambda: Cloud.of(made.ply, self.name))
+        self.first = cache(lambda: ServedCloud.of(made.ply, self.name))
         self._show(made.files, made.live)
         self.state = {"number": 0, "state": "none", "said": ""}
 

@@ -17,7 +17,7 @@ from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
-from vvgt_cli.conversion.frames import Series, is_glob, is_glob_of_volumes
+from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
@@ -29,7 +29,7 @@ from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.rays import HALO
-from vvgt_cli.field.reader import Box, Scalars
+from vvgt_cli.field.reader import Scalars, VoxelBox
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
@@ -50,7 +50,7 @@ from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
-Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
+Part = tuple[VoxelBox, np.ndarray, np.ndarray]  # voxels with a halo; the first (3,) without it, and the end, (x, y, z)
 MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
 
 
@@ -183,12 +183,12 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
             return _render(run, request, [given])
         except SeveralSteps:  # which are the frames
             pass
-    series = Series(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
+    series = FrameSeries(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
     return _render(run, request, series.sources(), series)
 
 
 def _render(
-    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest], series: Series | None = None
+    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest], series: FrameSeries | None = None
 ) -> int:  # fmt: skip
     """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
     shares = request.check(len(frames))
@@ -380,7 +380,7 @@ def mip_of(field: Blocked | Source) -> Draw:
     from vvgt_cli.dvr.scene import kernel_values
 
     values, slope, intercept = kernel_values(source.volume)
-    whole = Box(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
+    whole = VoxelBox(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
     part = whole, whole.begin, np.array(source.volume.dims)
     return lambda camera: grey(_greatest(source, [part], camera))
 
@@ -400,15 +400,14 @@ def _blocks(field: Blocked) -> Iterator[Part]:
 def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarray:
     """Return the mean over a pixel of the greatest values along its rays, (h, w) float32 of the range of values."""
     from vvgt_cli.dvr.march import greatest
-    from vvgt_cli.dvr.render import Box as Frame
-    from vvgt_cli.dvr.render import camera_arrays
+    from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 
     n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
     larger = replace(
         camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
         width=n * camera.width, height=n * camera.height,
     )  # fmt: skip
-    rays = camera_arrays(Frame(np.array(frame.half), np.array(frame.step)), larger)
+    rays = camera_arrays(BoxFrame(np.array(frame.half), np.array(frame.step)), larger)
     out = np.zeros((larger.height, larger.width), np.float32)
     for box, lo, hi in parts:
         faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, Cloud, PageController, plain_name, stored
+from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion.gaussian_files import (
     STDIN,
@@ -221,7 +221,7 @@ def _serve(
             resources |= _series(clouds)
         elif given:
             gaussians, header = open_gaussians(files[0])
-            controller.show(Cloud(gaussians, layout_of(header), controller.name))
+            controller.show(ServedCloud(gaussians, layout_of(header), controller.name))
         url = stack.enter_context(served(site, request.port))
         if not resources.get(""):
             source = replace(request.source, volume=files[0])

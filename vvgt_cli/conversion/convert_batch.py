@@ -24,7 +24,7 @@ from vvgt_cli.conversion.batch import (
 )
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
-from vvgt_cli.conversion.frames import Series, is_glob_of_volumes
+from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
@@ -373,5 +373,5 @@ def _batch(
 ) -> Batch:  # fmt: skip
     """Return the batch of a kind."""
     if kind == FRAMES:
-        return Series(request, shard, page)
+        return FrameSeries(request, shard, page)
     return Labels(request) if kind == LABELS else Functions(functions)

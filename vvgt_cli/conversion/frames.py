@@ -94,7 +94,7 @@ class Survey:
         return self.first.volumes[0]
 
 
-class Series(Batch):
+class FrameSeries(Batch):
     """The frames of a glob of files, or the time steps of one file, under what all of them share.
 
     Nodes of the function that follow from the data (``--tf-range rescale``, percentiles, the histogram) follow from all

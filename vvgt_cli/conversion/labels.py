@@ -37,7 +37,7 @@ from vvgt_cli.volume.space import metres
 
 
 @dataclass(frozen=True)
-class Part:
+class LabelItem:
     """A label, or a layer without labels, and the request that would convert it alone."""
 
     name: str
@@ -51,7 +51,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class MapLabel(Part):
+class MapLabel(LabelItem):
     """A label of a map."""
 
     volume: Volume
@@ -75,7 +75,7 @@ class Labels(Batch):
     def __init__(self, request: ConvertRequest) -> None:
         """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
-        self._layers: list[tuple[ConvertRequest, list[Part]]] = []
+        self._layers: list[tuple[ConvertRequest, list[LabelItem]]] = []
 
     def prepare(self, run: Run) -> None:
         """Read the map and its table, and those of the layers.
@@ -141,7 +141,7 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     return open_content(source.path, read)
 
 
-def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[Part]:
+def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[LabelItem]:
     """Return the labels of a map, or a ``layer`` as a whole if it is none; the names of tables are added to ``tables``.
 
     Raises:
@@ -152,7 +152,7 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
     if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
-        return [Part(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
+        return [LabelItem(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
     read = read_labels(labels) if isinstance(labels, str) and labels not in (AUTO, NO_LABELS) else labels
     maps = layers_of(content, None, read, distance=source.unit_distance)
     tables += [one.tf.name for one in maps]
@@ -168,7 +168,7 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
             if label.shown_opacity > 0 and extent is not None:
                 shown.append((volume, table, label, extent))
     numbers = [label.number for *_, label, _ in shown]
-    found: list[Part] = []
+    found: list[LabelItem] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
     for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
@@ -193,7 +193,7 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
+def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) -> list[Gaussians | None]:
     """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
     labels = [part for part in parts if isinstance(part, MapLabel)]
@@ -227,7 +227,7 @@ def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: Part, console: Console) -> Gaussians | None:
+def _alone(part: LabelItem, console: Console) -> Gaussians | None:
     """Convert a label or layer as if it were the only one; return None where nothing is visible."""
     try:
         return _fit(part.request, console)

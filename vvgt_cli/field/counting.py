@@ -17,7 +17,7 @@ from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Content, content_of, open_content
-from vvgt_cli.field.reader import CLASSIFIED, Place
+from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 from vvgt_cli.volume.blocks import Packed
@@ -40,7 +40,7 @@ class CountBlocks:
         labels: collect the distinct values of a type that is too wide to be counted.
     """
 
-    place: Place
+    place: VolumeOrigin
     boxes: Boxes
     slices: int
     store: BlockStore
@@ -127,7 +127,7 @@ class BlockAccess:
     ) -> None:  # fmt: skip
         """Prepare for counting; ``histogram`` asks for one even for types that are not counted value by value."""
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
-        self._places: dict[int, tuple[Volume, Place]] = {}
+        self._places: dict[int, tuple[Volume, VolumeOrigin]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
@@ -136,18 +136,18 @@ class BlockAccess:
         if not isinstance(source, str):
             content = content_of(source)
             for volume in (*content.volumes, *content.classified):
-                self._places[id(volume)] = volume, Place(volume, read)
+                self._places[id(volume)] = volume, VolumeOrigin(volume, read)
             return content
         read = replace(read, stored=True, packed=True)
         content = open_content(source, read)
         for number, volume in enumerate(content.volumes):
-            self._places[id(volume)] = volume, Place(source, read, number)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, number)
         if content.color:
             volume = content.classified[0]
-            self._places[id(volume)] = volume, Place(source, read, CLASSIFIED)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, CLASSIFIED)
         return content
 
-    def place(self, volume: Volume) -> Place:
+    def place(self, volume: Volume) -> VolumeOrigin:
         """Return the origin of a volume that was opened here."""
         return self._places[id(volume)][1]
 

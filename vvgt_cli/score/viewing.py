@@ -77,7 +77,7 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
     return replace(camera, fx=focal, fy=focal)
 
 
-class Place(NamedTuple):
+class ViewingPlace(NamedTuple):
     """A viewing condition without its rule; attributes as in `ViewingCondition`."""
 
     size: int
@@ -85,7 +85,7 @@ class Place(NamedTuple):
     where: str = ""
 
 
-ConditionPicture = tuple[Place, Camera, Blocks | None]
+ConditionPicture = tuple[ViewingPlace, Camera, Blocks | None]
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class ConditionView:
         reference: (h, w, 3) float32 picture of the blocks, or of the whole.
     """
 
-    place: Place
+    place: ViewingPlace
     camera: Camera
     blocks: Blocks | None
     reference: np.ndarray
@@ -113,7 +113,7 @@ def condition_pictures(
         cameras = default_views("test", size=size)
         for i in views:
             camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
-            found.append((Place(size, field_of_view), camera, blocks))
+            found.append((ViewingPlace(size, field_of_view), camera, blocks))
     return found
 
 
@@ -135,7 +135,7 @@ def eye_pictures(
         return []
     size, found = round(2 * device.focal * float(np.tan(np.radians(FIELD_OF_VIEW / 2)))), []
     for away in AWAY:
-        place = Place(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
+        place = ViewingPlace(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
         for i in views:
             x, y, _ = default_views("test")[i].position
             ring = away / float(np.hypot(x, y))
@@ -214,16 +214,14 @@ def texture_note(texture: Texture) -> str:
 
 
 def score_conditions(
-    gaussians: Gaussians,
-    seen: Iterable[ConditionView],
-    rules: Collection[str] = tuple(RULES),
+    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES),
     headset: str = INRIA.name,
-) -> list[ViewingCondition]:
-    """Score every rule at every place, on the blocks of `condition_views`; worst first. ``headset`` is the rule of one."""
+) -> list[ViewingCondition]:  # fmt: skip
+    """Score every rule at every place, on the blocks of `condition_views`; worst first; ``headset``: its rule."""
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    errors: dict[tuple[str, Place], list[float]] = {}
+    errors: dict[tuple[str, ViewingPlace], list[float]] = {}
     for view in seen:
         for rule in (headset,) if view.place.where else rules:
             ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]

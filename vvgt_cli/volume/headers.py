@@ -21,7 +21,7 @@ _TYPES = {
 }  # fmt: skip
 
 
-class Fields(dict[str, str]):
+class HeaderFields(dict[str, str]):
     """The fields of a header, keys in lower case; ``name`` is the file, for messages."""
 
     def __init__(self, name: str) -> None:

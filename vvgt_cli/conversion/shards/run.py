@@ -22,7 +22,7 @@ from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import most_steps, steps_in_time
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
-from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
+from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
@@ -168,7 +168,7 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     run = Run(console or Console(), ConversionReport("merge"))
     store = BlockStore(Path(folder).absolute())
     store.settings()
-    plan, threads = Plan.load(store), thread_count()
+    plan, threads = ShardPlan.load(store), thread_count()
     workers = worker_count(BlockOptions(), math.prod(plan.grid.blocks.dims), plan.budget, threads)
     with (
         _written(output) as outputs,
@@ -236,7 +236,7 @@ def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     field.views.expect(scored_views(size))
     cells = field.cells(size, budget, most_cells(budget))
     assert cells.rays is not None
-    Plan(
+    ShardPlan(
         cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
         tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree, field.reader.voxel_bytes,
     ).save(store, cells.light)  # fmt: skip
@@ -369,7 +369,7 @@ def scored_views(size: int) -> list[Picture]:
     return [Picture(cameras[i], settings, spread_blocks(size, size, i, BLOCKS_A_VIEW)) for i in PREVIEW_VIEWS]
 
 
-def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
+def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: ShardPlan, rule: str | Rule = INRIA) -> Scores:
     """Score Gaussians (box frame), drawn by a rule, on the stored views; raise DataError if a block is damaged."""
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render

@@ -168,7 +168,7 @@ A_FILE = 1 << 17  # Gaussians in a file, except for those of its last node
 REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """The content of a file: a level of the nodes from ``begin`` to ``end``, and the file's number in that level."""
 
     level: int
@@ -177,7 +177,7 @@ class Part(NamedTuple):
     end: int
 
 
-def divide(counts: np.ndarray) -> tuple[tuple[Part, ...], list[list[dict[str, int]]]]:
+def divide(counts: np.ndarray) -> tuple[tuple[FilePart, ...], list[list[dict[str, int]]]]:
     """Divide the levels of nodes among files.
 
     Args:
@@ -187,13 +187,13 @@ def divide(counts: np.ndarray) -> tuple[tuple[Part, ...], list[list[dict[str, in
         The files, in the order in which their first nodes come; and for each node, by level, its file, offset and
         count.
     """
-    parts: list[Part] = []
+    parts: list[FilePart] = []
     for level in range(counts.shape[1]):
         begin, rows, number = 0, 0, 0
         for node, count in enumerate(counts[:, level].tolist(), 1):
             rows += count
             if rows >= A_FILE or node == len(counts):
-                parts.append(Part(level, number, begin, node))
+                parts.append(FilePart(level, number, begin, node))
                 begin, rows, number = node, 0, number + 1
     parts.sort(key=lambda part: (part.begin, part.level))
     places: list[list[dict[str, int]]] = [[{} for _ in range(counts.shape[1])] for _ in range(len(counts))]
@@ -222,7 +222,7 @@ class WrittenFiles:
     """
 
     gaussians: StoredGaussians
-    parts: tuple[Part, ...]
+    parts: tuple[FilePart, ...]
     folder: Path
     axes: np.ndarray
     scale: float

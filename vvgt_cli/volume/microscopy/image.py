@@ -26,11 +26,10 @@ from vvgt_cli.volume.types import Volume
 EXTRA = "microscopy"
 MAX_XML = 64 << 20
 Color = tuple[float, float, float] | None
-Box = Slices
 
 
 @dataclass(frozen=True)
-class Picture:
+class Micrograph:
     """An image of a microscope.
 
     Attributes:
@@ -52,7 +51,7 @@ class Picture:
     channels: int
     shape: tuple[int, int, int]
     dtype: np.dtype
-    read: Callable[[int, int, Box], np.ndarray]
+    read: Callable[[int, int, Slices], np.ndarray]
     chunks: tuple[int, int, int]
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -62,7 +61,7 @@ class Picture:
     mapped: bool = False
 
 
-def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
+def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
 
     Errors are those of `Reader.read`.
@@ -95,7 +94,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
     return Volume(field, spacing, picture.origin, name=name, unit=unit)
 
 
-def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
+def _channel(picture: Micrograph, wanted: int | str | None, source: str) -> int | None:
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
     colors, separate = picture.colors, not picture.rgb
     return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, separate)

@@ -14,10 +14,11 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.libraries import read_part
-from vvgt_cli.volume.microscopy.image import Box, Color, Picture, picture_volume
+from vvgt_cli.volume.microscopy.image import Color, Micrograph, picture_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6
@@ -65,7 +66,7 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
     image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
     spacing, origin = _placed(image, shape)
     channel_facts = [_channel(file, c) for c in range(channels)]
-    picture = Picture(
+    picture = Micrograph(
         times, channels, shape, first.dtype, partial(_read, path, level), first.chunks or (1, *shape[1:]), spacing,
         origin, [name for name, _ in channel_facts], [color for _, color in channel_facts],
     )  # fmt: skip
@@ -76,7 +77,7 @@ def _place(level: int, time: int, channel: int) -> str:
     return f"DataSet/ResolutionLevel {level}/TimePoint {time}/Channel {channel}/Data"
 
 
-def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarray:
+def _read(path: Path, level: int, time: int, channel: int, box: Slices) -> np.ndarray:
     """Read a box; datasets are padded to whole chunks."""
     return read_part(path, _place(level, time, channel), box)
 

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
@@ -219,9 +219,9 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, spacing: Spacing 
     return None
 
 
-def _fields(path: Path) -> Fields:
+def _fields(path: Path) -> HeaderFields:
     """Return the fields of a log, ``section/key`` in lower case."""
-    fields, section = Fields(str(path)), ""
+    fields, section = HeaderFields(str(path)), ""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file.read(MAX_HEADER).splitlines():
             key, equals, value = line.partition("=")
