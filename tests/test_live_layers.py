@@ -15,7 +15,7 @@ from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
 from tests.test_page_live import compare, options
-from vvgt_cli.commands.live_site import Cloud
+from vvgt_cli.commands.live_site import ServedCloud
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
@@ -234,7 +234,7 @@ def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
 
 def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     """As `recolor` shows the file under the same looks: what the page sends is of each layer."""
-    cloud = Cloud.of((pair / "live.ply").read_bytes(), "live")
+    cloud = ServedCloud.of((pair / "live.ply").read_bytes(), "live")
     other = TF | {"opacity_unit_distance": 2.0}
     labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]

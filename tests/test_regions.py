@@ -15,7 +15,7 @@ from vvgt_cli.conversion.shards.regions import RegionNodes, VolumePart
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
-from vvgt_cli.field.reader import Place, Scalars
+from vvgt_cli.field.reader import Scalars, VolumeOrigin
 from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -60,7 +60,7 @@ def parts_of(path: Path, light: str | None, *edges: tuple[int, int]) -> tuple[li
     """Parts between ``edges`` along x, and the scene of the volume."""
     source = load(SourceRequest(str(path), light=LightOptions(lights=() if light is None else (light,))))
     scene, dims = source.scene(), source.volume.dims
-    reader = Scalars(Place(str(path), ReadOptions()), kernel_rule(source.volume, lambda: (0, 255)), scene.optics)
+    reader = Scalars(VolumeOrigin(str(path), ReadOptions()), kernel_rule(source.volume, lambda: (0, 255)), scene.optics)
     frame = BoxFrame(scene.half, scene.step)
     made = [
         VolumePart(reader, frame, dims, np.array([a, 0, 0]), np.array([b, *dims[1:]]), scene.light) for a, b in edges
