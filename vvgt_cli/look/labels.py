@@ -20,10 +20,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import Named
 from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
-LISTED = 8  # labels that a message names
 AUTO, NO_LABELS = "auto", "none"  # values of --labels: distinct colours, or a scalar field
 MAX_NAME, MAX_STEM = 200, 80  # characters of a label's name: in headers, and in names of files
 MAX_LEGEND = 24  # labels of a legend
@@ -167,10 +167,10 @@ class LabelTable:
         """
         known = {label.number: label for label in self.labels}
         missing = [n for n in numbers if n != 0 and n not in known]
-        shown = ", ".join(map(str, missing[:LISTED])) + (", ..." if len(missing) > LISTED else "")
+        shown = listed(missing, ", ")
         if not any(n in known for n in numbers if n != 0):
-            has = ", ".join(str(n) for n in list(known)[:LISTED]) + (", ..." if len(known) > LISTED else "")
-            raise DataError(f"{where}: none of its labels ({shown or 'only 0'}) is in {self.name}, which has {has}")
+            has = listed(list(known), ", ")
+            raise DataError(f"{where}: none of its labels ({shown}) is in {self.name}, which has {has}")
         if missing:
             raise DataError(
                 f"{where}: {len(missing)} labels have no entry in {self.name}: {shown}; add them (opacity 0 hides one)"
@@ -184,8 +184,8 @@ class LabelTable:
         """
         opacity = {e: e.shown_opacity if split else e.opacity for e in self.labels if e.number in numbers and e.number}
         if hidden := [f"{e.number} ({e.name})" for e in opacity if not opacity[e]]:
-            shown = ", ".join(hidden[:LISTED]) + (", ..." if len(hidden) > LISTED else "")
-            warnings.warn(f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {shown}", stacklevel=2)
+            text = f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {listed(hidden, ', ')}"
+            warnings.warn(text, stacklevel=2)
 
     def only(self, number: int) -> LabelTable:
         """Return the table with one label, switched on, and the others transparent."""

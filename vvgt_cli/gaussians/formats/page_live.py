@@ -29,6 +29,7 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
 from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.tables import extinction
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
 VALUES_ID = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
@@ -125,7 +126,7 @@ def contents(options: PlyOptions, name: str, names: Sequence[str] = (), slices: 
     labels = sum(len(layer.labels) for layer in layers) or (slices.labels if slices else 0)
     parts += [f"names of {labels} labels"] if labels else []
     stated = [layer.name for layer in layers if layer.name] if len(layers) > 1 else list(names)
-    parts += [f"the names {', '.join(stated[:3])}{', ...' if len(stated) > 3 else ''}"] if stated else []
+    parts += [f"the names {listed(stated, ', ', 3)}"] if stated else []
     parts += [str(slices)] if slices else []
     parts += ["a checksum of the volume"] if options.certificate else []
     return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"

@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import load_block
-from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.components import listed, select_component
 from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -82,7 +82,7 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
     values *= max(len(orbitals), 1)
     shape = (*map(abs, sizes), values)
     block = load_block(path, np.dtype(np.float32), shape, offset=start, encoding="text")
-    listing = ", ".join(orbitals[:12]) + (", ..." if len(orbitals) > 12 else "")
+    listing = listed(orbitals, ", ")
     label = f"orbitals {listing}:" if orbitals else "its values"
     if len(orbitals) > 1:
         label = f"the cube of orbitals {listing}"

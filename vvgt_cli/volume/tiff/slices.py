@@ -16,7 +16,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.components import listed, select_component
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -59,7 +59,8 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     if not files:
         raise DataError(f"{source}: no slices ({', '.join(SUFFIXES)})")
     if others:
-        warnings.warn(f"{source}: skipped {listed(others)}: not of the format of most slices", stacklevel=2)
+        names = listed([path.name for path in others], ", ", 3)
+        warnings.warn(f"{source}: skipped {names}: not of the format of most slices", stacklevel=2)
     files, step = in_order(files, source)
 
     def page(path: Path, slices: int = 1) -> Volume:
@@ -230,9 +231,6 @@ def _fields(path: Path) -> HeaderFields:
     return fields
 
 
-_SHOWN = 3  # numbers or files that a message names
-
-
 def by_number(path: Path) -> list[tuple[int, str]]:
     """Return the sorting key of a file name: runs of digits count by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name) if part]
@@ -258,7 +256,8 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
     if len(alone) >= len(main) or not columns:
         return files, 1
     if alone:
-        warnings.warn(f"{source}: skipped {listed(alone)}: not numbered as the other slices", stacklevel=2)
+        names = listed([path.name for path in alone], ", ", 3)
+        warnings.warn(f"{source}: skipped {names}: not numbered as the other slices", stacklevel=2)
     parts = re.split(r"(\d+)", main[0].name)
     for k in (k for k in range(len(columns) - 1) if parts[2 * k + 2] == "."):  # decimals: 0.5, 1.0, 1.5
         places = [float(f"{text[k]}.{text[k + 1]}") for text in texts]
@@ -272,13 +271,8 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
     step = int(min(_steps(numbers)))
     gaps = [n for a, b in pairwise(sorted(numbers)) for n in range(a + step, min(b, a + 5 * step), step)]
     if gaps:
-        warnings.warn(f"{source}: no slices numbered {listed(gaps)}; read as if evenly spaced", stacklevel=2)
+        warnings.warn(f"{source}: no slices numbered {listed(gaps, ', ', 3)}; read as if evenly spaced", stacklevel=2)
     return [path for _, path in sorted(zip(numbers, series, strict=True))], step
-
-
-def listed(items: Sequence[Path | int]) -> str:
-    """Return the first few numbers, or names of files, and that there are more."""
-    return ", ".join(str(getattr(i, "name", i)) for i in items[:_SHOWN]) + (", ..." if len(items) > _SHOWN else "")
 
 
 def _steps(numbers: Sequence[float]) -> set[float]:
