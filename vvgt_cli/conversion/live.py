@@ -31,7 +31,7 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats.page_live import LiveForm
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import LIVE
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
@@ -232,11 +232,10 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
 
 def function_table(source: Source) -> Table:
     """Return the lookup table of the function of a source, with lengths in the unit frame."""
-    stats, tf = source.overall, source.tf
+    stats, tf, volume = source.overall, source.tf, source.volume
     assert isinstance(tf, TransferFunction)
-    facts = LiveFacts.of(source.volume, stats, tf)
-    distance = source.unit_distance * source.volume.unit_frame().scale
-    return Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
+    distance = source.unit_distance * volume.unit_frame().scale
+    return Table.of_function(tf, stats.lo, stats.hi, distance, grain_of(volume.dims))
 
 
 def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.conversion.live import box_lighting
+from vvgt_cli.conversion.live import box_lighting, function_table
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest
@@ -23,7 +23,7 @@ from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.live import TAU, Table
+from vvgt_cli.gaussians.live import TAU
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
@@ -119,8 +119,8 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     samples = field.sample(gaussians)
     there = np.isfinite(samples).all(axis=1)
     samples[~there] = 0
-    old, a = _look_alone(before, source, gaussians, samples)
-    new, b = _look_alone(source, source, gaussians, samples)
+    old, a = _look_alone(before, gaussians, samples)
+    new, b = _look_alone(source, gaussians, samples)
     least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MAX_RATIO, MAX_RATIO), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
@@ -136,16 +136,11 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _look_alone(
-    look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
+def _look_alone(look: Source, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 
-    stats, scale = source.statistics, source.volume.unit_frame().scale
-    grain = 2 / max(source.volume.dims)
-    table = Table.of_function(look.tf, stats.lo, stats.hi, look.unit_distance * scale, grain)
-    sums = table.of(samples)
+    sums = function_table(look).of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting, gradient = box_lighting(look), samples[:, GRADIENT].astype(np.float64)

@@ -23,7 +23,7 @@ from vvgt_cli.look import (
 )
 from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.label_files import holds_table, segments_of, table_for
-from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct, hex_color
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
@@ -295,7 +295,7 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
         raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
-        f"{k}{f' {name!r}' if name else ''} {_hex(channel_color(k, color))}"
+        f"{k}{f' {name!r}' if name else ''} #{hex_color(channel_color(k, color))}"
         for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
     ]
     warnings.warn(
@@ -306,10 +306,6 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
 def channel_color(number: int, color: tuple[float, float, float] | None) -> tuple[float, float, float]:
     """Return the colour of a channel, RGB in [0, 1]: the file's, else the default for its number."""
     return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
-
-
-def _hex(rgb: Sequence[float]) -> str:
-    return "#" + "".join(f"{round(255 * v):02x}" for v in rgb)
 
 
 def _white(opened: Content) -> float:

@@ -65,8 +65,8 @@ class LiveFacts:
 
     @property
     def grain(self) -> float:
-        """Edge of a voxel, unit-frame length, as if the box were a cube."""
-        return 2 / max(self.dims)
+        """Edge of a voxel, as by `grain_of`."""
+        return grain_of(self.dims)
 
     @property
     def most_labels(self) -> int:
@@ -126,6 +126,11 @@ class LiveFacts:
     def title(self) -> str:
         """Return the comment line that introduces one of several layers."""
         return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name)}"
+
+
+def grain_of(dims: tuple[int, int, int]) -> float:
+    """Return the edge of a voxel, unit-frame length, as if the box were a cube."""
+    return 2 / max(dims)
 
 
 def function_text(tf: TransferFunction, lo: float, hi: float, layer_count: int = 1) -> str:
