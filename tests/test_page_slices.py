@@ -1,6 +1,7 @@
 """Slices of the volume on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
 
 import base64
+import gzip
 import json
 import re
 from dataclasses import replace
@@ -11,13 +12,26 @@ import numpy as np
 import pytest
 
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians.formats.page_slices import packed, slices_of, unpacked
+from vvgt_cli.gaussians.formats.page_slices import packed, slices_of
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
 from vvgt_cli.volume.stored import Stored
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
 TURNED = (0.8, -0.6, 0.0, -0.6, -0.8, 0.0, 0.0, 0.0, 1.0)  # oblique, and mirrored
+
+
+def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
+    """Decode values (nz, ny, nx) float64, NaN where unknown, or numbers in the list of labels, -1 for none."""
+    size = facts["bits"] // 8
+    planes = np.frombuffer(gzip.decompress(content), np.uint8).reshape(size, -1)
+    folded = np.ascontiguousarray(planes.T).view(f"<u{size}").reshape(facts["dims"][::-1])
+    steps = (folded >> 1) ^ (0 - (folded & 1))
+    codes = np.cumsum(steps, axis=2, dtype=folded.dtype).astype(np.int64)
+    if "labels" in facts:
+        return codes - 1
+    codes -= facts["missing"]
+    return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)
 
 
 def grids_in(page: Path) -> list[tuple[dict[str, Any], np.ndarray]]:

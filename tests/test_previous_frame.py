@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import patch, patched, stored_frames
+from vvgt_cli.gaussians.formats.page_frames import patch, stored_frames
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
@@ -34,6 +35,16 @@ TF = {"points": [
     {"x": 100, "rgb": [1, 1, 0.9], "opacity": 0.3},
 ]}  # fmt: skip
 HOW = ("--max-gaussians", "400", "--size", "96", "--steps", "30")
+
+
+def patched(base: bytes, runs: bytes) -> bytes:
+    """Apply a `patch` to ``base``."""
+    out, at = bytearray(base), 0
+    while at < len(runs):
+        place, length = struct.unpack_from("<II", runs, at)
+        out[place : place + length] = runs[at + 8 : at + 8 + length]
+        at += 8 + length
+    return bytes(out)
 
 
 def body(radius: float) -> np.ndarray:

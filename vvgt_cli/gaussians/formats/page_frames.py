@@ -76,13 +76,3 @@ def patch(base: bytes, content: bytes) -> bytes:
     first, last = at[np.concatenate([[0], breaks + 1])], at[np.concatenate([breaks, [len(at) - 1]])] + 1
     runs = zip(first.tolist(), last.tolist(), strict=True)
     return b"".join(struct.pack("<II", i, j - i) + content[i:j] for i, j in runs)
-
-
-def patched(base: bytes, runs: bytes) -> bytes:
-    """Apply a `patch` to ``base``."""
-    out, at = bytearray(base), 0
-    while at < len(runs):
-        place, length = struct.unpack_from("<II", runs, at)
-        out[place : place + length] = runs[at + 8 : at + 8 + length]
-        at += 8 + length
-    return bytes(out)

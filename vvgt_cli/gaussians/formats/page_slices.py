@@ -158,16 +158,3 @@ def packed(codes: np.ndarray) -> bytes:
     steps = np.diff(codes, axis=2, prepend=codes.dtype.type(0)).view(signed)
     folded = ((steps << 1) ^ (steps >> (8 * codes.itemsize - 1))).astype(signed.newbyteorder("<"))
     return gzip.compress(folded.view(np.uint8).reshape(-1, codes.itemsize).T.tobytes(), 6, mtime=0)
-
-
-def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
-    """Decode values (nz, ny, nx) float64, NaN where unknown, or numbers in the list of labels, -1 for none."""
-    size = facts["bits"] // 8
-    planes = np.frombuffer(gzip.decompress(content), np.uint8).reshape(size, -1)
-    folded = np.ascontiguousarray(planes.T).view(f"<u{size}").reshape(facts["dims"][::-1])
-    steps = (folded >> 1) ^ (0 - (folded & 1))
-    codes = np.cumsum(steps, axis=2, dtype=folded.dtype).astype(np.int64)
-    if "labels" in facts:
-        return codes - 1
-    codes -= facts["missing"]
-    return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)
