@@ -238,7 +238,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     other = TF | {"opacity_unit_distance": 2.0}
     labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
-    saved = cloud.with_layers(sent)
+    saved = cloud.with_looks(sent)
     facts = saved.options.live
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
     assert facts.layers[2].labels[0].opacity == 0.25
@@ -249,7 +249,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     assert thinner.mean() > 0.4  # opacity is per twice the distance
     for wrong in (sent[:2], [labels, *sent[1:]], [*sent[:2], {"function": other}], None):
         with pytest.raises(vvgt_library.DataError):
-            cloud.with_layers(wrong)
+            cloud.with_looks(wrong)
 
 
 def test_channels_in_python(tmp_path) -> None:

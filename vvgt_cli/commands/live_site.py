@@ -83,52 +83,11 @@ class ServedCloud:
             return Resource(BYTES, lambda: self.ply or b"")
         return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
-    def with_function(self, tf: TransferFunction, light: Any = None) -> ServedCloud:
-        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's).
+    def with_looks(self, sent: Any, light: Any = None) -> ServedCloud:
+        """Return the cloud under other looks of its layers and a light (None: the file's).
 
-        Raise DataError for several layers or labels, DataError or UsageError for an invalid light.
-        """
-        facts = self._alone("a function")
-        table, facts = self._function(facts, tf)
-        distance = tf.opacity_unit_distance
-        options = replace(
-            self.options, live=facts, unit_distance=distance, unit_distance_label="file", function=tf.name
-        )  # fmt: skip
-        return self._shown(table, light, options)
-
-    def _alone(self, what: str) -> LiveFacts:
-        """Return the facts about the values of the only layer; refuse several."""
-        facts = self.options.live
-        if facts is None or facts.others:
-            raise DataError(f"the cloud has several layers; expected a look for each instead of {what}")
-        return facts
-
-    def _function(self, facts: LiveFacts, tf: TransferFunction, layer_count: int = 1) -> tuple[Table, LiveFacts]:
-        """Return a layer's table and facts under a function."""
-        if facts.labels:
-            raise DataError("the cloud carries labels; expected labels, not a function")
-        assert tf.opacity_unit_distance is not None
-        distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
-        table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
-        return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, layer_count))
-
-    def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
-        """Return a layer's palette and facts under labels that a page sends."""
-        labels = parse_labels(sent, facts.labels).labels
-        return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
-
-    def with_labels(self, sent: Any, light: Any = None) -> ServedCloud:
-        """Return the cloud with other colours and opacities of its labels (``sent`` as in `parse_labels`).
-
-        Raises:
-            DataError, UsageError: labels or a light that are not valid, or labels of another cloud.
-        """
-        palette, facts = self._labels(self._alone("labels"), sent, self.options.unit_distance or 1.0)
-        check_labels([LabelTable("the page's labels", facts.labels)])
-        return self._shown(palette, light, replace(self.options, live=facts))
-
-    def with_layers(self, sent: Any, light: Any = None) -> ServedCloud:
-        """Return the cloud with other looks of its layers; ``sent`` has a function or labels for each.
+        ``sent`` lists, for each layer, an object with a function or with labels, as `parse_function` and `parse_labels`
+        have them.
 
         Raises:
             DataError, UsageError: looks or a light that are not valid, or looks of other layers.
@@ -136,22 +95,32 @@ class ServedCloud:
         layers = () if self.options.live is None else self.options.live.layers
         if not isinstance(sent, list) or len(sent) != len(layers) or not all(isinstance(one, dict) for one in sent):
             raise DataError(f"the page's layers: expected a list of {len(layers)} looks, each a function or labels")
-        tables, facts = list[Table | Palette](), list[LiveFacts]()
-        for layer, one in zip(layers, sent, strict=True):
-            if "labels" in one:
-                palette, own = self._labels(layer, one["labels"], layer.distance or 1.0)
-                tables.append(palette)
-                facts.append(own)
-                continue
-            tf = parse_function(one.get("function"))
-            table, own = self._function(layer, tf, len(layers))
-            tables.append(table)
-            facts.append(replace(own, distance=tf.opacity_unit_distance))
+        looks = [self._look(layer, one, len(layers)) for layer, one in zip(layers, sent, strict=True)]
+        facts = [one for _, one in looks]
         if all(one.labels for one in facts):
             check_labels([LabelTable("the page's labels", one.labels) for one in facts])
-        live = replace(facts[0], others=tuple(facts[1:]))
-        options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
-        return self._shown(LayerTables(tuple(tables)), light, options)
+        live, tables = replace(facts[0], others=tuple(facts[1:])), [table for table, _ in looks]
+        options = replace(self.options, live=live)
+        if live.function or live.others:
+            options = replace(options, unit_distance=live.distance, unit_distance_label="file")
+        if live.function and not live.others:
+            options = replace(options, function=live.baked().get("name"))
+        return self._shown(LayerTables(tuple(tables)) if live.others else tables[0], light, options)
+
+    def _look(self, layer: LiveFacts, sent: dict[str, Any], layer_count: int) -> tuple[Table | Palette, LiveFacts]:
+        """Return a layer's table and facts under a look that a page sends."""
+        scale = self.options.scale or 1.0
+        if "labels" in sent:
+            labels, distance = parse_labels(sent["labels"], layer.labels).labels, layer.distance
+            distance = distance or self.options.unit_distance or 1.0
+            return Palette.of_labels(labels, distance * scale), replace(layer, labels=labels, distance=distance)
+        if layer.labels:
+            raise DataError("the cloud carries labels; expected labels, not a function")
+        tf = parse_function(sent.get("function"))
+        assert tf.opacity_unit_distance is not None
+        table = Table.of_function(tf, layer.lo, layer.hi, tf.opacity_unit_distance * scale, layer.grain)
+        text = function_text(tf, layer.lo, layer.hi, layer_count)
+        return table, replace(layer, function=text, distance=tf.opacity_unit_distance)
 
     def _shown(self, table: Looks, light: Any, options: PlyOptions) -> ServedCloud:
         """Return the cloud baked under looks and a light: the page's, or else the file's."""
@@ -328,12 +297,9 @@ class PageController:
             raise DataError("that conversion was replaced by another; try again")
         assert self.first is not None
         cloud = self.first()
-        if sent.get("function") is not None and cloud.live:
-            cloud = cloud.with_function(parse_function(sent["function"]), sent.get("light"))
-        if sent.get("labels") is not None and cloud.live:
-            cloud = cloud.with_labels(sent["labels"], sent.get("light"))
-        if sent.get("layers") is not None and cloud.live:
-            cloud = cloud.with_layers(sent["layers"], sent.get("light"))
+        looks = sent.get("layers") or [{key: sent[key]} for key in ("function", "labels") if sent.get(key) is not None]
+        if looks and cloud.live:
+            cloud = cloud.with_looks(looks, sent.get("light"))
         slices = self.slices() if sent["file"] == "html" else None
         if number is None or better is None:
             return cloud.file(sent["file"], slices=slices)
