@@ -39,17 +39,17 @@ class Leaf:
     name: str = ""
 
 
-def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
-    """Yield the datasets in a vtkDataObject: itself, or those of its blocks that are there, with their levels."""
+def leaves_of(root: Any, name: str = "") -> Iterator[Leaf]:
+    """Yield the datasets in the vtkDataObject ``root``: itself, or those of its blocks that are there, with their levels."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet
 
-    if found is None or found.IsA("vtkDataSet"):
-        if found is not None:
-            yield Leaf(found, 0, name)
+    if root is None or root.IsA("vtkDataSet"):
+        if root is not None:
+            yield Leaf(root, 0, name)
         return
-    if not found.IsA("vtkCompositeDataSet"):
+    if not root.IsA("vtkCompositeDataSet"):
         return
-    walk = found.NewIterator()
+    walk = root.NewIterator()
     amr = hasattr(walk, "GetCurrentLevel")
     walk.InitTraversal()
     while not walk.IsDoneWithTraversal():
