@@ -97,9 +97,9 @@ def place_cases(
         rule: to draw by at that size.
     """
 
-    def share(of: Gaussians) -> float:
-        beyond = (np.abs(of.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
-        return float(np.average(beyond, weights=opacity(of) + 1e-12))
+    def share(cloud: Gaussians) -> float:
+        beyond = (np.abs(cloud.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
+        return float(np.average(beyond, weights=opacity(cloud) + 1e-12))
 
     def outside() -> Figure:
         found, other = share(gaussians), share(world)

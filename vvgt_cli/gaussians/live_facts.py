@@ -178,11 +178,11 @@ def one_comment(text: str) -> dict[str, Any]:
     raise ValueError(text)
 
 
-def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
+def live_facts(layers: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
     """Merge the facts of comments, one mapping per layer; None if some, or some of the file's columns, are missing."""
-    whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in found)
-    whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in found)
-    if not whole or (len(found) > 1 and LAYER not in columns):
+    whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in layers)
+    whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in layers)
+    if not whole or (len(layers) > 1 and LAYER not in columns):
         return None
-    first, *others = [LiveFacts(**one) for one in found]
+    first, *others = [LiveFacts(**one) for one in layers]
     return replace(first, others=tuple(others))

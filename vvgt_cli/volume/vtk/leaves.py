@@ -40,7 +40,7 @@ class Leaf:
 
 
 def leaves_of(root: Any, name: str = "") -> Iterator[Leaf]:
-    """Yield the datasets in the vtkDataObject ``root``: itself, or those of its blocks that are there, with their levels."""
+    """Yield the datasets in the vtkDataObject ``root``: itself, or its blocks that are there, with their levels."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet
 
     if root is None or root.IsA("vtkDataSet"):
