@@ -228,7 +228,7 @@ def layers_of(
         if own_table and opened.layer is not None:
             labels = segments_of(str(opened.path), opened.layer)
         elif own_table:
-            labels = opened.path
+            labels = str(opened.path)
         return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
