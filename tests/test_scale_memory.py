@@ -111,7 +111,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "open_content", lambda source, options: Content((volume,)))
     store = BlockStore(tmp_path)
     (store.folder / COUNTS).mkdir()
-    place = reader.Place("counted once", ReadOptions(stored=True))
+    place = reader.VolumeOrigin("counted once", ReadOptions(stored=True))
     task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24, store, COUNTS)
     for number in range(len(task)):
         task(number)

@@ -13,8 +13,7 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, for_thin, more_rays
+from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
 from vvgt_cli.field.digests import digest, values_digest
@@ -118,10 +117,10 @@ class Blocked:
         return self.renderer or self
 
     @cached_property
-    def frame(self) -> Frame:
+    def frame(self) -> BoxFrame:
         """Half extents and voxel edges in the unit frame."""
         frame = self.source.volume.unit_frame()
-        return Frame(np.array(frame.half), np.array(frame.step))
+        return BoxFrame(np.array(frame.half), np.array(frame.step))
 
     @cached_property
     def light(self) -> Light | None:
