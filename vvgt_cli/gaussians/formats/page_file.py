@@ -159,7 +159,7 @@ def page(
         elements: HTML elements with the viewer.
         more: further entries of the scene for the viewer.
     """
-    seen = {"camera": camera(splats), "outermost": outermost([splats])}
+    seen = {"camera": camera(splats)} | ({} if "outermost" in more else {"outermost": outermost([splats])})
     return _text(title, {"rule": rule_parameters(splats), **seen, "frames": list(frames), **more}, elements)
 
 
