@@ -36,7 +36,7 @@ NOT_RUN, YES, NO = "not run", "yes", "no"
 FACTS: dict[str, Callable[[PlyHeader], bool]] = {
     "certificate": lambda header: header.certificate is not None,
     "place in the world": lambda header: header.affine is not None,
-    "size, rule": lambda header: header.made_for is not None and header.rule is not None,
+    "size, rule": lambda header: header.screen_size is not None and header.rule is not None,
     "unit distance": lambda header: header.unit_distance is not None,
 }
 VALIDATE = """
@@ -56,7 +56,7 @@ def example() -> tuple[Gaussians, PlyOptions]:
     certificate = Certificate(
         "head", "ab" * 32, "0123456789ab", 1080, "compensated", 40.0, 3, 160000, texture=(0.5, 0.4)
     )
-    options = PlyOptions(unit_distance=0.5, made_for=1080, rule="compensated", certificate=certificate)
+    options = PlyOptions(unit_distance=0.5, screen_size=1080, rule="compensated", certificate=certificate)
     return gaussians, with_place(options, volume)
 
 

@@ -104,7 +104,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
         ClosedFormStage().run(work)
         shown = visible_cloud(live, table, box_lighting(source), pixel_width(SIZE))
-        scores = {"live": score(lit, shown), "closed form": score(lit, work.made())}
+        scores = {"live": score(lit, shown), "closed form": score(lit, work.current())}
         rows.append({"scene": name, "gaussians": gaussians, "light": title, **scores})
         print(rows[-1], flush=True)
     return rows

@@ -110,12 +110,12 @@ def main() -> None:
 def checkpoint(path: str, config: str) -> None:
     import torch
 
-    from vvgt_cli.network.checkpoint import Checkpoint, save_checkpoint
+    from vvgt_cli.network.checkpoint import NetworkCheckpoint, save_checkpoint
     from vvgt_cli.network.export import randomised
     from vvgt_cli.network.model import Vvgt
 
     torch.manual_seed(0)
-    save_checkpoint(path, Checkpoint(randomised(Vvgt(NAMED[config]))))
+    save_checkpoint(path, NetworkCheckpoint(randomised(Vvgt(NAMED[config]))))
 
 
 @main.command()

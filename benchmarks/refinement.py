@@ -26,7 +26,7 @@ from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
-from vvgt_cli.conversion.stages.views import LARGE, MOST_VIEWS, ray_settings, suits_small_views, view_count
+from vvgt_cli.conversion.stages.views import LARGE, MAX_VIEWS, ray_settings, suits_small_views, view_count
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.field.workload import view_edge
@@ -70,7 +70,7 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     adam, _ = judged.refined(start, train, images, OptimizeOptions(steps=ADAM_STEPS, method="adam", **LOSS_3DGS))
     budget = time.perf_counter() - began
     began = time.perf_counter()
-    cameras, images, rule = training_views(judged, start, MOST_VIEWS)
+    cameras, images, rule = training_views(judged, start, MAX_VIEWS)
     views = time.perf_counter() - began
     options = OptimizeOptions(steps=None, time_budget=max(budget - views, 0.0), rule=rule)
     ours, record = judged.refined(start, cameras, images, options)

@@ -42,7 +42,7 @@ def score(source: Source, scene: Scene, gaussians: Gaussians, size: int, rule: R
 def rows(name: str, source: Source, scene: Scene, path: Path) -> Iterator[dict[str, Any]]:
     """A row a format that can be written here."""
     gaussians, header = open_gaussians(str(path))
-    rule, size, layout = file_rule(header), header.made_for or 400, layout_of(header)
+    rule, size, layout = file_rule(header), header.screen_size or 400, layout_of(header)
     best = score(source, scene, gaussians, size, rule)
     yield {"scene": name, "format": ".ply", "megabytes": path.stat().st_size / 1e6, "psnr": best, "cost": 0.0}
     for known in FORMATS:
@@ -64,7 +64,7 @@ def picture(source: Source, scene: Scene, path: Path, target: Path) -> None:
     gaussians, header = open_gaussians(str(path))
     axes = upright_axes(source.volume, header.up)
     camera = default_views("test", size=EDGE)[PICTURED]
-    size = header.made_for or EDGE
+    size = header.screen_size or EDGE
     sheet = preview(scene, to_box_frame(gaussians, source.volume), [camera], axes, file_rule(header).at(EDGE / size))
     Image.fromarray(np.rint(255 * sheet).astype(np.uint8)).save(target, quality=QUALITY)
 

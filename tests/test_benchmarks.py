@@ -274,7 +274,7 @@ def test_plan(bench, scenes, tmp_path):
 
 def test_refinement(bench, scenes, tmp_path):
     steps = {"ours": (0, 2), "adam": (2,), "3dgs": (2,), "ivr-gs": (2,)}
-    module = bench("refinement", K=40, SIZE=SIZE, ADAM_STEPS=2, BASE_VIEWS=2, MOST_VIEWS=2, STEPS=steps)
+    module = bench("refinement", K=40, SIZE=SIZE, ADAM_STEPS=2, BASE_VIEWS=2, MAX_VIEWS=2, STEPS=steps)
     call(module.main, "equal", *scenes, "-o", tmp_path / "a.csv")
     assert float(rows_of(tmp_path / "a.csv")[0]["closed_form"]) > 10
     call(module.main, "curve", *scenes, "-o", tmp_path / "b.csv")

@@ -46,7 +46,7 @@ def test_convert_leaves_file_report_and_preview(converted):
     gaussians, header = read_ply(folder / "a.ply")
     assert 0 < len(gaussians) <= 300
     assert (header.frame, header.up, header.unit_distance_label) == ("unit", "none", "automatic")
-    assert (header.made_for, header.rule) == (48, "inria")
+    assert (header.screen_size, header.rule) == (48, "inria")
     assert np.abs(gaussians.means).max() < 1.2
     report = json.loads((folder / "a.json").read_text())
     assert (report["format"], report["schema"], report["command"]) == ("vvgt-conversion", 1, "convert")

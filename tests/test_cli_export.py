@@ -18,7 +18,7 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 
 from vvgt_cli.network import export as ex  # noqa: E402
-from vvgt_cli.network.checkpoint import Checkpoint, load_checkpoint, save_checkpoint  # noqa: E402
+from vvgt_cli.network.checkpoint import NetworkCheckpoint, load_checkpoint, save_checkpoint  # noqa: E402
 from vvgt_cli.network.model import Vvgt  # noqa: E402
 
 
@@ -31,7 +31,7 @@ def fresh(config=FED):
 def made(tmp_path_factory):
     """A checkpoint with weights everywhere, and its model, exported by the command; to be read only."""
     folder = tmp_path_factory.mktemp("export")
-    trained = Checkpoint(ex.randomised(fresh()), {"volumes": 3}, {"gain": 1.5}, "abc123")
+    trained = NetworkCheckpoint(ex.randomised(fresh()), {"volumes": 3}, {"gain": 1.5}, "abc123")
     save_checkpoint(folder / "tiny.pt", trained)
     assert run(["export", str(folder / "tiny.pt"), "-o", str(folder / "tiny"), "--quiet"]) == 0
     return folder
@@ -83,7 +83,7 @@ def test_float16_storage_halves_the_weights(made, traced):
 
 
 def test_a_head_that_is_zero_is_not_compared_as_it_is(made, traced, tmp_path):
-    save_checkpoint(tmp_path / "zero.pt", Checkpoint(fresh()))
+    save_checkpoint(tmp_path / "zero.pt", NetworkCheckpoint(fresh()))
     card = ex.export_model(tmp_path / "zero.pt", tmp_path / "zero")
     heads = [network.geometry.head.last.weight.abs().max() > 0 for network in traced]
     assert heads == [True, False]
@@ -92,7 +92,7 @@ def test_a_head_that_is_zero_is_not_compared_as_it_is(made, traced, tmp_path):
 
 
 def test_graphs_that_differ_are_not_written(traced, tmp_path):
-    save_checkpoint(tmp_path / "other.pt", Checkpoint(ex.randomised(ex.randomised(fresh()))))
+    save_checkpoint(tmp_path / "other.pt", NetworkCheckpoint(ex.randomised(ex.randomised(fresh()))))
     refused(DataError, "differs from torch", ex.export_model, tmp_path / "other.pt", tmp_path / "other")
     assert [path.name for path in tmp_path.iterdir()] == ["other.pt"]
 
@@ -114,7 +114,7 @@ class _Pickled:
 
 
 def _document():
-    return Checkpoint(fresh(TINY)).to_dict()
+    return NetworkCheckpoint(fresh(TINY)).to_dict()
 
 
 def _changed(document, **changes):
@@ -138,7 +138,7 @@ BROKEN = {
     "unknown": (lambda: _other_state(lambda s: s.update(extra=torch.zeros(1))), "1 unknown"),
     "shape": (lambda: _other_state(lambda s: s.update({"geometry.head.norm.weight": torch.zeros(3)})), "norm.weight"),
     "nan": (lambda: _other_state(lambda s: s["geometry.head.norm.weight"].fill_(np.nan)), "not finite"),
-    "no 3D side": (lambda: Checkpoint(fresh(replace(TINY, variant="wo_3dt"))).to_dict(), "wo_3dt"),
+    "no 3D side": (lambda: NetworkCheckpoint(fresh(replace(TINY, variant="wo_3dt"))).to_dict(), "wo_3dt"),
 }
 
 

@@ -164,7 +164,7 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
     write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], world)
     vvgt.ok("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q")
     far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
-    assert (same[1].made_for, same[1].rule) == (
+    assert (same[1].screen_size, same[1].rule) == (
         read_cameras(folder / "views" / "transforms_train.json")[0].width,
         "inria",
     )

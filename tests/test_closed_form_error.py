@@ -9,7 +9,7 @@ from tests.closed_form_scenes import Ramp, scene_of, score
 from tests.test_closed_form_tree import some_tree
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, cut_by_error, initialise
-from vvgt_cli.closed_form.closed_form import FEW, LEAST, MOST, SHARED, UNSEEN, scores_by_error, unseen
+from vvgt_cli.closed_form.closed_form import FEW, MAX_FACTOR, MIN_FACTOR, SHARED, UNSEEN, scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights
 from vvgt_cli.closed_form.tree import select, split_score
 from vvgt_cli.dvr import RenderSettings, render_views
@@ -58,7 +58,7 @@ def test_scores_against_sums_cell_by_cell(tree) -> None:
         return (wrong / mean + prior * outer) / (foretold + prior)
 
     for cell in np.random.default_rng(1).choice(len(tree), 200, replace=False):
-        assert found[cell] == pytest.approx(told[cell] * np.clip(factor(cell), LEAST, MOST), rel=1e-9)
+        assert found[cell] == pytest.approx(told[cell] * np.clip(factor(cell), MIN_FACTOR, MAX_FACTOR), rel=1e-9)
 
 
 def test_cells_go_where_the_error_is(tree) -> None:

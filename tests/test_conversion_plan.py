@@ -17,7 +17,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import view_count
-from vvgt_cli.defaults import MOST_STEPS, STEPS
+from vvgt_cli.defaults import MAX_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import Workload, expected_wide
@@ -132,7 +132,7 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
     assert stages["views"].note.startswith("24 of 200 px")
     assert "blocks" in stages["check views"].note
     header = read_ply(tmp_path / "a.ply")[1]
-    assert (header.made_for, header.rule) == (600, "inria")
+    assert (header.screen_size, header.rule) == (600, "inria")
     other = done(tmp_path, FitOptions(600, 600, steps=48, rule="playcanvas"), overwrite=True)
     by = {(condition["rule"], condition["size"]): condition["psnr"] for condition in report.conditions}
     assert {(condition["rule"], condition["size"]): condition["psnr"] for condition in other.conditions}[
@@ -202,6 +202,18 @@ def darkened(g):
     return Gaussians(g.means, g.log_scales, g.quaternions, g.opacity_logits, 0.1 * g.colors)
 
 
+@pytest.mark.parametrize(
+    ("page", "text"),
+    [
+        ("README.md", "(the default, {} steps)"), ("docs/python.md", "1080 px and {} steps"),
+        ("docs/optimize.md", "Then follow {} steps"), ("docs/scale.md", "`--steps` ({})"),
+        ("docs/commands/convert.md", "takes [{} steps]"),
+    ],
+)  # fmt: skip
+def test_pages_state_the_default_number_of_steps(page: str, text: str) -> None:
+    assert text.format(STEPS) in (Path(__file__).parents[1] / page).read_text("utf-8")
+
+
 @pytest.mark.parametrize(("steps", "before"), [(1, True), (23, True), (24, False)])
 def test_few_steps_are_taken_after_back_projection(steps, before, tmp_path):
     assert (of(plan(steps=steps), BackProjection) is not None) is before
@@ -216,10 +228,10 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
     steps = [steps_of(found) for found in taken]
     assert steps == sorted(steps)
     assert steps[0] == 0
-    assert 8 <= steps[3] < steps[-1] == MOST_STEPS
+    assert 8 <= steps[3] < steps[-1] == MAX_STEPS
     for found, seconds in zip(taken[2:], (9, 10, 15, 20, 30, 100), strict=True):
         assert found.seconds <= seconds
-        assert of(found, Refinement).most == MOST_STEPS
+        assert of(found, Refinement).most == MAX_STEPS
     assert of(taken[0], BackProjection) is None
     assert {name for name, _ in taken[0].skipped} == {"refinement", "back-projection"}
     assert steps_of(plan(time_budget=30, steps=40)) == 40
@@ -278,7 +290,7 @@ def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatc
         return plan_of(self, workload, *rest, **begun)
 
     monkeypatch.setattr(Planner, "plan", note)
-    monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.made())))
+    monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.current())))
     done(tmp_path, FitOptions(1000, 48))
     assert made[0] < 300
     assert seen == [1000, made[0]]
@@ -328,7 +340,7 @@ def test_a_target_between_ends_refinement_when_it_is_reached(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=before + 1), overwrite=True)
     assert report.refinement["reason"] == "target"
     assert report.refinement["psnr_after"] >= before + 1
-    assert report.refinement["steps"] < MOST_STEPS
+    assert report.refinement["steps"] < MAX_STEPS
 
 
 def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
@@ -359,7 +371,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
     with pytest.raises(AssertionError, match="before the one that makes them"):
-        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).made()
+        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).current()
 
 
 def test_the_default_refines_and_reports_what_it_skipped(tmp_path):

@@ -13,7 +13,7 @@ from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.conversion.shards.run import scored_views
 from vvgt_cli.dvr import RenderSettings, render_view
-from vvgt_cli.dvr.render import FIT_VIEWS, Box, camera_arrays
+from vvgt_cli.dvr.render import FIT_VIEWS, BoxFrame, camera_arrays
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import Boxes, piece_edge
@@ -130,7 +130,7 @@ def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
 
 
 def cast_of(camera, half=1.0, step=0.02):
-    eye, basis, lens = camera_arrays(Box(np.full(3, half), np.full(3, step)), camera)
+    eye, basis, lens = camera_arrays(BoxFrame(np.full(3, half), np.full(3, step)), camera)
     rows, columns = np.indices((camera.height, camera.width))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
     return KernelBundle(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))

@@ -73,13 +73,13 @@ def errors(before: Gaussians, after: Gaussians) -> tuple[float, ...]:
 @pytest.mark.parametrize("up", ["none", "x", "-y"])
 def test_what_is_written_is_read_again(known, up, tmp_path):
     before, path = cloud(), tmp_path / f"a{known.suffix}"
-    options = PlyOptions(up=up, made_for=300, rule="spark", unit_distance=2.5, unit_distance_label="given")
+    options = PlyOptions(up=up, screen_size=300, rule="spark", unit_distance=2.5, unit_distance_label="given")
     path.write_bytes(encoded(known, before, options, path.name))
     assert path.read_bytes() == encoded(known, before, options, path.name) or known.suffix in (".usdc", ".usdz")
     gaussians, header = read_splats(path)
     found = errors(before, in_unit_frame(gaussians, header))
     assert all(a <= b for a, b in zip(found, ROUNDED[known.suffix], strict=True)), found
-    assert (header.made_for, header.rule, header.unit_distance) == (300, "spark", 2.5)
+    assert (header.screen_size, header.rule, header.unit_distance) == (300, "spark", 2.5)
     assert header.up == ("z" if up == "none" and known.suffix == ".html" else up)
 
 
@@ -232,7 +232,7 @@ def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
 
 
 def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
-    write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
+    write_ply(tmp_path / "a.ply", cloud(), PlyOptions(screen_size=64))
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
         result = vvgt.ok("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
         found = re.search(r"([\d.]+|inf) dB from the Gaussians before writing, 3 views of 64 px", result.err)
@@ -327,9 +327,10 @@ def test_spz_4_of_splat_transform_is_read(transform, tmp_path):
 
 def test_records_of_spz_4(tmp_path):
     known = format_of("a.v4.spz")
-    content = known.write(splats_of(cloud(60), PlyOptions(up="x", rule="compensated", made_for=100)), "a")
+    content = known.write(splats_of(cloud(60), PlyOptions(up="x", rule="compensated", screen_size=100)), "a")
     assert content[14] & 1  # antialiased
-    assert gzip.decompress(encoded(format_of("a.spz"), cloud(60), PlyOptions(rule="compensated", made_for=9), "a"))[14]
+    options = PlyOptions(rule="compensated", screen_size=9)
+    assert gzip.decompress(encoded(format_of("a.spz"), cloud(60), options, "a"))[14]
     axes = content.index(struct.pack("<II", 0xADBE0003, 4))
     assert content[axes + 8] == 6  # right, down, front
 

@@ -223,8 +223,8 @@ def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:
     stream = io.BytesIO()
     gaussians = read_ply(io.BytesIO(ply(GOOD)))[0]
     write_ply(stream, gaussians, PlyOptions())
-    content = encoded(format_of("a.compressed.ply"), gaussians, PlyOptions(made_for=321, rule="spark"), "a")
+    content = encoded(format_of("a.compressed.ply"), gaussians, PlyOptions(screen_size=321, rule="spark"), "a")
     (tmp_path / "a.compressed.ply").write_bytes(content)
     _, header = read_splats(tmp_path / "a.compressed.ply")
-    assert (header.made_for, header.rule) == (321, "spark")
+    assert (header.screen_size, header.rule) == (321, "spark")
     assert header.version is not None

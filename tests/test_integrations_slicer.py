@@ -48,7 +48,7 @@ def test_arguments_are_taken_as_slicer_gives_them(vvgt, tmp_path) -> None:
     words = ("--tf", tmp_path / "tf.json", "--layer", tmp_path / "b.npy", "--max_gaussians", 300, "--size", 64)
     result = vvgt.ok("--slicer", *words, tmp_path / "a.npy", tmp_path / "out_1.ply")
     header = read_ply(tmp_path / "out_1.ply")[1]
-    assert header.made_for == 64
+    assert header.screen_size == 64
     assert 100 < header.count <= 300
     assert "distinct colours" in result.err
     lines = result.out.decode().splitlines()

@@ -173,7 +173,7 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
     saved(better, tmp_path / "better.ply")
     gaussians, header = vvgt.read_ply(tmp_path / "better.ply")
     np.testing.assert_allclose(gaussians.means, better.gaussians.means, atol=1e-6)
-    assert header.made_for == 48
+    assert header.screen_size == 48
     converted.save(tmp_path / "start.ply")
     file = vvgt.optimize(tmp_path / "start.ply", tmp_path / "views", steps=20)
     assert saved(file, tmp_path / "file.ply") == (tmp_path / "better.ply").read_bytes()

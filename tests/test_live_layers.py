@@ -15,7 +15,7 @@ from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
 from tests.test_page_live import compare, options
-from vvgt_cli.commands.live_site import Cloud
+from vvgt_cli.commands.live_site import ServedCloud
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
@@ -64,7 +64,7 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
             Palette.of_labels(organs.labels, 0.02),
         )
     )
-    laid = options(live=replace(first, others=(other, organs)), up="none", made_for=300)
+    laid = options(live=replace(first, others=(other, organs)), up="none", screen_size=300)
     compare(baked(some, table), laid, table, tmp_path)
 
 
@@ -234,11 +234,11 @@ def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
 
 def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     """As `recolor` shows the file under the same looks: what the page sends is of each layer."""
-    cloud = Cloud.of((pair / "live.ply").read_bytes(), "live")
+    cloud = ServedCloud.of((pair / "live.ply").read_bytes(), "live")
     other = TF | {"opacity_unit_distance": 2.0}
     labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
     sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
-    saved = cloud.with_layers(sent)
+    saved = cloud.with_looks(sent)
     facts = saved.options.live
     assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
     assert facts.layers[2].labels[0].opacity == 0.25
@@ -249,7 +249,7 @@ def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
     assert thinner.mean() > 0.4  # opacity is per twice the distance
     for wrong in (sent[:2], [labels, *sent[1:]], [*sent[:2], {"function": other}], None):
         with pytest.raises(vvgt_library.DataError):
-            cloud.with_layers(wrong)
+            cloud.with_looks(wrong)
 
 
 def test_channels_in_python(tmp_path) -> None:

@@ -47,7 +47,7 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
     scene = scene_of(content)
     live = scene["live"]
     assert [frame["name"] for frame in scene["frames"]] == ["frame 0", "frame 1", "frame 2"]
-    assert live["held"] == ["values-0", "values-1", "values-2"]
+    assert live["elements"] == ["values-0", "values-1", "values-2"]
     largest = []
     for k in range(3):
         some, header = read_ply(tmp_path / f"f_{k}.ply")
@@ -67,10 +67,10 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
 
 
 def test_a_page_of_many_frames_is_bounded(vvgt, frames, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(series, "MOST_LIVE", 100)
+    monkeypatch.setattr(series, "MAX_LIVE", 100)
     done = vvgt("convert", frames / "f?.npy", "--live", "-o", tmp_path / "p.html", *SMALL)
     assert (done.code, "3 frames on one page: 33 Gaussians each, fewer than --max-gaussians" in done.err) == (0, True)
-    assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["held"]) == 3
+    assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["elements"]) == 3
 
 
 def test_a_series_in_python_is_live(frames, tmp_path) -> None:
@@ -79,7 +79,7 @@ def test_a_series_in_python_is_live(frames, tmp_path) -> None:
     assert isinstance(clouds, vvgt_library.Clouds)
     assert len(clouds["f1.npy"].recolor("magma").gaussians)
     clouds.save(tmp_path / "p.html")
-    assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["held"]) == 3
+    assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["elements"]) == 3
     blocked = vvgt_library.convert(str(frames / "f?.npy"), "viridis", goal, live=True, blocks=16)
     assert isinstance(blocked, vvgt_library.Clouds)
     assert [cloud.ply.live for cloud in blocked.values()] == [cloud.ply.live for cloud in clouds.values()]

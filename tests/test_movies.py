@@ -34,7 +34,7 @@ def ply(tmp_path):
     means = rng.uniform(-0.7, 0.7, (40, 3))
     colors = np.round(rng.uniform(0, 1, (40, 3)))
     gaussians = Gaussians(means, np.full((40, 3), -2.2), np.tile((1, 0, 0, 0), (40, 1)), np.full(40, 3), colors)
-    write_ply(tmp_path / "a.ply", gaussians, PlyOptions(made_for=64))
+    write_ply(tmp_path / "a.ply", gaussians, PlyOptions(screen_size=64))
     return gaussians, tmp_path / "a.ply"
 
 
@@ -168,7 +168,7 @@ def test_files_of_gaussians_are_a_movie_over_time(ply, tmp_path, vvgt):
     """Each is where its volume is, seen by the first file's camera and rule; an empty one is black."""
     gaussians = replace(ply[0], log_scales=ply[0].log_scales - 2)  # thin: what they look like depends on the rule
     up = replace(orbit_views(1, size=64)[0], rotation=orbit_views(1)[0].rotation @ upright_matrix("x"))
-    options = PlyOptions(scale=1.0, centre=(0, 0, 0), up="x", made_for=64, rule="compensated")
+    options = PlyOptions(scale=1.0, centre=(0, 0, 0), up="x", screen_size=64, rule="compensated")
     write_ply(tmp_path / "f_8", gaussians, options)
     write_ply(tmp_path / "f_9", gaussians, replace(options, scale=2.0, centre=(0.1, 0, 0), up="none", rule="inria"))
     head = (tmp_path / "f_8").read_bytes().partition(b"end_header")[0].replace(b"vertex 40", b"vertex 0")

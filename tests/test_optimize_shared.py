@@ -91,7 +91,7 @@ def test_what_is_linear_in_the_features_is_foretold(count):
     samples = found.solver.shape[1]
     assert off.max() < 3 * 9 * steps.FEATURES / samples
     assert samples <= 2 * shared.SAMPLE
-    assert (found.features < shared.MOST).mean() > 0.99  # 8 bits are enough
+    assert (found.features < shared.MAX_FEATURE).mean() > 0.99  # 8 bits are enough
 
 
 def test_a_step_with_shares_and_floors_is_that_of_the_twin():

@@ -185,7 +185,7 @@ def test_the_pages_program_exposes_an_x_ray_as_we_do(tf: TransferFunction, tmp_p
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
 def test_the_pages_program_shows_gaussians_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
     table = Table.of_function(tf, LO, HI, 0.05, GRAIN)
-    compare(baked(cloud(), table), options(live=facts(tf), up="none", made_for=300), table, tmp_path)
+    compare(baked(cloud(), table), options(live=facts(tf), up="none", screen_size=300), table, tmp_path)
 
 
 def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> None:

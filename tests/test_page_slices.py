@@ -1,6 +1,7 @@
 """Slices of the volume on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
 
 import base64
+import gzip
 import json
 import re
 from dataclasses import replace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians.formats.page_slices import packed, slices_of, unpacked
+from vvgt_cli.gaussians.formats.page_slices import packed, slices_of
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
 from vvgt_cli.volume.stored import Stored
@@ -20,13 +21,26 @@ HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
 TURNED = (0.8, -0.6, 0.0, -0.6, -0.8, 0.0, 0.0, 0.0, 1.0)  # oblique, and mirrored
 
 
-def held(page: Path) -> list[tuple[dict[str, Any], np.ndarray]]:
+def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
+    """Decode values (nz, ny, nx) float64, NaN where unknown, or numbers in the list of labels, -1 for none."""
+    size = facts["bits"] // 8
+    planes = np.frombuffer(gzip.decompress(content), np.uint8).reshape(size, -1)
+    folded = np.ascontiguousarray(planes.T).view(f"<u{size}").reshape(facts["dims"][::-1])
+    steps = (folded >> 1) ^ (0 - (folded & 1))
+    codes = np.cumsum(steps, axis=2, dtype=folded.dtype).astype(np.int64)
+    if "labels" in facts:
+        return codes - 1
+    codes -= facts["missing"]
+    return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)
+
+
+def grids_in(page: Path) -> list[tuple[dict[str, Any], np.ndarray]]:
     """Facts and decoded values of each grid that a page holds."""
     text = page.read_text("utf-8")
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
     found = []
     for facts in scene.get("slices", ()):
-        content = re.search(rf'id="{facts["held"]}">([^<]+)</script>', text)[1]
+        content = re.search(rf'id="{facts["element"]}">([^<]+)</script>', text)[1]
         found.append((facts, unpacked(base64.b64decode(content), facts)))
     return found
 
@@ -163,7 +177,7 @@ def test_codes_are_packed_without_loss(dtype):
 
 
 def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MOST", 64)
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MAX_CELLS", 64)
     data = np.zeros((8, 8, 8), np.uint16)
     data[3:5], data[5:7], data[7:] = 7, 300, 9  # 9 is not in the table
     table = LabelTable("t", (Label(0, "air", (0, 0, 0), 0.0), Label(7, "<b>", (1, 0, 0)), Label(300, "c", (0, 1, 0))))
@@ -192,20 +206,20 @@ def test_pages_hold_what_the_conversion_shows_in_memory_and_in_blocks(vvgt, scan
     page = scan / "page.html"
     done = vvgt.ok("convert", scan / "scan.nii.gz", "-o", page, *HOW)
     assert "slices of the volume (14 x 16 x 18 voxels)" in done.err
-    [(facts, values)] = held(page)
+    [(facts, values)] = grids_in(page)
     assert (values.max(), facts["dims"]) == (999, [14, 16, 18])
     vvgt.ok("convert", scan / "scan.nii.gz", "--blocks", "16", "-o", scan / "blocks.html", *HOW)
-    assert held(scan / "blocks.html")[0][0] == facts
-    np.testing.assert_array_equal(held(scan / "blocks.html")[0][1], values)
+    assert grids_in(scan / "blocks.html")[0][0] == facts
+    np.testing.assert_array_equal(grids_in(scan / "blocks.html")[0][1], values)
     for how in (("--mask", scan / "mask.nii.gz"), ("--crop", "3:11,3:13,3:15")):
         for more in ((), ("--blocks", "16")):
             vvgt.ok("convert", scan / "scan.nii.gz", *how, *more, "-o", page, *HOW)
-            [(facts, values)] = held(page)
+            [(facts, values)] = grids_in(page)
             assert np.nanmax(values) < 200  # nothing from outside
             assert np.isfinite(values).sum() == 8 * 10 * 12
     assert facts["affine"][3] == -3  # where it was
     none = vvgt("convert", scan / "scan.nii.gz", "--no-slices", "-o", page, *HOW)
-    assert (none.code, held(page), "slices" in none.err) == (0, [], False)
+    assert (none.code, grids_in(page), "slices" in none.err) == (0, [], False)
 
 
 @pytest.mark.parametrize("form", [(), ("--live",), ("--no-live",)])
@@ -219,7 +233,7 @@ def test_a_page_within_its_size_has_coarser_slices_before_fewer_gaussians(vvgt, 
     for limit in ("9MB", "1.1MB", "1MB"):
         done = vvgt.ok(*given, "--max-size", limit, "-o", page)
         sizes.append(page.stat().st_size)
-        grids.append(held(page)[0][0]["dims"])
+        grids.append(grids_in(page)[0][0]["dims"])
         counts.append(re.findall(r"page\.html: (\d+) Gaussians", done.err)[-1])
     assert grids[0] == [64, 64, 64]
     assert grids[0] > grids[1] > grids[2]
@@ -244,19 +258,19 @@ def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.request.SIZE", 32)  # of `view`
     page, layer = scan / "both.html", ("--layer", f"{scan / 'labels.nii.gz'},labels=auto")
     vvgt.ok("convert", scan / "scan.nii.gz", *layer, "--live", "-o", page, *HOW[:4])
-    (_, values), (facts, rows) = held(page)
+    (_, values), (facts, rows) = grids_in(page)
     assert np.isfinite(values).all()
     assert (rows >= 0).sum() == 3 * 5 * 5
     assert len(facts["labels"]) == 1
     alone = vvgt.ok("view", scan / "labels.nii.gz", "--labels", "auto", "-o", page, "--overwrite", "--no-live")
     assert "names of 1 label," in alone.err
-    assert [set(np.unique(rows)) for _, rows in held(page)] == [{-1, 0}]
+    assert [set(np.unique(rows)) for _, rows in grids_in(page)] == [{-1, 0}]
     assert "--no-slices" in vvgt.fails(2, "view", scan / "scan.nii.gz", "--no-slices")
     live = vvgt.ok("convert", scan / "labels.nii.gz", "--labels", "auto", "--live", "--overwrite", "-o", page, *HOW[:4])
     assert "both.html holds Gaussians, names of 1 label," in live.err
     two = ("--tf", "gray", "--tf", "viridis")
     vvgt.ok("convert", scan / "scan.nii.gz", *two, "-o", page, *HOW)
-    assert held(page) == []
+    assert grids_in(page) == []
 
 
 def test_results_have_slices_in_files_and_cells(scan):
@@ -264,10 +278,10 @@ def test_results_have_slices_in_files_and_cells(scan):
 
     result = vvgt.convert(str(scan / "scan.nii.gz"), goal={"max_gaussians": 60, "size": 32, "steps": 0})
     result.save(scan / "result.html", editor=False)
-    [(facts, values)] = held(scan / "result.html")
+    [(facts, values)] = grids_in(scan / "result.html")
     assert values.shape == (18, 16, 14)
-    assert facts["held"] in result._repr_html_()
+    assert facts["element"] in result._repr_html_()
     result.save(scan / "result.html", slices=False)
-    assert held(scan / "result.html") == []
+    assert grids_in(scan / "result.html") == []
     result.save(scan / "result.html", comments=False)
-    assert held(scan / "result.html") == []
+    assert grids_in(scan / "result.html") == []

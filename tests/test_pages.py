@@ -21,7 +21,7 @@ def clouds(page: Path) -> dict[str, np.ndarray]:
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
     found = {}
     for frame in scene["frames"]:
-        content = re.search(rf'id="{frame["held"]}">([^<]+)</script>', text)[1]
+        content = re.search(rf'id="{frame["element"]}">([^<]+)</script>', text)[1]
         found[frame["name"]] = np.sort(read_compressed_ply(base64.b64decode(content), "page").logits)
     assert len(found) == len(scene["frames"])
     return found
@@ -189,8 +189,8 @@ def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path
         return dict(json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1]))
 
     both = scene("both.html", "v.npy")
-    assert both["converted"]["held"] == "splats-0"
-    assert both["frames"][0]["held"] == "live-0"
+    assert both["converted"]["element"] == "splats-0"
+    assert both["frames"][0]["element"] == "live-0"
     assert len(both["live"]["layers"][0]["nodes"]) > 1
     vvgt.ok("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW)
     assert same(np.sort(read_splats(tmp_path / "both.html")[0].opacity_logits), tmp_path / "v.ply")

@@ -11,7 +11,7 @@ from vvgt_cli.commands import report
 from vvgt_cli.commands.peers import Peer
 from vvgt_cli.errors import UsageError
 from vvgt_cli.score.charts import draw
-from vvgt_cli.score.curves import Series, psnr
+from vvgt_cli.score.curves import ReportRuns, psnr
 
 SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
 MAKE = """
@@ -87,8 +87,8 @@ def test_places_are_filled_in_within_words() -> None:
 
 def test_a_page_marks_peers_and_vtks_own_picture() -> None:
     every = [*runs(), run("Brush", "Brush", "peer", 90_000, 300.0, 35.0, 0), run("live", "live", "live", 9, 4, 30.0, 0)]
-    one = Series("x", every, document(runs=every, vtk_psnr=48.0))
-    other = Series("y", runs(), document())
+    one = ReportRuns("x", every, document(runs=every, vtk_psnr=48.0))
+    other = ReportRuns("y", runs(), document())
     for series, there in (([one], {"peer", "live", "VTK"}), ([other], {"steps"}), ([one, other], {"x", "y", "peer"})):
         for chart in draw(series)[:3]:
             legend = {text.get_text() for text in chart.figure.axes[0].get_legend().get_texts()}

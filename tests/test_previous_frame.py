@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import held_frames, patch, patched
+from vvgt_cli.gaussians.formats.page_frames import patch, stored_frames
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
@@ -34,6 +35,16 @@ TF = {"points": [
     {"x": 100, "rgb": [1, 1, 0.9], "opacity": 0.3},
 ]}  # fmt: skip
 HOW = ("--max-gaussians", "400", "--size", "96", "--steps", "30")
+
+
+def patched(base: bytes, runs: bytes) -> bytes:
+    """Apply a `patch` to ``base``."""
+    out, at = bytearray(base), 0
+    while at < len(runs):
+        place, length = struct.unpack_from("<II", runs, at)
+        out[place : place + length] = runs[at + 8 : at + 8 + length]
+        at += 8 + length
+    return bytes(out)
 
 
 def body(radius: float) -> np.ndarray:
@@ -206,7 +217,7 @@ def rows(file: Path) -> np.ndarray:
 def test_frames_share_what_stands_still_whatever_their_comments_say():
     gaussians = random_cloud(600, 1, 0.05, 0.3, (0.0, 1.0))
     clouds = [(f"{k}", splats_of(gaussians, PlyOptions(function="f" * n))) for k, n in enumerate((3, 12, 5, 12))]
-    held = held_frames(clouds)
+    held = stored_frames(clouds)
     assert [frame.whole for frame in held] == [None, 0, 0, 0]
     for (name, splats), (content, _) in zip(clouds[1:], held[1:], strict=True):
         found = read_compressed_ply(patched(held[0].content, content), name)
@@ -240,7 +251,7 @@ def check_page(folder: Path) -> None:
     """The page holds what the files do, and the frames that go on as little as differs."""
     text = (folder / "f.html").read_text("utf-8")
     frames = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])["frames"]
-    held = [base64.b64decode(re.search(rf'id="{frame["held"]}">([^<]*)</script>', text)[1]) for frame in frames]
+    held = [base64.b64decode(re.search(rf'id="{frame["element"]}">([^<]*)</script>', text)[1]) for frame in frames]
     assert [frame.get("whole") for frame in frames] == [None, 0, 0, 0]
     whole = [held[0], *(patched(held[0], runs) for runs in held[1:])]
     for k, content in enumerate(whole):

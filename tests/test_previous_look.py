@@ -8,7 +8,7 @@ import pytest
 import vvgt_cli as vvgt
 from tests.refused import refused
 from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
-from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recolor_earlier
+from vvgt_cli.conversion.previous_look import MAX_RATIO, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
@@ -94,7 +94,7 @@ def test_another_light_and_another_size(session, earlier):
     assert unlit.report.refinement["standard"] == earlier.report.refinement["psnr_after"]  # by itself, not the last
     small = {**GOAL, "size": 64}
     assert started_warm(other := session.convert(SHELL, small, after=earlier))
-    assert other.ply.made_for == 64
+    assert other.ply.screen_size == 64
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_depth_goes_with_extinction(session, earlier):
     seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
     ratio = np.log1p(-opacity(found)[seen]) / np.log1p(-opacity(before)[seen])
     assert np.median(ratio) == pytest.approx(np.log1p(-0.2) / np.log1p(-0.4), rel=0.15)
-    assert ratio.min() >= 1 / MOST
+    assert ratio.min() >= 1 / MAX_RATIO
     assert replace(found, means=before.means).degree == 0
     assert to_unit_frame(found, thin.field.source.volume).means.shape == before.means.shape
 

@@ -11,11 +11,11 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.shards.regions import Part, RegionNodes
+from vvgt_cli.conversion.shards.regions import RegionNodes, VolumePart
 from vvgt_cli.dvr import RenderSettings, render_view
-from vvgt_cli.dvr.render import Box as Frame
+from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
-from vvgt_cli.field.reader import Place, Scalars
+from vvgt_cli.field.reader import Scalars, VolumeOrigin
 from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
@@ -50,19 +50,21 @@ def files_in(folder: Path) -> dict[Path, bytes]:
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def moved(camera: Camera, part: Part) -> Camera:
+def moved(camera: Camera, part: VolumePart) -> Camera:
     """The same camera in the frame of a part."""
     eye = (camera.position - part.centre) * part.scale
     return replace(camera, translation=-camera.rotation @ eye)
 
 
-def parts_of(path: Path, light: str | None, *edges: tuple[int, int]) -> tuple[list[Part], Scene]:
+def parts_of(path: Path, light: str | None, *edges: tuple[int, int]) -> tuple[list[VolumePart], Scene]:
     """Parts between ``edges`` along x, and the scene of the volume."""
     source = load(SourceRequest(str(path), light=LightOptions(lights=() if light is None else (light,))))
     scene, dims = source.scene(), source.volume.dims
-    reader = Scalars(Place(str(path), ReadOptions()), kernel_rule(source.volume, lambda: (0, 255)), scene.optics)
-    frame = Frame(scene.half, scene.step)
-    made = [Part(reader, frame, dims, np.array([a, 0, 0]), np.array([b, *dims[1:]]), scene.light) for a, b in edges]
+    reader = Scalars(VolumeOrigin(str(path), ReadOptions()), kernel_rule(source.volume, lambda: (0, 255)), scene.optics)
+    frame = BoxFrame(scene.half, scene.step)
+    made = [
+        VolumePart(reader, frame, dims, np.array([a, 0, 0]), np.array([b, *dims[1:]]), scene.light) for a, b in edges
+    ]
     return made, scene
 
 

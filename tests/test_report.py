@@ -20,7 +20,7 @@ from vvgt_cli.score.charts import FILES, draw, log_ticks
 from vvgt_cli.score.curves import (
     OTHER,
     STAGES,
-    Series,
+    ReportRuns,
     cost,
     knee,
     pareto,
@@ -253,7 +253,7 @@ def test_ticks_lie_within_and_are_some():
 
 
 def test_charts_name_every_run_and_follow_the_page():
-    charts = draw([Series("s", runs(), document(vtk_psnr=41.0))])
+    charts = draw([ReportRuns("s", runs(), document(vtk_psnr=41.0))])
     for chart, file in zip(charts, FILES, strict=True):
         drawn = chart.svg()
         assert chart.file == file
@@ -268,13 +268,13 @@ def test_charts_name_every_run_and_follow_the_page():
             assert len({r["label"] for r in runs()} & set(texts)) >= 7
         colors = set(re.findall("#[0-9a-f]{6}", re.sub("<title>.*?</title>", "", drawn)))
         assert colors <= {*STAGES.values(), OTHER}  # others are the page's, light or dark
-    assert draw([Series("s", runs()[:1])])[0].svg().count("<title>") == 1
-    again = draw([Series("s", runs(), document(vtk_psnr=41.0))])
+    assert draw([ReportRuns("s", runs()[:1])])[0].svg().count("<title>") == 1
+    again = draw([ReportRuns("s", runs(), document(vtk_psnr=41.0))])
     assert [chart.svg() for chart in charts] == [chart.svg() for chart in again]
 
 
 def test_labels_in_charts_are_separate_and_inside():
-    for chart in draw([Series("s", runs())])[:3]:
+    for chart in draw([ReportRuns("s", runs())])[:3]:
         axes = chart.figure.axes[0]
         boxes = [note.get_window_extent() for note in axes.texts]
         assert len(boxes) >= 7
@@ -287,7 +287,7 @@ def test_names_cannot_break_out_of_the_page():
     for one in bad["runs"]:
         one["name"] = "</script><img src=x onerror=alert(1)>"
     pictures = Pictures([0], [b"png"], [[b"png"]] * len(bad["runs"]))
-    one = [Series("<i>", bad["runs"], bad)]
+    one = [ReportRuns("<i>", bad["runs"], bad)]
     reader = Reader(page(one, draw(one), "<u>", pictures))
     assert reader.tags.count("img") == 4
     assert reader.tags.count("script") == 2

@@ -267,14 +267,14 @@ def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_
     from vvgt_cli.field.block_store import COUNTS, BlockStore
     from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
-    from vvgt_cli.field.reader import Place
+    from vvgt_cli.field.reader import VolumeOrigin
 
     merged = []
     for slices in (1, 7, 80):
         store = BlockStore(tmp_path / str(slices))
         (store.folder / COUNTS).mkdir(parents=True)
         task = CountBlocks(
-            Place(str(raw), ReadOptions(stored=True)), Boxes((100, 90, 80), (64, 64, 64)), slices, store, COUNTS
+            VolumeOrigin(str(raw), ReadOptions(stored=True)), Boxes((100, 90, 80), (64, 64, 64)), slices, store, COUNTS
         )
         for number in range(len(task)):
             task(number)

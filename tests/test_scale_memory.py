@@ -1,5 +1,9 @@
 """What blocks read and keep: slices of TIFF page by page, every voxel once, no more than a worker's memory."""
 
+import gc
+import weakref
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
@@ -107,7 +111,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "open_content", lambda source, options: Content((volume,)))
     store = BlockStore(tmp_path)
     (store.folder / COUNTS).mkdir()
-    place = reader.Place("counted once", ReadOptions(stored=True))
+    place = reader.VolumeOrigin("counted once", ReadOptions(stored=True))
     task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24, store, COUNTS)
     for number in range(len(task)):
         task(number)
@@ -132,8 +136,6 @@ def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
 
 
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):
-    import weakref
-
     from vvgt_cli.field import tiled_tree
 
     values, made = np.round(bodies((128, 90, 120)) * 255).astype(np.uint8), []
@@ -149,3 +151,38 @@ def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, mon
     monkeypatch.setattr(tiled_tree, "build_tree", watched)
     vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     assert len(made) > 6
+
+
+@pytest.mark.parametrize("blocks", [None, BlockOptions(16)])
+@pytest.mark.parametrize("live", [False, True])
+def test_a_converted_volume_is_released_at_once(monkeypatch, blocks, live):
+    """In a batch, volumes that wait for Python's search for cycles are in memory together."""
+    from matplotlib import colormaps  # whose first import keeps exceptions, with the frames of its callers
+
+    from vvgt_cli.conversion import convert_batch
+    from vvgt_cli.conversion.batch import Functions
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.progress import Console
+
+    opened, fields, alive = convert_batch.open_field, [], []
+
+    @contextmanager
+    def open_field(run, request):
+        alive.append(sum(one() is not None for one in fields))
+        with opened(run, request) as field:
+            fields.append(weakref.ref(field))
+            yield field
+
+    monkeypatch.setattr(convert_batch, "open_field", open_field)
+    fit = FitOptions(200, size=64, steps=None if live else 2)
+    source = SourceRequest("example:marschner-lobb:16", tf=colormaps["viridis"].name)
+    one = ConvertRequest(source, fit=fit, blocks=blocks, live=live)
+    gc.disable()
+    try:
+        convert_batch._run(
+            Functions([(name, one, name) for name in "abc"]), convert_batch.Memory(), Console(quiet=True)
+        )
+    finally:
+        gc.enable()
+    assert alive == [0, 0, 0]

@@ -39,7 +39,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
     """Write what a frame's function and values come to in place of converting it; returns the calls."""
     calls: list = []
 
-    def write(request, console, made=None, start=None) -> ConversionReport:
+    def write(request, console, finished=None, start=None) -> ConversionReport:
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
@@ -131,7 +131,7 @@ def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, serie
 
 
 def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(request, console, made=None, start=None) -> ConversionReport:
+    def interrupted(request, console, finished=None, start=None) -> ConversionReport:
         Path(request.output).write_text("short")
         return ConversionReport("convert", refinement={"reason": "interrupted"})
 

@@ -16,10 +16,10 @@ from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.view import streamed_resources
 from vvgt_cli.conversion.index import named_files
-from vvgt_cli.conversion.shards.cut import Node
+from vvgt_cli.conversion.shards.cut import CutNode
 from vvgt_cli.conversion.shards.level_selection import CutErrors, level_errors
-from vvgt_cli.conversion.shards.regions import Made, save
-from vvgt_cli.conversion.shards.streamed import Part, WrittenFiles, divide
+from vvgt_cli.conversion.shards.regions import StoredGaussians, save
+from vvgt_cli.conversion.shards.streamed import FilePart, WrittenFiles, divide
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
@@ -219,7 +219,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
 def test_files_hold_neighbouring_nodes_of_one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 10)
     parts, places = divide(np.array([[6, 1], [5, 2], [12, 4], [1, 3]]))
-    assert parts == (Part(0, 0, 0, 2), Part(1, 0, 0, 4), Part(0, 1, 2, 3), Part(0, 2, 3, 4))
+    assert parts == (FilePart(0, 0, 0, 2), FilePart(1, 0, 0, 4), FilePart(0, 1, 2, 3), FilePart(0, 2, 3, 4))
     assert [lods[0]["offset"] for lods in places] == [0, 6, 0, 0]
     assert [lods[0]["file"] for lods in places] == [0, 0, 2, 3]
     assert [lods[1]["offset"] for lods in places] == [0, 1, 3, 7]
@@ -231,10 +231,10 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
         columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 1, 3)]
         gaussians = Gaussians(*columns[:3], columns[3][:, 0], columns[4])
         store.prepare("closed")
-        save(store, "closed", 0, [Node([gaussians], [np.ones(2)], None)], {})
+        save(store, "closed", 0, [CutNode([gaussians], [np.ones(2)], None)], {})
         parts, places = divide(np.array([[50]]))
         assert places == [[{"file": 0, "offset": 0, "count": 50}]]
-        task = WrittenFiles(Made(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
+        task = WrittenFiles(StoredGaussians(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
         task.forget_changed()
         Pass(InProcess(), store, lambda _: None)(task, "write")
         assert task.size(0) == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())

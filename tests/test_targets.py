@@ -67,7 +67,7 @@ def test_what_is_given_wins_over_the_target():
 def test_the_size_limit_is_of_files_that_have_one(output, given, limit):
     request = ConvertRequest(SourceRequest(BLOB), output, FitOptions(10_000_000, target="phone"), **given)
     assert request.megabytes == limit
-    assert replace(request, several=True).megabytes == request.limits.max_megabytes
+    assert replace(request, shares_output=True).megabytes == request.limits.max_megabytes
     if limit is None:
         assert request.budget() == 10_000_000
     elif output == "a.ply":

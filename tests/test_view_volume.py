@@ -25,8 +25,8 @@ from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands import view
-from vvgt_cli.commands.converter import Converter, Failed, Start
-from vvgt_cli.commands.live_site import Cloud, PageController, parse_function, plain_name
+from vvgt_cli.commands.converter import Converter, Failed, Setup
+from vvgt_cli.commands.live_site import PageController, ServedCloud, parse_function, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion import convert_batch
 from vvgt_cli.conversion.live import apply_light
@@ -103,7 +103,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         assert scene["slices"] == {"from": "slices.json"}
         assert scene["live"]["layers"][0]["values"][1] == pytest.approx(0.9, abs=0.1)
         path = urlsplit(url).path
-        assert len(Cloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
+        assert len(ServedCloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
         # a function: the next one ends the work for it
         assert send(url, "function", {**FUNCTION, "name": "first"}) == (200, b'{"number": 2}')
         first = set(workers(child.pid))
@@ -124,7 +124,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         assert header.live is None
         assert header.up == "z"
         status, saved = send(url, "save", {"file": "ply", "number": 4})
-        kept = Cloud.of(saved, "x")
+        kept = ServedCloud.of(saved, "x")
         assert status == 200
         assert (kept.options.up, kept.options.unit_distance) == ("none", 0.1)
         assert kept.options.light == Lighting(True, (), 0.2, 1.0, 0.0, 4.0)
@@ -133,7 +133,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         assert len(read_html(send(url, "save", {"file": "html", "number": 4})[1], "x")) == len(shown_now)
         # the live form under the function, as a file that is live
         status, saved = send(url, "save", {"file": "ply", "function": FUNCTION})
-        live = Cloud.of(saved, "x")
+        live = ServedCloud.of(saved, "x")
         assert live.live
         assert live.options.live.baked()["name"] == "mine"
         assert b'"live"' in send(url, "save", {"file": "html", "function": FUNCTION})[1]
@@ -200,7 +200,7 @@ def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Pat
         assert process.stdout is not None
         if ready:  # the input stays open: it is the answers that nobody hears
             process.stdout.close()
-            pickle.dump(Start(SourceRequest("example:blob:12"), "blob", None), process.stdin)
+            pickle.dump(Setup(SourceRequest("example:blob:12"), "blob", None), process.stdin)
             pickle.dump((1, None), process.stdin)
             process.stdin.flush()
         else:
@@ -223,7 +223,7 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
     some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     found.converter = Still(SourceRequest("none"), "x", found.on_message)
     found.resources["state"] = Resource("application/json", found._state_json)
-    found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
+    found.show(ServedCloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
     with served(site) as url:
         yield url, found
 
@@ -297,11 +297,11 @@ def test_a_saved_live_file_has_the_colours_of_the_function(controller: tuple[str
         "points": [{"x": LO, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": HI, "rgb": [0, 0, 1], "opacity": 0.4}],
         "opacity_unit_distance": 0.5,
     }
-    saved = Cloud.of(send(controller[0], "save", {"file": "ply", "function": function})[1], "x")
+    saved = ServedCloud.of(send(controller[0], "save", {"file": "ply", "function": function})[1], "x")
     wanted = baked(live_cloud(), Table.of_function(parse_function(function), LO, HI, 0.05, GRAIN), pixel_width(SIZE))
     np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
-    plain = Cloud.of(send(controller[0], "save", {"file": "ply"})[1], "x")
+    plain = ServedCloud.of(send(controller[0], "save", {"file": "ply"})[1], "x")
     assert np.abs(plain.gaussians.colors - wanted.colors).max() > 0.1
 
 
@@ -319,8 +319,8 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple
     table = Table.of_function(parse_function(FUNCTION), LO, HI, 0.1 * 0.1, GRAIN)
     dark = baked(live_cloud(), table, pixel_width(SIZE))
 
-    def saved(**more: Any) -> Cloud:
-        return Cloud.of(send(url, "save", {"file": "ply", "function": FUNCTION, **more})[1], "x")
+    def saved(**more: Any) -> ServedCloud:
+        return ServedCloud.of(send(url, "save", {"file": "ply", "function": FUNCTION, **more})[1], "x")
 
     kept = saved()
     assert kept.options.light == side

@@ -65,8 +65,8 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
         length = float((high - low).max() + 6 * np.median(sigma))
     alpha, largest = opacity(gaussians), sigma.max(axis=1)
 
-    def share(of: np.ndarray) -> float:
-        return float(np.average(of, weights=np.maximum(alpha, 1e-12)))
+    def share(values: np.ndarray) -> float:
+        return float(np.average(values, weights=np.maximum(alpha, 1e-12)))
 
     def faint() -> Figure:
         return Figure("share of Gaussians", float(np.mean(alpha < MIN_ALPHA)), 0.5)
@@ -97,9 +97,9 @@ def place_cases(
         rule: to draw by at that size.
     """
 
-    def share(of: Gaussians) -> float:
-        beyond = (np.abs(of.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
-        return float(np.average(beyond, weights=opacity(of) + 1e-12))
+    def share(cloud: Gaussians) -> float:
+        beyond = (np.abs(cloud.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
+        return float(np.average(beyond, weights=opacity(cloud) + 1e-12))
 
     def outside() -> Figure:
         found, other = share(gaussians), share(world)

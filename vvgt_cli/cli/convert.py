@@ -22,7 +22,7 @@ from vvgt_cli.cli.options import (
 )
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import ASIDE, command_line, typed
-from vvgt_cli.defaults import RULE
+from vvgt_cli.defaults import MAX_STEPS, RULE, STEPS
 from vvgt_cli.progress import Console
 
 
@@ -46,8 +46,8 @@ from vvgt_cli.progress import Console
 @rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
-    help="Maximum number of gradient descent steps; 0 for none. Default: 152, or up to 400 with a target or "
-    "time budget.",
+    help=f"Maximum number of gradient descent steps; 0 for none. Default: {STEPS}, or up to {MAX_STEPS} with a target "
+    "or time budget.",
 )  # fmt: skip
 @click.option(
     "--live/--no-live", default=None,

@@ -30,7 +30,7 @@ from vvgt_cli.closed_form.tree import (
     value_score,
 )
 from vvgt_cli.closed_form.visibility import Visibility, visibility
-from vvgt_cli.dvr.render import Box
+from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
@@ -194,7 +194,7 @@ def form_of(
     ``progress`` is called with the completed share.
     """
     report = progress or (lambda share: None)
-    box = Box(half, step)
+    box = BoxFrame(half, step)
     cameras = cameras or default_views("train", size=MARCH_SIZE)
     seen = visibility(box, cells, cameras, progress=lambda share: report(0.5 * share))
     if values:
@@ -302,7 +302,7 @@ def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, ru
     return total / len(cameras)
 
 
-LEAST, MOST = 0.25, 30.0  # times the mean that an error counts at a score: what is flat keeps cells for other views
+MIN_FACTOR, MAX_FACTOR = 0.25, 30.0  # times the mean, for errors at a score: what is flat keeps cells for other views
 UNSEEN = 0.08  # of the mean blending weight in views: Gaussians below are hidden (0.1: fogs lose, 0.05: less gain)
 SHARED = 1.0  # mean scores that the cells above count for: an error of few pixels says little
 
@@ -337,7 +337,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         factor[level] = np.where(
             predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
         )
-    result: np.ndarray = score * np.clip(factor, LEAST, MOST)
+    result: np.ndarray = score * np.clip(factor, MIN_FACTOR, MAX_FACTOR)
     return result
 
 

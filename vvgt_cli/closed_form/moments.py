@@ -23,7 +23,7 @@ FINEST_CUT = -4
 POINTS = 2  # of quadrature a voxel and axis
 WIDE = 1  # exponent of cells under whose voxels it is asked where the function is straight
 CHUNK_CELLS, CHUNK_BLOCKS = 1 << 17, 16  # cells of the dense scratch buffer; blocks at least
-MOST_CELLS = 32  # along the edge of a block that is made a cube of cells
+MAX_CELLS = 32  # along the edge of a block that is made a cube of cells
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     cell = 2.0**exponent
     cells = np.round(np.maximum(BRICK, cell) / cell).astype(np.int64)
-    if cells.max() <= MOST_CELLS:
+    if cells.max() <= MAX_CELLS:
         cells[:] = cells.max()
     return np.round(cells * cell).astype(np.int64), cells
 

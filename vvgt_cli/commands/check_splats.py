@@ -92,7 +92,7 @@ def open_splats(
         comments = tuple(c for c in columns.comments if c.split()[:2] not in (["vvgt", LIVE], ["vvgt", CERTIFICATE]))
         stored, header = gaussians_of(replace(columns.take(np.flatnonzero(good)), comments=comments), file)
         gaussians = in_unit_frame(stored, header)
-    size = header.made_for or SIZE
+    size = header.screen_size or SIZE
     about = {"file": file.rpartition("/")[2], "gaussians": len(columns), "size": size, "rule": file_rule(header).name}
     cases = list(row_cases(columns, good))
     if source is None:

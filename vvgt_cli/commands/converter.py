@@ -83,7 +83,7 @@ Message = ConsoleLine | Progress | Converted | Scored | Failed
 
 
 @dataclass(frozen=True)
-class Start:
+class Setup:
     """Initial message to the process.
 
     Attributes:
@@ -180,7 +180,7 @@ class Converter:
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Start(self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
+            pickle.dump(Setup(self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import IO, Any, NoReturn
 
-from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Start
-from vvgt_cli.commands.live_site import Cloud, page_files, stored
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
+from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
 from vvgt_cli.conversion.convert import convert_in_memory, open_field
 from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.live import convert_live, live_refusal
@@ -71,7 +71,6 @@ class LoadedVolume:
         """Read the volume, unless it is better processed in blocks."""
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
-        self.table: LabelTable | None = None  # the labels to begin with
         self.last: PreviousLook | None = None  # what the next conversion goes on from
         if automatic(source, Console(quiet=True)) is None:  # `open_field` reports it
             console.bar("reading")
@@ -86,7 +85,6 @@ class LoadedVolume:
             why = live_refusal(request, field.source) or _missing()
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
-                self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
                 console.send(self._with_page(convert_live(run, request, field, ply, scored=False)))
                 return
         console.message(f"converted without a live form: {why}")
@@ -98,7 +96,7 @@ class LoadedVolume:
         look, light = job
         source = replace(self.source, light=light or self.source.light)
         if isinstance(look, LabelTable):
-            source = replace(source, labels=self._labels(look))
+            source = replace(source, labels=look)
         else:
             lit = replace(look, lighting=self.lighting)
             source = replace(source, tf=lit, tf_range="data", unit_distance=None)
@@ -113,16 +111,9 @@ class LoadedVolume:
         console.send(Scored(_file(conversion), conversion.scores["psnr"]))
         return conversion
 
-    def _labels(self, sent: LabelTable) -> LabelTable:
-        """Return the volume's labels with the colours and opacities of ``sent``."""
-        assert self.table is not None
-        new = {label.number: label for label in sent.labels}
-        labels = tuple(replace(new.get(label.number, label), name=label.name) for label in self.table.labels)
-        return replace(self.table, labels=labels)
-
     def _with_page(self, conversion: Conversion) -> Converted:
         """Return a conversion with its page: the libraries that a page needs are loaded here already."""
-        cloud = Cloud.of(_file(conversion), self.name)
+        cloud = ServedCloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
         sliced = not all(layer.colors for layer in conversion.field.source.layers)
         return Converted(cloud.ply, page_files(cloud, converts=True, sliced=sliced), cloud.live)
@@ -152,7 +143,7 @@ def main() -> None:
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
     try:
-        start: Start = pickle.load(orders)
+        start: Setup = pickle.load(orders)
     except Exception:
         _exit(folder)
     set_memory(start.memory)

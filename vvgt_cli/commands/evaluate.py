@@ -132,7 +132,7 @@ def _cell(value: Any) -> str:
 @contextmanager
 def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
     """Open the volume, by default in the file's own anatomical space, light and unit distance."""
-    size, asked = request.size or header.made_for or SIZE, request.source.light
+    size, asked = request.size or header.screen_size or SIZE, request.source.light
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
@@ -185,11 +185,11 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     """
     if header.live is None or (request.labels is None and request.tf is None and not request.layers):
         return gaussians
-    held = ["labels" if one.labels else "values" for one in header.live.layers]
+    carried = ["labels" if one.labels else "values" for one in header.live.layers]
     shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]
-    if held != shown:
+    if carried != shown:
         raise UsageError(
-            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(held)}; expected the volume and "
+            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
             "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
         )
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
@@ -243,7 +243,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
     from vvgt_cli.images import write_png
 
     source = volume.source
-    size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)
+    size, rule = request.size or header.screen_size or SIZE, file_rule(header, request.rule)
     with run.stage("reference") as stage:
         own = _reference_psnr(volume, size, request.step)
         stage.note = f"its own error {own:.1f} dB"
@@ -287,7 +287,7 @@ def _look_around(
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
     with run.stage("conditions") as stage, _together(volume, wanted):
         seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))
-        conditions = score_conditions(gaussians, seen, own=rule.name)
+        conditions = score_conditions(gaussians, seen, headset=rule.name)
         evaluation.conditions = [asdict(condition) for condition in conditions]
         stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]

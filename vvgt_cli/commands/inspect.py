@@ -22,7 +22,7 @@ from vvgt_cli.gaussians import as_ply, describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
-from vvgt_cli.gaussians.formats.page_live import HELD
+from vvgt_cli.gaussians.formats.page_live import VALUES_ID
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
@@ -210,8 +210,8 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
         if len(content.volumes) > 1:
             facts["channels"] = len(content.volumes)
         elif volume.data.nbytes <= CHEAP:
-            numbers = statistics(volume)
-            facts["range"] = [numbers.lo, numbers.hi]
+            stats = statistics(volume)
+            facts["range"] = [stats.lo, stats.hi]
     except VvgtError as error:
         facts["error"] = " ".join(str(error).split())[:200]
     return facts
@@ -227,8 +227,8 @@ def _channels(content: Content) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"choice": f"--channel {k}", "name": content.names[k] if content.names else ""}
         row |= {"color": [round(v, 4) for v in channel_color(k, content.colors[k])]}
         if volume.data.nbytes <= CHEAP:
-            numbers = statistics(volume)
-            row["range"] = [numbers.lo, numbers.hi]
+            stats = statistics(volume)
+            row["range"] = [stats.lo, stats.hi]
         rows.append(row)
     return rows
 
@@ -262,7 +262,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         with suppress(DataError):  # a header that says less of its segments than colours need
             one = content.layer
             kinds["segments"] = _entries(read_labels(file) if one is None else segments_of(file, one))
-    numbers = statistics(volume)
+    stats = statistics(volume)
     return {
         "kind": "volume",
         "name": volume.name,
@@ -282,12 +282,12 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "extent": volume.extent,
         "scaling": [volume.slope, volume.intercept],
         **({"modality": volume.modality} if volume.modality else {}),
-        "range": [numbers.lo, numbers.hi],
-        "nan": numbers.nan_count,
-        "inf": numbers.inf_count,
+        "range": [stats.lo, stats.hi],
+        "nan": stats.nan_count,
+        "inf": stats.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
         **listed,
-        **({} if kinds else {"tf": fitting(numbers, volume)}),
+        **({} if kinds else {"tf": fitting(stats, volume)}),
     }
 
 
@@ -314,7 +314,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
     text = Path(file).read_text("utf-8") if page else ""
-    live = bool(layers) or f'id="{HELD}-0"' in text
+    live = bool(layers) or f'id="{VALUES_ID}-0"' in text
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
     scanned = header.space in ("RAS", "LPS")

@@ -7,7 +7,7 @@ import io
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -26,14 +26,14 @@ from vvgt_cli.gaussians.formats.page_live import Extras, live_page_data, parse_l
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, baked
-from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
+from vvgt_cli.gaussians.live_facts import MAX_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.label_files import table_of
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import triple
 
 JSON, BYTES, HTML = "application/json", "application/octet-stream", "text/html; charset=utf-8"
 SLICES = "slices.json"
@@ -47,7 +47,7 @@ def stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class ServedCloud:
     """Gaussians that a page shows.
 
     Attributes:
@@ -63,7 +63,7 @@ class Cloud:
     ply: bytes | None = None
 
     @classmethod
-    def of(cls, ply: bytes, name: str) -> Cloud:
+    def of(cls, ply: bytes, name: str) -> ServedCloud:
         """Read a `.ply`."""
         gaussians, header = open_gaussians(io.BytesIO(ply))
         return cls(gaussians, layout_of(header), name, ply)
@@ -73,7 +73,7 @@ class Cloud:
         """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str, live: Cloud | None = None, slices: Slices | None = None) -> Resource:
+    def file(self, suffix: str, live: ServedCloud | None = None, slices: Slices | None = None) -> Resource:
         """Return the file to save, in the format of an ending; ``live`` is the form for the editor of a page."""
         extras = Extras(None if live is None or not live.live else (live.gaussians, live.options), slices)
         if (other := format_of(f"x.{suffix}")) is not None:
@@ -83,55 +83,11 @@ class Cloud:
             return Resource(BYTES, lambda: self.ply or b"")
         return Resource(BYTES, lambda: as_ply(self.gaussians, self.options))
 
-    def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
-        """Return the cloud under a function on data values with a unit distance, and a light (None: the file's).
+    def with_looks(self, sent: Any, light: Any = None) -> ServedCloud:
+        """Return the cloud under other looks of its layers and a light (None: the file's).
 
-        Raise DataError for several layers or labels, DataError or UsageError for an invalid light.
-        """
-        facts = self._alone("a function")
-        table, facts = self._function(facts, tf)
-        distance = tf.opacity_unit_distance
-        options = replace(
-            self.options, live=facts, unit_distance=distance, unit_distance_label="file", function=tf.name
-        )  # fmt: skip
-        return self._shown(table, light, options)
-
-    def _alone(self, what: str) -> LiveFacts:
-        """Return the facts about the values of the only layer; refuse several."""
-        facts = self.options.live
-        if facts is None or facts.others:
-            raise DataError(f"the cloud has several layers; expected a look for each instead of {what}")
-        return facts
-
-    def _function(self, facts: LiveFacts, tf: TransferFunction, several: int = 1) -> tuple[Table, LiveFacts]:
-        """Return a layer's table and facts under a function."""
-        if facts.labels:
-            raise DataError("the cloud carries labels; expected labels, not a function")
-        assert tf.opacity_unit_distance is not None
-        distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
-        table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
-        return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
-
-    def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
-        """Return a layer's palette and facts under labels that a page sends."""
-        entries = {label.number: label for label in parse_labels(sent).labels}
-        if sorted(entries) != sorted(label.number for label in facts.labels):
-            raise DataError("the page's labels differ from the cloud's; expected all of these")
-        labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
-        return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
-
-    def with_labels(self, sent: Any, light: Any = None) -> Cloud:
-        """Return the cloud with other colours and opacities of its labels (``sent`` as in `parse_labels`).
-
-        Raises:
-            DataError, UsageError: labels or a light that are not valid, or labels of another cloud.
-        """
-        palette, facts = self._labels(self._alone("labels"), sent, self.options.unit_distance or 1.0)
-        check_labels([LabelTable("the page's labels", facts.labels)])
-        return self._shown(palette, light, replace(self.options, live=facts))
-
-    def with_layers(self, sent: Any, light: Any = None) -> Cloud:
-        """Return the cloud with other looks of its layers; ``sent`` has a function or labels for each.
+        ``sent`` lists, for each layer, an object with a function or with labels, as `parse_function` and `parse_labels`
+        have them.
 
         Raises:
             DataError, UsageError: looks or a light that are not valid, or looks of other layers.
@@ -139,48 +95,56 @@ class Cloud:
         layers = () if self.options.live is None else self.options.live.layers
         if not isinstance(sent, list) or len(sent) != len(layers) or not all(isinstance(one, dict) for one in sent):
             raise DataError(f"the page's layers: expected a list of {len(layers)} looks, each a function or labels")
-        tables, facts = list[Table | Palette](), list[LiveFacts]()
-        for layer, one in zip(layers, sent, strict=True):
-            if "labels" in one:
-                palette, own = self._labels(layer, one["labels"], layer.distance or 1.0)
-                tables.append(palette)
-                facts.append(own)
-                continue
-            tf = parse_function(one.get("function"))
-            table, own = self._function(layer, tf, len(layers))
-            tables.append(table)
-            facts.append(replace(own, distance=tf.opacity_unit_distance))
+        looks = [self._look(layer, one, len(layers)) for layer, one in zip(layers, sent, strict=True)]
+        facts = [one for _, one in looks]
         if all(one.labels for one in facts):
             check_labels([LabelTable("the page's labels", one.labels) for one in facts])
-        live = replace(facts[0], others=tuple(facts[1:]))
-        options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
-        return self._shown(LayerTables(tuple(tables)), light, options)
+        live, tables = replace(facts[0], others=tuple(facts[1:])), [table for table, _ in looks]
+        options = replace(self.options, live=live)
+        if live.function or live.others:
+            options = replace(options, unit_distance=live.distance, unit_distance_label="file")
+        if live.function and not live.others:
+            options = replace(options, function=live.baked().get("name"))
+        return self._shown(LayerTables(tuple(tables)) if live.others else tables[0], light, options)
 
-    def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
+    def _look(self, layer: LiveFacts, sent: dict[str, Any], layer_count: int) -> tuple[Table | Palette, LiveFacts]:
+        """Return a layer's table and facts under a look that a page sends."""
+        scale = self.options.scale or 1.0
+        if "labels" in sent:
+            labels, distance = parse_labels(sent["labels"], layer.labels).labels, layer.distance
+            distance = distance or self.options.unit_distance or 1.0
+            return Palette.of_labels(labels, distance * scale), replace(layer, labels=labels, distance=distance)
+        if layer.labels:
+            raise DataError("the cloud carries labels; expected labels, not a function")
+        tf = parse_function(sent.get("function"))
+        assert tf.opacity_unit_distance is not None
+        table = Table.of_function(tf, layer.lo, layer.hi, tf.opacity_unit_distance * scale, layer.grain)
+        text = function_text(tf, layer.lo, layer.hi, layer_count)
+        return table, replace(layer, function=text, distance=tf.opacity_unit_distance)
+
+    def _shown(self, table: Looks, light: Any, options: PlyOptions) -> ServedCloud:
         """Return the cloud baked under looks and a light: the page's, or else the file's."""
         from vvgt_cli.conversion.live import apply_light
 
         lighting = self.options.light if light is None else parse_light(light, self.options)
-        pixel = pixel_width(self.options.made_for or SIZE)
+        pixel = pixel_width(self.options.screen_size or SIZE)
         found = as_stored(apply_light(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
         return replace(self, gaussians=found, options=options, ply=None)
 
 
-def parse_labels(sent: Any) -> LabelTable:
-    """Return the labels of a page, a list of number, color (RGB in [0, 1]) and opacity, or raise DataError."""
+def parse_labels(sent: Any, known: Sequence[Label]) -> LabelTable:
+    """Return the labels of a cloud as a page sends them: a list of number, color (RGB in [0, 1]) and opacity.
+
+    Raise DataError for another list, or labels of another cloud.
+    """
     what = "the page's labels"
-    if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
-        raise DataError(f"{what}: expected a list of at most {MOST_LABELS} objects")
-    found = []
-    for entry in sent:
-        number, color, opacity = entry.get("number"), entry.get("color"), entry.get("opacity")
-        if not isinstance(number, int) or not isinstance(color, list) or len(color) != 3:
-            raise DataError(f"{what}: expected number, color (three numbers) and opacity")
-        if not all(isinstance(x, int | float) and 0 <= x <= 1 for x in (*color, opacity)):
-            raise DataError(f"{what}: label {number}; expected color and opacity in [0, 1]")
-        found.append(Label(number, str(number), triple(list(map(float, color))), float(opacity)))
-    return LabelTable(what, tuple(sorted(found, key=lambda label: label.number)))
+    if not isinstance(sent, list) or not 0 < len(sent) <= MAX_LABELS or not all(isinstance(e, dict) for e in sent):
+        raise DataError(f"{what}: expected a list of at most {MAX_LABELS} objects")
+    looks = {label.number: label for label in table_of({str(one.get("number")): one for one in sent}, what).labels}
+    if sorted(looks) != sorted(label.number for label in known):
+        raise DataError(f"{what} differ from the cloud's; expected all of these")
+    return LabelTable(what, tuple(replace(looks[label.number], name=label.name) for label in known))
 
 
 def parse_function(sent: Any) -> TransferFunction:
@@ -196,7 +160,7 @@ def parse_function(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
+def page_files(cloud: ServedCloud, converts: bool, sliced: bool = False) -> dict[str, bytes]:
     """Return the text of a page, named "", and the file that it loads; raise DataError if a library is missing.
 
     It ``converts`` a volume for functions if that has a single layer, and shows its slices if it is ``sliced``.
@@ -207,8 +171,8 @@ def page_files(cloud: Cloud, converts: bool, sliced: bool = False) -> dict[str, 
     else:
         [splats], [planes], facts = live_page_data([(cloud.gaussians, cloud.options)])
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
-        held = base64.b64encode(planes).decode("ascii")
-        elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
+        encoded_planes = base64.b64encode(planes).decode("ascii")
+        elements = f'<script type="{BYTES}" id="{facts["elements"][0]}">{encoded_planes}</script>\n{SCRIPT}'
         more = {"live": facts, "server": {"converts": converts and len(facts["layers"]) == 1, "name": cloud.name}}
     if sliced:
         more["slices"] = {"from": SLICES}
@@ -231,7 +195,7 @@ class PageController:
         """Create the state of a page without Gaussians."""
         self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
-        self.first: Callable[[], Cloud] | None = None
+        self.first: Callable[[], ServedCloud] | None = None
         self.read_slices: Callable[[], Slices | None] = lambda: None
         self._reading = threading.Lock()
         self.better: bytes | None = None
@@ -251,7 +215,7 @@ class PageController:
         with converter.lock:
             converter.submit(None)
 
-    def show(self, cloud: Cloud) -> None:
+    def show(self, cloud: ServedCloud) -> None:
         """Show the Gaussians of a file, live if possible."""
         self.first = lambda: cloud
         try:
@@ -283,7 +247,7 @@ class PageController:
         found = self.slices()
         if found is None:
             raise DataError("slices: the volume has colours; expected values or labels")
-        contents = {key: base64.b64encode(content).decode("ascii") for key, content in found.held.items()}
+        contents = {key: base64.b64encode(content).decode("ascii") for key, content in found.elements.items()}
         return json.dumps({"facts": found.facts, "contents": contents}).encode()
 
     def function(self, sent: Any) -> Resource:
@@ -297,7 +261,10 @@ class PageController:
         job: Job = None
         if sent is not None:
             light = sent.pop("light", None) if isinstance(sent, dict) else None
-            look = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
+            live = self.first().options.live
+            known = () if live is None else live.labels
+            labelled = isinstance(sent, dict) and "labels" in sent
+            look = parse_labels(sent["labels"], known) if labelled else parse_function(sent)
             check_labels([look])
             job = look, None if light is None else LightOptions.of(parse_light(light, self.first().options))
         with self.converter.lock:
@@ -330,16 +297,13 @@ class PageController:
             raise DataError("that conversion was replaced by another; try again")
         assert self.first is not None
         cloud = self.first()
-        if sent.get("function") is not None and cloud.live:
-            cloud = cloud.with_function(parse_function(sent["function"]), sent.get("light"))
-        if sent.get("labels") is not None and cloud.live:
-            cloud = cloud.with_labels(sent["labels"], sent.get("light"))
-        if sent.get("layers") is not None and cloud.live:
-            cloud = cloud.with_layers(sent["layers"], sent.get("light"))
+        looks = sent.get("layers") or [{key: sent[key]} for key in ("function", "labels") if sent.get(key) is not None]
+        if looks and cloud.live:
+            cloud = cloud.with_looks(looks, sent.get("light"))
         slices = self.slices() if sent["file"] == "html" else None
         if number is None or better is None:
             return cloud.file(sent["file"], slices=slices)
-        conversion = Cloud.of(better, self.name)
+        conversion = ServedCloud.of(better, self.name)
         if not {"function", "labels"} & set(sent):
             return conversion.file(sent["file"], slices=slices)
         options = replace(cloud.options, certificate=conversion.options.certificate)
@@ -365,7 +329,7 @@ class PageController:
             self._better(number, message)
 
     def _first(self, made: Converted) -> None:
-        self.first = cache(lambda: Cloud.of(made.ply, self.name))
+        self.first = cache(lambda: ServedCloud.of(made.ply, self.name))
         self._show(made.files, made.live)
         self.state = {"number": 0, "state": "none", "said": ""}
 

@@ -100,7 +100,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
         stage.note = f"{len(train)} training views, {len(check)} check views{held_out}"
     run.compile(for_degree(OPTIMIZE, start.degree))
     edge = train.cameras[0].width
-    size, asked = request.size or header.made_for or edge, file_rule(header, request.rule)
+    size, asked = request.size or header.screen_size or edge, file_rule(header, request.rule)
     rule = asked.at(edge / size)
     options = replace(request.options, rule=rule, judge=rule)
     run.report.options = asdict(request.options) | {
@@ -113,7 +113,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
     if test is not None:
         _score(run, test, start, gaussians, rule)
     degree = header.sh_degree if request.sh_degree is None else request.sh_degree
-    layout = replace(layout_of(header), certificate=None, made_for=size, rule=asked.name, sh_degree=degree)
+    layout = replace(layout_of(header), certificate=None, screen_size=size, rule=asked.name, sh_degree=degree)
     return Result(gaussians, run.report, layout)
 
 

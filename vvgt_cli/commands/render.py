@@ -17,7 +17,7 @@ from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
-from vvgt_cli.conversion.frames import Series, is_glob, is_glob_of_volumes
+from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
@@ -29,7 +29,7 @@ from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.rays import HALO
-from vvgt_cli.field.reader import Box, Scalars
+from vvgt_cli.field.reader import Scalars, VoxelBox
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
@@ -50,7 +50,7 @@ from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
 Seen = Callable[[Camera], Gaussians]  # what a camera is shown
-Part = tuple[Box, np.ndarray, np.ndarray]  # voxels with a halo; the first one (3,) without it, and the end, (x, y, z)
+Part = tuple[VoxelBox, np.ndarray, np.ndarray]  # voxels with a halo; the first (3,) without it, and the end, (x, y, z)
 MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
 
 
@@ -59,7 +59,7 @@ class RenderRequest:
     """Pictures to draw.
 
     Attributes:
-        given: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
+        source: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
             (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie, None for an empty one; or a volume
             or a series of volumes with its look.
         output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
@@ -77,7 +77,7 @@ class RenderRequest:
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
     """
 
-    given: tuple[str | None, ...] | SourceRequest
+    source: tuple[str | None, ...] | SourceRequest
     output: str
     camera: str | None = None
     orbit: int | None = None
@@ -162,7 +162,7 @@ class RenderRequest:
             check_folder(where, "images")
             outputs.append(Output("-o", str(where / VIEWS_FILE)))
         if self.movie or self.png or where.is_dir():
-            inputs = self.given.paths() if isinstance(self.given, SourceRequest) else list(filter(None, self.given))
+            inputs = self.source.paths() if isinstance(self.source, SourceRequest) else list(filter(None, self.source))
             check_outputs(outputs, inputs, self.overwrite)
         return shares
 
@@ -174,7 +174,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         UsageError: an image exists, or the directory cannot be made; views or an output that do not suit the frames.
         DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
     """
-    run, given = Run(console or Console(), ConversionReport("render")), request.given
+    run, given = Run(console or Console(), ConversionReport("render")), request.source
     if not isinstance(given, SourceRequest):
         return _render(run, request, given)
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
@@ -183,12 +183,12 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
             return _render(run, request, [given])
         except SeveralSteps:  # which are the frames
             pass
-    series = Series(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
+    series = FrameSeries(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
     return _render(run, request, series.sources(), series)
 
 
 def _render(
-    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest | None], series: Series | None = None
+    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest | None], series: FrameSeries | None = None
 ) -> int:  # fmt: skip
     """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
     shares = request.check(len(frames))
@@ -199,7 +199,7 @@ def _render(
         start = next((given, share) for given, share in zip(frames, shares, strict=True) if given is not None)
         draw, by, first = _frame(run, request, *start, stack)
         if first is not None:
-            shares = request.views(len(frames), first.made_for, first.up)
+            shares = request.views(len(frames), first.screen_size, first.up)
         cameras, opened = list(chain(*shares)), [draw]
         del draw
 
@@ -235,18 +235,18 @@ def _blank(rule: str | None) -> Draw:
 
 
 def _frame(
-    run: Run, request: RenderRequest, given: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
+    run: Run, request: RenderRequest, source: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
     first: PlyHeader | None = None,
 ) -> tuple[Draw, str, PlyHeader | None]:  # fmt: skip
     """Return the renderer of a frame, its name, and the header of Gaussians; ``first`` is that of the first frame."""
-    if isinstance(given, SourceRequest):
-        return (*_volume(run, request, given, cameras, stack), None)
+    if isinstance(source, SourceRequest):
+        return (*_volume(run, request, source, cameras, stack), None)
     with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request, given, first)
+        seen, gaussians, header = _opened(request, source, first)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
     if request.rule in NAMES:
         edge = 2.0 * header.scale / first.scale if first and first.scale and header.scale else 2.0
-        draw, by = draw_gaussians(given, gaussians, header, request.rule, request.function, edge), request.rule
+        draw, by = draw_gaussians(source, gaussians, header, request.rule, request.function, edge), request.rule
         run.compile(GREY)
     else:
         from vvgt_cli.splat import render
@@ -254,7 +254,7 @@ def _frame(
         rule = file_rule(first or header, request.rule)
         run.compile(for_degree(DRAW, gaussians.degree))
         draw, by = lambda camera: render(seen(camera), camera, rule), rule.name
-    return _placed(draw, given, header, first), by, header
+    return _placed(draw, source, header, first), by, header
 
 
 def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
@@ -325,7 +325,7 @@ def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple
     """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
     manifest, function = by_view(name), None if request.rule in NAMES else request.function
     if manifest is None:
-        several = isinstance(request.given, tuple) and len(request.given) > 1
+        several = isinstance(request.source, tuple) and len(request.source) > 1
         gaussians, header = open_gaussians(name, empty=several)
         if first is not None and (request.rule in NAMES or request.function is not None):
             header = _in_range(name, header, first)
@@ -390,7 +390,7 @@ def mip_of(field: Blocked | Source) -> Draw:
     from vvgt_cli.dvr.scene import kernel_values
 
     values, slope, intercept = kernel_values(source.volume)
-    whole = Box(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
+    whole = VoxelBox(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
     part = whole, whole.begin, np.array(source.volume.dims)
     return lambda camera: grey(_greatest(source, [part], camera))
 
@@ -410,15 +410,14 @@ def _blocks(field: Blocked) -> Iterator[Part]:
 def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarray:
     """Return the mean over a pixel of the greatest values along its rays, (h, w) float32 of the range of values."""
     from vvgt_cli.dvr.march import greatest
-    from vvgt_cli.dvr.render import Box as Frame
-    from vvgt_cli.dvr.render import camera_arrays
+    from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 
     n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
     larger = replace(
         camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
         width=n * camera.width, height=n * camera.height,
     )  # fmt: skip
-    rays = camera_arrays(Frame(np.array(frame.half), np.array(frame.step)), larger)
+    rays = camera_arrays(BoxFrame(np.array(frame.half), np.array(frame.step)), larger)
     out = np.zeros((larger.height, larger.width), np.float32)
     for box, lo, hi in parts:
         faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])

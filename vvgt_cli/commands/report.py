@@ -41,7 +41,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.charts import FILES, draw, write_plots
 from vvgt_cli.score.curves import (
-    Series,
+    ReportRuns,
     cost,
     knee,
     pareto,
@@ -420,7 +420,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
     found: dict[str, Any] = json.loads(text)
-    series = [Series(source.volume.name, runs, found)]
+    series = [ReportRuns(source.volume.name, runs, found)]
     shown = list(map(png_bytes, pictures(reference.shown, PICTURED, request.picture_size)))
     folder.mkdir(exist_ok=True)
     write_text(str(folder / DATA), text, request.overwrite)
@@ -485,13 +485,13 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
     console.message(f"{folder / PAGE}")
 
 
-def _distinct(series: list[Series]) -> list[Series]:
+def _distinct(series: list[ReportRuns]) -> list[ReportRuns]:
     """Add numbers to reports that share a name, and put the report's name before those of its runs."""
     names, found = [one.name for one in series], []
     for n, one in enumerate(series):
         name = one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})"
         runs = [{"label": run["name"], **run, "name": f"{name}: {run['name']}"} for run in one.runs]
-        found.append(Series(name, runs, one.document))
+        found.append(ReportRuns(name, runs, one.document))
     return found
 
 
@@ -511,7 +511,7 @@ def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence
     return folder
 
 
-def _write(folder: Path, series: list[Series], title: str, shown: Pictures | None, overwrite: bool) -> None:
+def _write(folder: Path, series: list[ReportRuns], title: str, shown: Pictures | None, overwrite: bool) -> None:
     write_text(str(folder / TABLE), table([run for one in series for run in one.runs]), overwrite)
     charts = draw(series)
     write_plots(folder, charts, overwrite)

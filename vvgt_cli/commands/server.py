@@ -21,7 +21,7 @@ from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.gaussians.formats.page_file import policy, waiting_page
 
 ADDRESS = "127.0.0.1"
-MOST = 1 << 20  # bytes of what a page may send: a function of 4096 nodes has 400 KB
+MAX_REQUEST = 1 << 20  # bytes of what a page may send: a function of 4096 nodes has 400 KB
 NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -125,7 +125,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("Content-Type") != "application/json" or not re.fullmatch("[0-9]{1,9}", length):
             self.send_error(415)  # which a page of another origin cannot send unasked
             return
-        if int(length) > MOST:
+        if int(length) > MAX_REQUEST:
             self.send_error(413)
             return
         try:

@@ -74,17 +74,17 @@ def suggest_transfer_functions(
     run = Run(console or Console(), ConversionReport("tf suggest"))
     with run.stage("read") as stage:
         grid = read_volume(volume, read)
-        numbers = statistics(grid)
-        stage.note = f"{grid.name}: values {numbers.lo:g} to {numbers.hi:g}"
+        stats = statistics(grid)
+        stage.note = f"{grid.name}: values {stats.lo:g} to {stats.hi:g}"
     with run.stage("suggest") as stage:
-        suggestions = suggest(numbers, count, sum(grid.dims) / 3, sum(grid.spacing) / 3)
+        suggestions = suggest(stats, count, sum(grid.dims) / 3, sum(grid.spacing) / 3)
         folder.mkdir(exist_ok=True)
         for path, suggestion in zip(paths, suggestions, strict=True):
             write_text(str(path), suggestion.to_json(), overwrite)
         stage.note = f"{count} functions in {folder}"
     for path, suggestion in zip(paths, suggestions, strict=True):
         run.console.message(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
-    preset = fitting(numbers, grid)
+    preset = fitting(stats, grid)
     run.console.message(f"preset that fits: --tf {preset}" if preset else "no preset fits ('vvgt tf list')")
     return paths
 
@@ -106,9 +106,9 @@ def show_transfer_function(
         raise UsageError("--tf-range and reading options need --volume")
     check_outputs([Output("-o", output, (".png",))], [tf, volume], overwrite)
     function = read_transfer_function(tf)
-    numbers = None
+    stats = None
     if volume is not None:
         data = read_volume(volume, read)
-        numbers = statistics(data)
-        function = resolve(function, numbers, tf_range, data.hounsfield)
-    draw(function, numbers, output, overwrite)
+        stats = statistics(data)
+        function = resolve(function, stats, tf_range, data.hounsfield)
+    draw(function, stats, output, overwrite)

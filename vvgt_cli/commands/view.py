@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, Cloud, PageController, plain_name, stored
+from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion.gaussian_files import (
     STDIN,
@@ -31,7 +31,7 @@ from vvgt_cli.errors import DataError, NoLiveForm, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
 from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.page_slices import Slices
@@ -190,7 +190,7 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
         _refuse_reading(given, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
-        return gaussians, replace(options, title=request.title or options.title), NOTHING
+        return gaussians, replace(options, title=request.title or options.title), NO_EXTRAS
     from vvgt_cli.conversion.convert import convert_in_memory
     from vvgt_cli.conversion.request import ConvertRequest
 
@@ -198,7 +198,7 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
     conversion = convert_in_memory(
         ConvertRequest(replace(given, volume=name), editor=editor, title=request.title), run.console
     )
-    extras = conversion.extras(editor, request.slices, run) if is_page(request.output) else NOTHING
+    extras = conversion.extras(editor, request.slices, run) if is_page(request.output) else NO_EXTRAS
     return conversion.gaussians, conversion.ply, extras
 
 
@@ -221,7 +221,7 @@ def _serve(
             resources |= _series(clouds)
         elif given:
             gaussians, header = open_gaussians(files[0])
-            controller.show(Cloud(gaussians, layout_of(header), controller.name))
+            controller.show(ServedCloud(gaussians, layout_of(header), controller.name))
         url = stack.enter_context(served(site, request.port))
         if not resources.get(""):
             source = replace(request.source, volume=files[0])

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import NONE, content_of, open_content
+from vvgt_cli.field.layered import content_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
@@ -186,8 +187,8 @@ def options_in(request: ConvertRequest) -> set[str]:
     fit, limits, source = request.fit, request.limits, request.source
     used = {
         "--checkpoint": request.checkpoint, "--report": request.report, "--preview": request.preview,
-        "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--labels none": source.labels == NONE,
-        "--steps": fit.steps, "--model": fit.model, "--rule": fit.rule != INRIA.name,
+        "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--steps": fit.steps,
+        "--model": fit.model, "--rule": fit.rule != INRIA.name, "--labels none": source.labels == NO_LABELS,
         "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
         "--device": fit.device != "cpu", "--for": fit.target,
     }  # fmt: skip

@@ -33,7 +33,7 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
@@ -45,7 +45,7 @@ SMALLER = (8, 4, 2)  # divisors of the budget that a target is tried with first
 
 
 def convert(
-    request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None,
+    request: ConvertRequest, console: Console | None = None, finished: Gaussians | None = None,
     start: WarmStart | None = None,
 ) -> ConversionReport:  # fmt: skip
     """Convert a volume to a file, and return the report; see `run_conversion` for the arguments.
@@ -66,7 +66,7 @@ def convert(
         open_field(run, request) as field,
     ):
         early = _early_writer(run, request)
-        report = _write(run, request, run_conversion(run, request, field, made, start, early), early is not None)
+        report = _write(run, request, run_conversion(run, request, field, finished, start, early), early is not None)
         if request.checkpoint is not None and not report.interrupted:
             Checkpoint(Path(request.checkpoint)).finish()
         return report
@@ -92,7 +92,7 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     with claimed(request.outputs(), request.inputs(), request.overwrite), open_field(run, request, INIT) as field:
         work = Work(run, field, request.fit, degree=degree_of(request, field.source))
         ClosedFormStage().run(work)
-        return _write(run, request, _conversion(request, work, as_stored(work.made())))
+        return _write(run, request, _conversion(request, work, as_stored(work.current())))
 
 
 def plan_conversion(request: ConvertRequest, console: Console | None = None) -> Plan:
@@ -116,11 +116,11 @@ def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
         work, planner, plan = _planned(run, request, field)
         check_memory(plan)
         _fit(work, request, planner, plan)
-        return work.made()
+        return work.current()
 
 
 def run_conversion(
-    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None,
+    run: Run, request: ConvertRequest, field: Field, finished: Gaussians | None = None,
     start: WarmStart | None = None, unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
     """Convert a field: closed form, refinement as planned (`vvgt_cli.conversion.plan`), scores on the test views.
@@ -131,7 +131,7 @@ def run_conversion(
         run: times the stages.
         request: the request.
         field: the volume under its look.
-        made: finished Gaussians, box frame, that only need scores.
+        finished: finished Gaussians, box frame, that only need scores.
         start: warm start that is tried before the closed form.
         unscored: called with the conversion before it has scores and a certificate.
 
@@ -141,27 +141,27 @@ def run_conversion(
     if request.live:
         check_live(request)
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
-    regions = made is None and start is None and isinstance(field, Blocked) and by_regions(request)
+    regions = finished is None and start is None and isinstance(field, Blocked) and by_regions(request)
     if start is not None:
-        field.views = start.views(field.views)
+        field.renderer = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
     report_target(run, work.fit, request.megabytes)
-    if made is not None or regions:
+    if finished is not None or regions:
         finish = planner.finish(work.limits.time_budget is None) if regions else []
-        plan = plan.for_made(plan.gaussians if made is None else len(made), planner.sh_degree, finish)
+        plan = plan.for_finished(plan.gaussians if finished is None else len(finished), planner.sh_degree, finish)
         run.report.plan = plan.record()
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
     if regions and isinstance(field, Blocked):
         from vvgt_cli.conversion.shards.run import gaussians_by_regions
 
-        made = gaussians_by_regions(run, request, field)
+        finished = gaussians_by_regions(run, request, field)
         field.views.expect(_pictures(plan, work.fit))
     work.checkpoint = checkpoint_of(request.checkpoint, work.field, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
-    if made is not None:
-        work.gaussians = as_stored(made)
+    if finished is not None:
+        work.gaussians = as_stored(finished)
         improve(work, plan)
-        work.gaussians = as_stored(work.made())
+        work.gaussians = as_stored(work.current())
     elif kept:
         work.gaussians = kept[0]
         run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only scoring remains")
@@ -171,7 +171,7 @@ def run_conversion(
         whole, plan = plan, _fit(work, request, planner, plan)
         if start is not None:
             start.keep(work, whole)
-    conversion = _conversion(request, work, work.made())
+    conversion = _conversion(request, work, work.current())
     if unscored is not None:
         unscored(conversion)
     for stage in plan.stages:
@@ -210,17 +210,17 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     """Run the closed form and the stages that improve it; return the plan, revised by the closed form's time."""
     first = plan.stages[0]
     first.run(work)
-    degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
+    degree = work.current().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_disk_space(request.output, 2 * file_bytes(len(work.made()), degree))  # a second time with its certificate
+        check_disk_space(request.output, 2 * file_bytes(len(work.current()), degree))  # with its certificate again
     # the mean of its pace and that of drawing, since steps follow neither alone on every machine
     pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
-    planner = replace(planner, wide=suits_small_views(work.made(), work.fit.size), sh_degree=degree)
-    workload = replace(plan.workload.at(pace), gaussians=len(work.made()), degree=work.made().degree)
+    planner = replace(planner, wide=suits_small_views(work.current(), work.fit.size), sh_degree=degree)
+    workload = replace(plan.workload.at(pace), gaussians=len(work.current()), degree=work.current().degree)
     plan = planner.plan(workload, work.run.elapsed(), begun=True)
     check_memory(plan)
     improve(work, plan)
-    work.gaussians = as_stored(work.made())  # what is scored is what the file holds
+    work.gaussians = as_stored(work.current())  # what is scored is what the file holds
     if not work.run.report.interrupted:
         work.checkpoint.save(FITTED, work.gaussians)
     return plan
@@ -337,20 +337,20 @@ def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], N
     if request.writes < 2:
         return None
 
-    def write(found: Conversion) -> None:
-        _write_file(run, request, found, more="; complete; scoring next")
+    def write(conversion: Conversion) -> None:
+        _write_file(run, request, conversion, more="; complete; scoring next")
 
     return write
 
 
-def _write_file(run: Run, request: ConvertRequest, found: Conversion, again: bool = False, more: str = "") -> None:
+def _write_file(run: Run, request: ConvertRequest, conversion: Conversion, again: bool = False, more: str = "") -> None:
     """Write the file, a page with all its contents, or ``again`` with its certificate; ``more`` ends the message."""
     assert request.output is not None
     page = is_page(request.output) and request.ply.comments
     limit = None if request.megabytes is None else 1e6 * request.megabytes
-    extras = found.extras(request.editor, request.slices, run, limit) if page else NOTHING
+    extras = conversion.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
     write_gaussians(
-        run, request.output, found.gaussians, found.ply, request.overwrite or again, found.normals(),
+        run, request.output, conversion.gaussians, conversion.ply, request.overwrite or again, conversion.normals(),
         "certificate" if again else "write", more, extras,
     )  # fmt: skip
 

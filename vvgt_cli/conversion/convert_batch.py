@@ -24,7 +24,7 @@ from vvgt_cli.conversion.batch import (
 )
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
-from vvgt_cli.conversion.frames import Series, is_glob_of_volumes
+from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
@@ -296,7 +296,7 @@ def convert_files(
         kind, together = FRAMES, True
         check_options(ONE_FILE, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
-    request = replace(request, editor=request.editor and not together, several=together)
+    request = replace(request, editor=request.editor and not together, shares_output=together)
     looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
     batch = _batch(kind, request, looks, share, together)
     if together:
@@ -331,14 +331,14 @@ def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: 
 
 
 def convert_to_memory(
-    requests: Mapping[str, ConvertRequest], *, several: bool = False, split_labels: bool = False,
+    requests: Mapping[str, ConvertRequest], *, as_clouds: bool = False, split_labels: bool = False,
     after: Conversion | None = None, console: Console | None = None,
 ) -> Conversion | Clouds:  # fmt: skip
     """Convert one volume, the frames of a series, several looks or the labels of a map, without files.
 
     Args:
         requests: request of each look, by name.
-        several: return `Clouds` even for a single look.
+        as_clouds: return `Clouds` even for a single look.
         split_labels: make a cloud of each label.
         after: an earlier conversion of the same volume to start from.
         console: destination of messages.
@@ -350,7 +350,7 @@ def convert_to_memory(
 
     console, request = console or Console(), next(iter(requests.values()))
     used = options_in(request) | ({"after"} if after else set()) | ({"--split-labels"} if split_labels else set())
-    kind = FUNCTIONS if several else LABELS if split_labels else ONE
+    kind = FUNCTIONS if as_clouds else LABELS if split_labels else ONE
     for one in [LAYERS if kind == LABELS and request.source.layers else kind, *([LIVE] if request.live else [])]:
         check_options(one, used)
     path = request.source.volume
@@ -373,5 +373,5 @@ def _batch(
 ) -> Batch:  # fmt: skip
     """Return the batch of a kind."""
     if kind == FRAMES:
-        return Series(request, shard, page)
+        return FrameSeries(request, shard, page)
     return Labels(request) if kind == LABELS else Functions(functions)

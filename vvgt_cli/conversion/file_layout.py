@@ -40,7 +40,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         up=up_axis(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
-        made_for=request.fit.size,
+        screen_size=request.fit.size,
         rule=request.fit.rule,
         light=source.lighting,
         function=source.name if len(source.layers) > 1 else source.tf.name,
@@ -60,7 +60,7 @@ def _example(request: ConvertRequest) -> str | None:
 
 def _legend(source: Source) -> str | None:
     """Return the legend of one function, or of all label tables."""
-    tf, numbers = source.tf, source.statistics
+    tf, stats = source.tf, source.statistics
     if len(source.layers) > 1 or isinstance(tf, LabelTable):
         return legend_text([layer.tf for layer in source.layers], 0.0, 0.0, "")
-    return legend_text(tf, numbers.lo, numbers.hi, unit_of_values(source.volume.values_in, tf), source.volume.quantity)
+    return legend_text(tf, stats.lo, stats.hi, unit_of_values(source.volume.values_in, tf), source.volume.quantity)

@@ -17,12 +17,12 @@ from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_content
+from vvgt_cli.field.layered import ALL, COLOR, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
-from vvgt_cli.look.label_files import holds_table, read_labels
-from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.label_files import holds_table, table_for
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
@@ -35,7 +35,7 @@ from vvgt_cli.volume.tiff.slices import matching
 if TYPE_CHECKING:
     from vvgt_cli.look import TransferFunction
 
-MOST_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
+MAX_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Survey:
 
     Attributes:
         count: number of frames.
-        own: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
+        ranges: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
         whole: statistics of each component over all frames.
         first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
@@ -82,7 +82,7 @@ class Survey:
     """
 
     count: int
-    own: list[list[tuple[float, float]]]
+    ranges: list[list[tuple[float, float]]]
     whole: tuple[Statistics, ...]
     first: Content
     content: str
@@ -94,7 +94,7 @@ class Survey:
         return self.first.volumes[0]
 
 
-class Series(Batch):
+class FrameSeries(Batch):
     """The frames of a glob of files, or the time steps of one file, under what all of them share.
 
     Nodes of the function that follow from the data (``--tf-range rescale``, percentiles, the histogram) follow from all
@@ -116,7 +116,7 @@ class Series(Batch):
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
         self.previous = previous_frame(request, shard.count)
-        self._most = max(MOST_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
+        self._most = max(MAX_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
 
     def prepare(self, run: Run) -> None:
         """Read all frames once, for what they share.
@@ -140,7 +140,7 @@ class Series(Batch):
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
             shown, distance = _functions(source, found)
-            self._dark = [not source.layers and _invisible(shown, own) for own in found.own]
+            self._dark = [not source.layers and _invisible(shown, ranges) for ranges in found.ranges]
             lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
             stage.note = (
                 f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
@@ -243,8 +243,8 @@ def survey(
         UsageError: the segments of a frame overlap.
     """
     first: Content | None = None
-    numbers, digests = [], []
-    mapped, found = labels not in (None, NONE), set[int]()
+    stats, digests = [], []
+    mapped, found = labels not in (None, NO_LABELS), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
         content = open_content(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
@@ -256,14 +256,14 @@ def survey(
             mapped = holds_table(content.path) or recognised(content.volumes[0])
         if mapped and content.single_volume:
             found.update(labels_in(content.volumes[0]))
-        numbers.append([statistics(volume) for volume in content.classified])
+        stats.append([statistics(volume) for volume in content.classified])
         digests += [volume_digest(volume) for volume in content.volumes]
         if bar:
             bar(k + 1, len(steps))
     if first is None:
         raise UsageError("the series has no frames; expected one or more")
-    whole = tuple(merge_statistics(rows) for rows in zip(*numbers, strict=True))
-    own = [[(n.lo, n.hi) for n in rows] for rows in numbers]
+    whole = tuple(merge_statistics(rows) for rows in zip(*stats, strict=True))
+    own = [[(n.lo, n.hi) for n in rows] for rows in stats]
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 
@@ -313,9 +313,9 @@ def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
     return Statistics(lo, hi, sum(p.nan_count for p in volumes), sum(p.inf_count for p in volumes), histogram, edges)
 
 
-def _invisible(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
+def _invisible(shown: Sequence[TransferFunction | LabelTable], ranges: Sequence[tuple[float, float]]) -> bool:
     """Return whether nothing of a frame is visible."""
-    return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
+    return not any(tf.support(*limits) for tf, limits in zip(shown, ranges, strict=True))
 
 
 def _functions(
@@ -329,18 +329,12 @@ def _functions(
     from vvgt_cli.look.resolve import parse_tf_range
 
     if frames.labels is not None and frames.first.single_volume:
-        return (_table(source.labels, frames.labels),), unit_distance(source.unit_distance, frames.grid)
+        table = table_for(source.labels or AUTO, frames.labels, "the series")
+        return (table,), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))
     given = read if read is not None and frames.first.single_volume else shown[0]
     return shown, unit_distance(source.unit_distance, frames.grid, given)
-
-
-def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
-    """Return the table of a series of label maps; automatic colours depend on the label's number alone."""
-    if isinstance(labels, str) and labels != AUTO:
-        return read_labels(labels).warned(found, "the series")
-    return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
 def list_steps(source: SourceRequest) -> list[Step]:

@@ -20,7 +20,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_live import Extras, contents, page_of_several
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
@@ -71,7 +71,7 @@ def write_gaussians(
     normals: np.ndarray | None = None,
     stage: str = "write",
     more: str = "",
-    extras: Extras = NOTHING,
+    extras: Extras = NO_EXTRAS,
 ) -> None:
     """Write Gaussians in the format of the name, or as a `.ply` to standard output, and record the size.
 
@@ -203,7 +203,7 @@ def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOp
         return
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
-        size, rule = options.made_for or SIZE, rule_of(options.rule or INRIA)
+        size, rule = options.screen_size or SIZE, rule_of(options.rule or INRIA)
         cameras, found = default_views("test", size=size), []
         for i in PREVIEW_VIEWS:
             blocks = spread_blocks(size, size, i)
@@ -231,7 +231,7 @@ def report_format_cost(
     if not _stores_pictures(output, options):
         return
     with run.stage("read back") as stage:
-        size, rule = options.made_for or SIZE, options.rule or INRIA
+        size, rule = options.screen_size or SIZE, options.rule or INRIA
         before, after = (
             score_test_views(
                 scene, to_box_frame(g, volume), size, RenderSettings(), rule=rule, perceptual=False, only=PREVIEW_VIEWS

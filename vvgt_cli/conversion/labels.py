@@ -8,7 +8,6 @@ hide are also converted alone, and their hidden Gaussians added; so are labels t
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,14 +21,13 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import AUTO, IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
-from vvgt_cli.field.layered import NONE as NO_LABELS
+from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.label_files import read_labels
-from vvgt_cli.look.labels import Label, LabelTable, check_labels
+from vvgt_cli.look.labels import AUTO, NO_LABELS, Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -37,11 +35,9 @@ from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.space import metres
 
-LONGEST = 80  # characters of a label's name in a file name
-
 
 @dataclass(frozen=True)
-class Part:
+class LabelItem:
     """A label, or a layer without labels, and the request that would convert it alone."""
 
     name: str
@@ -55,7 +51,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class MapLabel(Part):
+class MapLabel(LabelItem):
     """A label of a map."""
 
     volume: Volume
@@ -79,7 +75,7 @@ class Labels(Batch):
     def __init__(self, request: ConvertRequest) -> None:
         """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
-        self._layers: list[tuple[ConvertRequest, list[Part]]] = []
+        self._layers: list[tuple[ConvertRequest, list[LabelItem]]] = []
 
     def prepare(self, run: Run) -> None:
         """Read the map and its table, and those of the layers.
@@ -145,7 +141,7 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     return open_content(source.path, read)
 
 
-def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[Part]:
+def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[LabelItem]:
     """Return the labels of a map, or a ``layer`` as a whole if it is none; the names of tables are added to ``tables``.
 
     Raises:
@@ -156,7 +152,7 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
     if not content.overlapping and (not content.single_volume or is_plain(content, source.tf, labels, (), IN_MEMORY)):
         name = layer or content.volumes[0].name
         whole = replace(source, volume=content) if request.blocks is None else source
-        return [Part(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
+        return [LabelItem(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
     read = read_labels(labels) if isinstance(labels, str) and labels not in (AUTO, NO_LABELS) else labels
     maps = layers_of(content, None, read, distance=source.unit_distance)
     tables += [one.tf.name for one in maps]
@@ -166,17 +162,18 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
     for whole_map in maps:
         volume, table, extents = whole_map.volume, whole_map.tf, extents_of(whole_map.volume)
         assert isinstance(table, LabelTable)
-        for label in table.warned(extents, volume.name, split=True).labels:
+        table.warn_hidden(extents, volume.name, split=True)
+        for label in table.labels:
             extent = extents.get(float(label.number))
             if label.shown_opacity > 0 and extent is not None:
                 shown.append((volume, table, label, extent))
     numbers = [label.number for *_, label, _ in shown]
-    found: list[Part] = []
+    found: list[LabelItem] = []
     divided = shares([extent.count for *_, extent in shown], request.fit.max_gaussians)
     for (volume, table, label, extent), share in zip(shown, divided, strict=True):
         alone = replace(_source(request, content, volume), labels=table.only(label.number))
         again = numbers.count(label.number) > 1  # of segments that overlap
-        stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
+        stem = f"{volume.name.rpartition(' ')[2]}-{label.stem}" if again else label.stem
         facts = label.facts() | extent.measures(volume)
         if layer:
             facts["parents"] = (layer, *label.parents)
@@ -196,7 +193,7 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
+def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) -> list[Gaussians | None]:
     """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
     labels = [part for part in parts if isinstance(part, MapLabel)]
@@ -230,7 +227,7 @@ def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: Part, console: Console) -> Gaussians | None:
+def _alone(part: LabelItem, console: Console) -> Gaussians | None:
     """Convert a label or layer as if it were the only one; return None where nothing is visible."""
     try:
         return _fit(part.request, console)
@@ -252,8 +249,3 @@ def shares(voxels: Sequence[int], budget: int) -> list[int]:
     weight = np.array(voxels, np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
-
-
-def file_name(label: Label) -> str:
-    """Return the unique number of a label and its name in plain characters."""
-    return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name)[:LONGEST].strip('-')}".strip("-")

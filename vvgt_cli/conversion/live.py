@@ -31,7 +31,7 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats.page_live import LiveForm
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, MOST_LABELS, LiveFacts
+from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import LIVE
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
@@ -129,7 +129,8 @@ def convert_live(
         gaussians, facts = _several_layers(run, request, field)
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     else:
-        gaussians, facts, look = _one_layer(run, request, field), _facts(source), source.tf
+        facts, look = LiveFacts.of(source.volume, source.overall, source.tf), source.tf
+        gaussians = _one_layer(run, request, field, facts.labels)
     table = lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
     gaussians = as_stored(apply_light(baked(gaussians, table, pixel), lighting))
     found = Conversion(to_unit_frame(gaussians, source.volume), run.report, replace(ply, live=facts), field)
@@ -141,18 +142,10 @@ def convert_live(
     return found
 
 
-def _facts(source: Source, several: int = 1) -> LiveFacts:
-    """Return the header of the values or labels of one of ``several`` layers."""
-    if isinstance(source.tf, LabelTable):
-        return label_facts(source, live_labels(source))
-    return LiveFacts.of(source.volume, source.overall, source.tf, several)
-
-
-def _one_layer(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
-    """Return the live Gaussians of one layer, box frame."""
+def _one_layer(run: Run, request: ConvertRequest, field: Field, labels: tuple[Label, ...]) -> Gaussians:
+    """Return the live Gaussians of one layer, box frame; ``labels`` are those of a label map."""
     source = field.source
     if isinstance(source.tf, LabelTable):
-        labels = live_labels(source)
         foggy = label_fog_field(field, labels)
         found = with_labels(run, foggy, fog_start(run, foggy, request), labels)
     else:
@@ -169,10 +162,11 @@ def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Ga
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
         run.console.message(f"layer {number} of {count}: {layer.name}")
         alone = field.with_look(source.single_layer(number))
-        own = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
-        facts.append(replace(own, dims=source.volume.dims))
+        layer_facts = LiveFacts.of(layer.volume, alone.source.overall, layer.tf, count)
+        layer_facts = replace(layer_facts, name=layer.volume.name, distance=layer.unit_distance)
+        facts.append(replace(layer_facts, dims=source.volume.dims))
         try:
-            some = _one_layer(run, share, alone)
+            some = _one_layer(run, share, alone, layer_facts.labels)
         except NothingVisible:  # a frame of a series in which it is empty
             run.skip(layer.volume.name, "only background")
             continue
@@ -238,11 +232,10 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
 
 def function_table(source: Source) -> Table:
     """Return the lookup table of the function of a source, with lengths in the unit frame."""
-    numbers, tf = source.overall, source.tf
+    stats, tf, volume = source.overall, source.tf, source.volume
     assert isinstance(tf, TransferFunction)
-    facts = LiveFacts.of(source.volume, numbers, tf)
-    distance = source.unit_distance * source.volume.unit_frame().scale
-    return Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
+    distance = source.unit_distance * volume.unit_frame().scale
+    return Table.of_function(tf, stats.lo, stats.hi, distance, grain_of(volume.dims))
 
 
 def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:
@@ -278,22 +271,6 @@ def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
     least = np.log(SMALLEST * pixel_width(size))
     widening = np.maximum(least - gaussians.log_scales.max(axis=1).astype(np.float64), 0)
     return replace(gaussians, log_scales=gaussians.log_scales + widening[:, None])
-
-
-def live_labels(source: Source) -> tuple[Label, ...]:
-    """Return labels that Gaussians can belong to, invisible ones too; raise NoLiveForm for more than `MOST_LABELS`."""
-    table = source.tf
-    assert isinstance(table, LabelTable)
-    found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
-    if len(found) > MOST_LABELS:
-        raise NoLiveForm(f"{source.name}: {len(found)} labels; a live form has at most {MOST_LABELS}")
-    return found
-
-
-def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
-    """Return the header of live Gaussians with these labels."""
-    numbers = [float(label.number) for label in labels]
-    return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
 
 
 def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:

@@ -62,7 +62,7 @@ class Manifest:
         settings: everything that the files depend on, plain values.
         shard: shard of this manifest.
         files: relative path -> {"bytes", "sha256"} of each complete file, other shards' included.
-        own: those of ``files`` that this shard records.
+        recorded: those of ``files`` that this shard records.
         what: content of the folder, a key of `COMMANDS`.
     """
 
@@ -70,7 +70,7 @@ class Manifest:
     settings: dict[str, Any]
     shard: Shard = field(default_factory=Shard)
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
-    own: dict[str, dict[str, Any]] = field(default_factory=dict)
+    recorded: dict[str, dict[str, Any]] = field(default_factory=dict)
     what: str = "views"
 
     @property
@@ -100,8 +100,8 @@ class Manifest:
                 )
             self.files |= document["files"]
             if path.name == self.shard.manifest:
-                self.own = document["files"]
-        self.files |= self.own
+                self.recorded = document["files"]
+        self.files |= self.recorded
         if not found and not overwrite:
             for name in planned:
                 if (self.folder / name).exists():
@@ -140,10 +140,10 @@ class Manifest:
         for name in names:
             path = self.folder / name
             known = {"bytes": path.stat().st_size, "sha256": file_digest(path), **facts.get(name, {})}
-            self.files[name] = self.own[name] = known
+            self.files[name] = self.recorded[name] = known
         document = {
             "format": f"vvgt-{self.what}", "schema": SCHEMA, "hash": self.hash, "settings": self.settings,
-            "files": self.own,
+            "files": self.recorded,
         }  # fmt: skip
         with atomic_write(self.folder / self.shard.manifest, overwrite=True) as temporary:
             temporary.write_text(json.dumps(document, indent=1) + "\n", "utf-8")

@@ -53,9 +53,9 @@ def to_box_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
     return gaussians if aligned else transform(gaussians, np.linalg.inv(axes))
 
 
-def to_frame_of(gaussians: Gaussians, own: UnitFrame, its: UnitFrame) -> Gaussians:
+def to_frame_of(gaussians: Gaussians, frame: UnitFrame, target: UnitFrame) -> Gaussians:
     """Transform Gaussians, and the lengths that they carry, from the unit frame of one volume to that of another."""
-    before, factor = own.scale * (np.array(own.centre) - np.array(its.centre)), its.scale / own.scale
+    before, factor = frame.scale * (np.array(frame.centre) - np.array(target.centre)), target.scale / frame.scale
     moved = rescale(gaussians, factor, before, np.zeros(3))
     if gaussians.live is None:
         return moved

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -20,13 +21,13 @@ from vvgt_cli.conversion.stages import (
     ViewingConditions,
 )
 from vvgt_cli.conversion.stages.views import view_count
+from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import UPRIGHT, Axes
 
-FEWEST_STEPS = 8  # fewer are not worth rendering views for
 ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
 FINISHING = 20  # steps on whole views after those on regions: few enough that cells by error are left out
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
@@ -84,7 +85,7 @@ class Plan:
         """Return the expected seconds after a stage."""
         return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
 
-    def for_made(self, count: int, degree: int, finish: list[Stage]) -> Plan:
+    def for_finished(self, count: int, degree: int, finish: list[Stage]) -> Plan:
         """Return the plan for ``count`` finished Gaussians with harmonics of ``degree``: few stages, then scores."""
         return replace(
             self, gaussians=count, workload=replace(self.workload, gaussians=count), bytes=file_bytes(count, degree),
@@ -170,14 +171,12 @@ class Planner:
     def _improvements(self, plan: Plan, left: float | None) -> list[Stage]:
         """Return the stages that need views: gradient descent for the given steps or time, or as many as pay off."""
         workload = plan.workload
-        open_end = self.limits.target_psnr is not None or left is not None
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
         small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
-        steps = wanted = self.fit.most_steps(open_end)
-        while left is not None and steps > 0 and self._seconds(workload, steps, small) > left:
-            steps = min(steps - 1, int(steps * 0.9))
-        if not wanted or steps < min(FEWEST_STEPS, wanted):
+        wanted = most_steps(self.fit, self.limits)
+        steps = steps_in_time(wanted, left, lambda steps: self._seconds(workload, steps, small))
+        if not steps:
             plan.skipped.append(("refinement", _time_left(left) if wanted else "no steps are requested"))
             return self._without_steps(plan, network, left)
         if self.fit.model is None:
@@ -234,6 +233,19 @@ class Planner:
             plan.skipped.append(("network", f"about {seconds:.1f} s, {_time_left(left)}"))
             return [], left
         return [stage], None if left is None else left - seconds
+
+
+def most_steps(fit: FitOptions, limits: Limits) -> int:
+    """Return the requested number of steps, else `STEPS`, or `MAX_STEPS` if a target or a time budget ends them."""
+    if fit.steps is not None:
+        return fit.steps
+    return STEPS if limits.target_psnr is None and limits.time_budget is None else MAX_STEPS
+
+
+def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:
+    """Return the number of steps, at most ``steps``, that take the seconds ``left``; 0 if too few (`FEWEST_STEPS`)."""
+    affordable = steps if left is None else bisect_right(range(steps + 1), left, key=seconds) - 1
+    return affordable if affordable >= min(FEWEST_STEPS, steps) else 0
 
 
 def _time_left(left: float | None) -> str:

@@ -18,6 +18,7 @@ from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
 
 
 WARM_START = "starting from the previous frame"
-STEPS = 50  # of gradient descent at a time
-ROUNDS = 2  # of `STEPS` at most
+ROUNDS = 2  # of `WARM_STEPS` at most
 LEVEL = 0.25 / 255  # difference of a pixel that counts as none
 VIEWS = 18  # training views per frame, which take turns
 WORSE = 0.2  # dB on the check views below the last cold frame, beyond which a frame starts cold
@@ -114,10 +114,10 @@ class PreviousFrame(WarmStart):
         shown = last.shown
         if found.blocks.any():  # else no view was drawn
             turn = self._turn % len(shown)
-            shown = (*shown[:turn], work.made(), *shown[turn + 1 :])
+            shown = (*shown[:turn], work.current(), *shown[turn + 1 :])
             self._turn += 1
-        self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
-        self._moved = _count_differing(last.gaussians, work.made())
+        self._last = replace(last, source=work.field.source, gaussians=work.current(), shown=shown)
+        self._moved = _count_differing(last.gaussians, work.current())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         return True
 
@@ -126,7 +126,7 @@ class PreviousFrame(WarmStart):
         if not any(isinstance(stage, Refinement) for stage in plan.stages) or work.check is None:
             return
         if work.train is not None and work.train_rule is not None and work.train_settings is not None:
-            made = work.made()
+            made = work.current()
             cameras = work.train.cameras
             shown = (made,) * max(len(cameras) // VIEWS, 1)
             self._last = _Frame(
@@ -155,14 +155,14 @@ class PreviousFrame(WarmStart):
         assert work.check is not None
         judged, psnr = _changed_blocks(work.check, found), 0.0
         asked = work.fit.steps
-        left = ROUNDS * STEPS if asked is None else min(asked, ROUNDS * STEPS)
+        left = ROUNDS * WARM_STEPS if asked is None else min(asked, ROUNDS * WARM_STEPS)
         while left > 0:
-            steps = min(STEPS, left)
+            steps = min(WARM_STEPS, left)
             left -= steps
             options = OptimizeOptions.of(
-                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=STEPS
+                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
-            result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
+            result = refine(work.run, work.current(), Views(cameras, images), judged, options, free=free)
             result = as_stored(widen_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)

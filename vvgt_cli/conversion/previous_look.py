@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.conversion.live import box_lighting
+from vvgt_cli.conversion.live import box_lighting, function_table
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest
@@ -17,20 +17,20 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import suits_small_views, view_count
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.live import TAU, Table
+from vvgt_cli.gaussians.live import TAU
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
-STEPS = 50  # of gradient descent at most
 FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
 WORSE = 2.0  # the same after the steps, since other looks allow other errors
 FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
-MOST = 50.0  # greatest ratio of extinctions
+MAX_RATIO = 50.0  # greatest ratio of extinctions
 OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
 WARM_START = "starting from the earlier conversion"
@@ -83,7 +83,8 @@ class PreviousLook(WarmStart):
         """Refine the recoloured Gaussians; return the reason why they are not good enough, None if they are."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
-        steps, small = min(work.fit.steps or STEPS, STEPS), suits_small_views(work.made(), work.fit.size)
+        steps = min(work.fit.steps or WARM_STEPS, WARM_STEPS)
+        small = suits_small_views(work.current(), work.fit.size)
         stages = (
             TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
             Refinement(steps, steps, small),
@@ -91,7 +92,7 @@ class PreviousLook(WarmStart):
         judge = CheckViews()
         work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
-        if work.psnr(work.made()) < standard - FAR:
+        if work.psnr(work.current()) < standard - FAR:
             return "the look differs too much"
         work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])
         for stage in stages:
@@ -118,10 +119,10 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     samples = field.sample(gaussians)
     there = np.isfinite(samples).all(axis=1)
     samples[~there] = 0
-    old, a = _look_alone(before, source, gaussians, samples)
-    new, b = _look_alone(source, source, gaussians, samples)
+    old, a = _look_alone(before, gaussians, samples)
+    new, b = _look_alone(source, gaussians, samples)
     least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
-    ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
+    ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MAX_RATIO, MAX_RATIO), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
     alike = 1 - np.linalg.norm(new.colors - old.colors, axis=1) / OTHER
@@ -135,16 +136,11 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _look_alone(
-    look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
+def _look_alone(look: Source, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 
-    numbers, scale = source.statistics, source.volume.unit_frame().scale
-    grain = 2 / max(source.volume.dims)
-    table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
-    sums = table.of(samples)
+    sums = function_table(look).of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting, gradient = box_lighting(look), samples[:, GRADIENT].astype(np.float64)

@@ -17,7 +17,7 @@ from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_lo
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, check_labels, distinct
+from vvgt_cli.look.labels import LabelTable, check_labels
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Volume
@@ -107,7 +107,7 @@ def apply_function(
     assert facts.scale is not None
     assert options.unit_distance is not None
     table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
-    found = visible_cloud(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
+    found = visible_cloud(gaussians, table, options.light, pixel_width(options.screen_size or SIZE))
     if not (len(found) or empty):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
@@ -274,19 +274,15 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
 
 def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:
     """Return the table of labels as given and as used, which are the same."""
-    from vvgt_cli.look.label_files import read_labels
+    from vvgt_cli.look.label_files import table_for
 
     wrong = ["--tf"] * (function.tf is not None) + ["--tf-range"] * (function.tf_range != "data")
     if wrong:
         raise UsageError(f"{name}: its Gaussians carry labels, not values; replace {' and '.join(wrong)} by --labels")
-    numbers = [label.number for label in facts.labels]
     if function.labels is None:
         table = LabelTable("the labels of the file", facts.labels)
-    elif function.labels == "auto":
-        table = distinct(numbers)
     else:
-        given = read_labels(function.labels) if isinstance(function.labels, str) else function.labels
-        table = given.of(numbers, name)
+        table = table_for(function.labels, [label.number for label in facts.labels], name)
     return table, table
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from vvgt_cli.conversion.place import AUTO
-from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, MOST_STEPS, RULE, SIZE, STEPS
+from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest
@@ -34,7 +34,7 @@ class FitOptions:
         rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by; None: the target's, or `RULE`.
         seed: seed of random numbers.
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.
-        steps: maximum number of steps of gradient descent; None: the default (`most_steps`).
+        steps: maximum number of steps of gradient descent; None: the default.
         device: "cpu", or "cuda" for views and steps.
         target: name of the device that the file is made for (`vvgt_cli.gaussians.targets`), None for none.
 
@@ -58,12 +58,6 @@ class FitOptions:
         for name, default in (("max_gaussians", MAX_GAUSSIANS), ("size", SIZE), ("rule", RULE)):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(target, name, default))
-
-    def most_steps(self, open_end: bool) -> int:
-        """Return the maximum number of steps; ``open_end``: a target or a time budget decides when to end."""
-        if self.steps is not None:
-            return self.steps
-        return MOST_STEPS if open_end else STEPS
 
 
 @dataclass(frozen=True)
@@ -134,7 +128,7 @@ class ConvertRequest:
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
-        several: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
+        shares_output: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
     """
 
     source: SourceRequest
@@ -151,7 +145,7 @@ class ConvertRequest:
     editor: bool = False
     slices: bool = False
     all_views: bool = False
-    several: bool = False
+    shares_output: bool = False
     command: str | None = None
     title: str | None = None
     blocks: BlockOptions | None = None
@@ -184,7 +178,7 @@ class ConvertRequest:
         if self.limits.max_megabytes is not None or target is None:
             return self.limits.max_megabytes
         limited = not self.live if known is None else known.suffix == ".html"
-        return target.megabytes if limited and not self.several else None
+        return target.megabytes if limited and not self.shares_output else None
 
     @property
     def scored_whole(self) -> bool:

@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
-from vvgt_cli.gaussians.formats.choose import NOTHING
+from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_file import iframe
 from vvgt_cli.gaussians.formats.page_live import Extras
 from vvgt_cli.gaussians.formats.streamed import is_streamed
@@ -110,7 +110,7 @@ class Result:
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NOTHING
+            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NO_EXTRAS
             return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
 
     def layout(
@@ -165,7 +165,7 @@ class Result:
             run: times the stages.
             limit: bytes of the page, which its slices must leave room for.
         """
-        return NOTHING
+        return NO_EXTRAS
 
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
@@ -200,7 +200,7 @@ class Result:
         from vvgt_cli.splat import render
 
         if camera is None:
-            camera = default_views("test", size=size or self.ply.made_for or SIZE)[FROM_THE_SIDE]
+            camera = default_views("test", size=size or self.ply.screen_size or SIZE)[FROM_THE_SIDE]
         if rule in NAMES:
             return draw_gaussians("result", self.gaussians, self.ply, rule)(camera)
         return render(self.gaussians, camera, rule_of(rule or self.ply.rule or INRIA))
@@ -219,26 +219,26 @@ class Conversion(Result):
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
 
     @cached_property
-    def _made(self) -> dict[str, Any]:
+    def _extras(self) -> dict[str, Any]:
         """Contents of a page, by name, that have been made."""
         return {}
 
     def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
         """Implement `Result.extras`, with a message if there is no live form."""
         run = run or Run(Console(quiet=True), ConversionReport("init"))
-        if live and self.make_live is not None and "live" not in self._made:
-            self._made["live"] = self.make_live(run, self.field, self.ply)
-        form, name = self._made.get("live") if live else None, f"slices within {limit}"
-        if slices and name not in self._made:
+        if live and self.make_live is not None and "live" not in self._extras:
+            self._extras["live"] = self.make_live(run, self.field, self.ply)
+        form, name = self._extras.get("live") if live else None, f"slices within {limit}"
+        if slices and name not in self._extras:
             with run.stage("slices") as stage:
                 room = None if limit is None else limit - self._page_bytes(form)
-                found = self._made[name] = self.field.source.slices(room)
+                found = self._extras[name] = self.field.source.slices(room)
                 colours = all(layer.colors for layer in self.field.source.layers)
                 why = "the volume has colours" if colours else f"--max-size leaves {max(room or 0, 0) / 1e6:.2f} MB"
                 stage.note = str(found or f"none: {why}")
         if form is not None:
             form = form[0], replace(form[1], certificate=self.ply.certificate)
-        return Extras(form, self._made[name] if slices else None)
+        return Extras(form, self._extras[name] if slices else None)
 
     def _page_bytes(self, form: LiveForm | None) -> int:
         """Return the bytes of the page with a certificate, but without slices."""
@@ -270,7 +270,7 @@ class Conversion(Result):
         Returns:
             (h, 3 w, 3) float32 RGB in [0, 1], rows below each other.
         """
-        cameras = default_views("test", size=size or self.ply.made_for or SIZE)
+        cameras = default_views("test", size=size or self.ply.screen_size or SIZE)
         volume = self.field.source.volume
         axes, inside = upright_axes(volume, self.ply.up), to_box_frame(self.gaussians, volume)
         return preview(self.field.views, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)

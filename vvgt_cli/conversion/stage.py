@@ -66,8 +66,8 @@ class Work:
         """Return the drawing rule that the file is made for."""
         return rule_of(self.fit.rule)
 
-    def made(self) -> Gaussians:
-        """Return the Gaussians that an earlier stage has made."""
+    def current(self) -> Gaussians:
+        """Return the Gaussians of the latest stage."""
         assert self.gaussians is not None, "a stage that needs Gaussians stands before the one that makes them"
         return self.gaussians
 
@@ -86,7 +86,7 @@ class Work:
     def target_reached(self) -> bool:
         """Return whether the target PSNR is reached."""
         target = self.limits.target_psnr
-        return target is not None and self.check is not None and self.psnr(self.made()) >= target
+        return target is not None and self.check is not None and self.psnr(self.current()) >= target
 
     def keep_better(self, before: float, after: float, gaussians: Gaussians) -> bool:
         """Take ``gaussians`` if their PSNR ``after`` is better, and return whether it is."""

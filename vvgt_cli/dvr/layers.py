@@ -22,7 +22,7 @@ from vvgt_cli.volume.types import triple
 
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
-MOST_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
+MAX_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
 VOXEL_BYTES = 20  # of a scene: four float32, and extinction again
 
 
@@ -126,8 +126,8 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
         inner = np.linalg.inv(layer.volume.affine) @ first.affine
         _check_meeting(first, layer.volume, inner)
         finer = np.maximum(finer, np.round(np.abs(inner[:3, :3]).max(axis=0) - 1e-6).astype(np.int64))
-    if finer.max() > MOST_FINER:
-        raise DataError(f"{first.name}: layers with voxels {finer.max()} times finer; expected at most {MOST_FINER}")
+    if finer.max() > MAX_FINER:
+        raise DataError(f"{first.name}: layers with voxels {finer.max()} times finer; expected at most {MAX_FINER}")
     if (finer == 1).all():
         return first
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))

@@ -84,7 +84,7 @@ class BoxGeometry(Protocol):
         """Voxel edges (3,), unit frame."""
 
 
-class Box(NamedTuple):
+class BoxFrame(NamedTuple):
     """A volume's half extents and voxel edges (3,), as `BoxGeometry` has them."""
 
     half: np.ndarray

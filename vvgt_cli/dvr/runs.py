@@ -16,8 +16,8 @@ from vvgt_cli.jit.decorators import inlined, intrinsic
 from vvgt_cli.jit.numba_internals import alloca_once, get_or_insert_function
 
 RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
-MOST = (1 << 31) - 1
-NEAR = MOST // (4 * RUN + 3)  # voxels of a slab up to which the offsets within a run of steps to 4 voxels fit 32 bits
+INT32_MAX = (1 << 31) - 1
+NEAR = INT32_MAX // (4 * RUN + 3)  # voxels of a slab up to which offsets within a run of steps to 4 voxels fit 32 bits
 
 F: Any = nb.float32  # Any: mypy knows what they make outside of kernels
 N: Any = nb.int32
@@ -194,6 +194,6 @@ def sample_run(
     last_voxel = N(nx - 2 - bx), N(ny - 1 - by), N(nz - 1 - bz)  # the last pair along x
     table = F(optics.lo), F(optics.inv_width), F(optics.nodes.shape[0] - 1)
     if slab < NEAR:
-        _near_samples(here, N(row), N(slab), N(min(last, MOST)), start, step, top, last_voxel, table, out)
+        _near_samples(here, N(row), N(slab), N(min(last, INT32_MAX)), start, step, top, last_voxel, table, out)
     else:
         _far_samples(here, row, slab, last, start, step, top, last_voxel, table, out)

@@ -13,8 +13,7 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, for_thin, more_rays
+from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
 from vvgt_cli.field.digests import digest, values_digest
@@ -98,7 +97,7 @@ class Blocked:
         prepare_look: maps a source of the same volumes to that source with statistics, reader and visible voxels.
         pictures: rendered or expected pictures, by digest.
         grid: the grid of base cells, once they are integrated.
-        views: renderer of its pictures; None selects the field itself.
+        renderer: renders its pictures; None selects the field itself.
     """
 
     source: Source
@@ -110,17 +109,18 @@ class Blocked:
     prepare_look: Callable[[Source], tuple[Source, Reader, float]]
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
-    views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+    renderer: ViewRenderer | None = None
 
-    def __post_init__(self) -> None:
-        """Use the field itself as the renderer if none is given."""
-        self.views = self.views or self
+    @property
+    def views(self) -> ViewRenderer:
+        """Implement `Field.views`."""
+        return self.renderer or self
 
     @cached_property
-    def frame(self) -> Frame:
+    def frame(self) -> BoxFrame:
         """Half extents and voxel edges in the unit frame."""
         frame = self.source.volume.unit_frame()
-        return Frame(np.array(frame.half), np.array(frame.step))
+        return BoxFrame(np.array(frame.half), np.array(frame.step))
 
     @cached_property
     def light(self) -> Light | None:

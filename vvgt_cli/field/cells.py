@@ -12,7 +12,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import CELLS, ROW, BlockStore
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
-from vvgt_cli.field.reader import Box, Layers, Scalars
+from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.files import atomic_write
 
 NORMALS = ".normals.npy"
@@ -37,7 +37,7 @@ class Blockwise:
         """Return the number of blocks."""
         return len(self.grid.blocks)
 
-    def box(self, number: int, halo: int) -> Box:
+    def box(self, number: int, halo: int) -> VoxelBox:
         """Read block ``number`` with ``halo`` voxels around it."""
         lo, hi = self.grid.blocks.at(number)
         return self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
@@ -97,7 +97,7 @@ class CellBlocks(Blockwise):
             deepest=np.array(deepest),
         )
 
-    def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _cells(self, box: VoxelBox, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices and moments of the cells with extinction in a tile (x, y, z) of a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
         from vvgt_cli.dvr.bricks import visible_blocks
@@ -114,7 +114,7 @@ class CellBlocks(Blockwise):
         region = Region(box.voxels, box.optics, half, step, box.begin.astype(np.float64), box.texels)
         return region_cells(region, lo + which * edge, exponent)
 
-    def _normals(self, box: Box, moments: np.ndarray) -> np.ndarray:
+    def _normals(self, box: VoxelBox, moments: np.ndarray) -> np.ndarray:
         """Return normals (n, 3) at the centroids of cells."""
         half, step = np.array(self.grid.half), np.array(self.grid.step)
         points = (moments[:, FIRST] / moments[:, [MASS]] + half) / step - 0.5
@@ -132,7 +132,7 @@ class CellBlocks(Blockwise):
         return summed(local, mass, grid.march, march), field.astype(np.float32), float(depth.max())
 
 
-def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
+def normals_in(box: VoxelBox, points: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Return normals and extinction (n, 4) at the volume's voxel coordinates ``points`` (n, 3), all inside a box."""
     from vvgt_cli.closed_form.lit import point_normals
 

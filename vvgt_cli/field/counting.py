@@ -17,11 +17,11 @@ from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Content, content_of, open_content
-from vvgt_cli.field.reader import CLASSIFIED, Place
+from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 from vvgt_cli.volume.blocks import Packed
-from vvgt_cli.volume.label_maps import MOST
+from vvgt_cli.volume.label_maps import MAX_LABELS
 from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.stored import read_block
 
@@ -40,7 +40,7 @@ class CountBlocks:
         labels: collect the distinct values of a type that is too wide to be counted.
     """
 
-    place: Place
+    place: VolumeOrigin
     boxes: Boxes
     slices: int
     store: BlockStore
@@ -67,7 +67,7 @@ class CountBlocks:
             values = read_block(volume, begin, end)
             part = tally(values, volume, self.limits)
             found = part if found is None else found.plus(part)
-            if self.labels and len(unique) <= MOST:
+            if self.labels and len(unique) <= MAX_LABELS:
                 unique = np.union1d(unique, values[np.isfinite(values)])
             for n in range(wanted):
                 if z <= places[n, 2] < end[2]:
@@ -127,7 +127,7 @@ class BlockAccess:
     ) -> None:  # fmt: skip
         """Prepare for counting; ``histogram`` asks for one even for types that are not counted value by value."""
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
-        self._places: dict[int, tuple[Volume, Place]] = {}
+        self._places: dict[int, tuple[Volume, VolumeOrigin]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
@@ -136,18 +136,18 @@ class BlockAccess:
         if not isinstance(source, str):
             content = content_of(source)
             for volume in (*content.volumes, *content.classified):
-                self._places[id(volume)] = volume, Place(volume, read)
+                self._places[id(volume)] = volume, VolumeOrigin(volume, read)
             return content
         read = replace(read, stored=True, packed=True)
         content = open_content(source, read)
         for number, volume in enumerate(content.volumes):
-            self._places[id(volume)] = volume, Place(source, read, number)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, number)
         if content.color:
             volume = content.classified[0]
-            self._places[id(volume)] = volume, Place(source, read, CLASSIFIED)
+            self._places[id(volume)] = volume, VolumeOrigin(source, read, CLASSIFIED)
         return content
 
-    def place(self, volume: Volume) -> Place:
+    def place(self, volume: Volume) -> VolumeOrigin:
         """Return the origin of a volume that was opened here."""
         return self._places[id(volume)][1]
 
@@ -197,8 +197,8 @@ class BlockAccess:
                 task = replace(task, kind=task.kind.replace(COUNTS, LABELS), labels=True)
                 self._run(task)
             stored = task.unique()
-        if len(stored) > MOST:
-            raise Unsuitable(f"{volume.name}: more than {MOST} distinct values; expected a label map")
+        if len(stored) > MAX_LABELS:
+            raise Unsuitable(f"{volume.name}: more than {MAX_LABELS} distinct values; expected a label map")
         values = np.unique(volume.slope * stored + volume.intercept)
         if (values != np.round(values)).any():
             odd = values[values != np.round(values)][0]
@@ -297,9 +297,9 @@ def with_limits(whole: Tally, volume: Volume) -> Tally:
         Unsuitable: no voxel has a finite value, or the scaling makes values infinite.
     """
     if counted(volume):
-        numbers = integer_statistics(whole.counts, volume)
-        ends = (numbers.lo - volume.intercept) / volume.slope, (numbers.hi - volume.intercept) / volume.slope
-        return replace(whole, lo=numbers.lo, hi=numbers.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
+        stats = integer_statistics(whole.counts, volume)
+        ends = (stats.lo - volume.intercept) / volume.slope, (stats.hi - volume.intercept) / volume.slope
+        return replace(whole, lo=stats.lo, hi=stats.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
     if not whole.finite:
         inf = volume.data.size - whole.nan
         raise Unsuitable(

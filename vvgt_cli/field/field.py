@@ -59,10 +59,14 @@ class Field(Protocol):
 
     Attributes:
         source: the volume and its look; the values may still be in the file.
-        views: renderer of its pictures.
+        renderer: renders its pictures; None selects the field itself.
     """
 
-    views: ViewRenderer
+    renderer: ViewRenderer | None
+
+    @property
+    def views(self) -> ViewRenderer:
+        """The renderer of its pictures."""
 
     @property
     def source(self) -> Source:
@@ -97,21 +101,22 @@ class Resident:
     Attributes:
         source: the volume and its look.
         scene: the values, laid out for the kernels.
-        views: renderer of its pictures; None selects the field itself.
+        renderer: renders its pictures; None selects the field itself.
         device: "cpu" or "cuda", which renders them where it is the field itself.
         report: gets a line if the device fails.
     """
 
     source: Source
     scene: Scene
-    views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+    renderer: ViewRenderer | None = None
     device: str = "cpu"
     report: Callable[[str], None] = print
     _drawn: dict[str, np.ndarray] = field(default_factory=dict)  # pixels of pictures' blocks, by `Picture.key`
 
-    def __post_init__(self) -> None:
-        """Use the field itself as the renderer if none is given."""
-        self.views = self.views or self
+    @property
+    def views(self) -> ViewRenderer:
+        """Implement `Field.views`."""
+        return self.renderer or self  # a reference to itself would keep the volume until Python looks for cycles
 
     @classmethod
     def of(cls, source: Source, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:

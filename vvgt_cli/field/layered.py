@@ -22,20 +22,19 @@ from vvgt_cli.look import (
     unit_distance,
 )
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.label_files import holds_table, read_labels, segments_of
-from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.label_files import holds_table, segments_of, table_for
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct, hex_color
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
+from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
 
-AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # values of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
-MOST_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
+MAX_CHANNELS = 6  # shown together by default: colours of more are hard to distinguish
 DARK, BRIGHT = 0.5, 0.998  # quantiles of a channel's voxels between which its opacity rises
 
 
@@ -90,9 +89,9 @@ class Content:
 
         return PreparedVolume.of(self.volumes[0])
 
-    def held(self) -> Content:
+    def loaded(self) -> Content:
         """Return the same content, with lazily computed arrays loaded into memory."""
-        volumes = tuple(map(held, self.volumes))
+        volumes = tuple(map(loaded, self.volumes))
         return (
             self if all(a is b for a, b in zip(volumes, self.volumes, strict=True)) else replace(self, volumes=volumes)
         )
@@ -121,7 +120,7 @@ class InMemory:
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
         """Implement `Access.open`."""
-        return open_content(source, read) if isinstance(source, str) else content_of(source).held()
+        return open_content(source, read) if isinstance(source, str) else content_of(source).loaded()
 
     def statistics(self, volume: Volume) -> Statistics:
         """Implement `Access.statistics`."""
@@ -143,7 +142,7 @@ def content_of(source: Volume | Content) -> Content:
 def open_content(source: str, read: ReadOptions) -> Content:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    Components are returned for "color" and "all", for a file of colours, and by default for up to `MOST_CHANNELS`
+    Components are returned for "color" and "all", for a file of colours, and by default for up to `MAX_CHANNELS`
     channels of a microscope.
 
     Raises:
@@ -155,7 +154,7 @@ def open_content(source: str, read: ReadOptions) -> Content:
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
         by_default = not (asked or error.color or overlapping)
-        if by_default and not (error.channels and error.count <= MOST_CHANNELS):
+        if by_default and not (error.channels and error.count <= MAX_CHANNELS):
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(f"{source}: {error.count} components; expected 3 or 4 for --component color") from None
@@ -188,11 +187,11 @@ def is_plain(
     opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
     """Return whether the content is one scalar field under a function, and not a recognised label map."""
-    if not opened.single_volume or layers or labels not in (None, NONE):
+    if not opened.single_volume or layers or labels not in (None, NO_LABELS):
         return False
     return (
         tf is not None
-        or labels == NONE
+        or labels == NO_LABELS
         or not (holds_table(opened.path) or recognised(opened.volumes[0], access.labels))
     )
 
@@ -222,22 +221,22 @@ def layers_of(
         UsageError: there is both a label table and a function.
     """
     labels = _chosen_labels(opened, tf, labels, access)
-    if labels not in (None, NONE):
-        own = labels == AUTO and holds_table(opened.path)
+    if labels is not None and labels != NO_LABELS:
+        own_table = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
-            return _overlapping(opened, labels, own, distance, access)
-        if own and opened.layer is not None:
+            return _overlapping(opened, labels, own_table, distance, access)
+        if own_table and opened.layer is not None:
             labels = segments_of(str(opened.path), opened.layer)
-        elif own:
-            labels = opened.path
+        elif own_table:
+            labels = str(opened.path)
         return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
-    numbers = whole or [access.statistics(volume) for volume in sources]
-    shown = functions_of(opened, numbers, function, tf_range)
+    stats = whole or [access.statistics(volume) for volume in sources]
+    shown = functions_of(opened, stats, function, tf_range)
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
-    for volume, one, its in zip(sources, shown, numbers, strict=True):
+    for volume, one, its in zip(sources, shown, stats, strict=True):
         given = function if function is not None and opened.single_volume else one
         there = bool(one.support(its.lo, its.hi))
         layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened), there))
@@ -250,20 +249,20 @@ def _chosen_labels(
     """Return the requested labels, or ``auto`` for a recognised label map; arguments as in `layers_of`."""
     volume = opened.volumes[0]
     if opened.overlapping:
-        if tf is not None or labels == NONE:
+        if tf is not None or labels == NO_LABELS:
             raise UsageError(
                 f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: omit "
                 "--tf and --labels none, or take one layer with --component N"
             )
         return labels or AUTO
-    if labels not in (None, NONE) and not opened.single_volume:
+    if labels not in (None, NO_LABELS) and not opened.single_volume:
         raise UsageError(f"{volume.name}: several components; expected a label map: choose one with --component N")
-    if labels not in (None, NONE) and tf is not None:
+    if labels not in (None, NO_LABELS) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
     if labels is None and tf is None and opened.single_volume:
-        own = holds_table(opened.path)
-        if own or recognised(volume, access.labels):
-            reason = "its segments" if own else "its name and its few integers"
+        own_table = holds_table(opened.path)
+        if own_table or recognised(volume, access.labels):
+            reason = "its segments" if own_table else "its name and its few integers"
             warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
             return AUTO
     return labels
@@ -271,23 +270,23 @@ def _chosen_labels(
 
 def functions_of(
     opened: Content,
-    numbers: Sequence[Statistics],
+    stats: Sequence[Statistics],
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float] = "data",
 ) -> list[TransferFunction]:
-    """Return a function on data values per volume of `Content.classified`; ``numbers`` are the volumes' statistics."""
+    """Return a function on data values per volume of `Content.classified`; ``stats`` are the volumes' statistics."""
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
-        return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
+        return [resolve(tf, stats[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
     if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
-            return [from_histogram(numbers[0], one.hounsfield, one.density)]
-        return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
+            return [from_histogram(stats[0], one.hounsfield, one.density)]
+        return [resolve(tf, stats[0], tf_range, one.hounsfield)]
     if opened.components_message:
         _warn_all_channels(opened, tf)
-    names = opened.names or [""] * len(numbers)
-    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+    names = opened.names or [""] * len(stats)
+    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(stats)]
 
 
 def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
@@ -296,7 +295,7 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
         raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
-        f"{k}{f' {name!r}' if name else ''} {_hex(channel_color(k, color))}"
+        f"{k}{f' {name!r}' if name else ''} #{hex_color(channel_color(k, color))}"
         for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
     ]
     warnings.warn(
@@ -309,10 +308,6 @@ def channel_color(number: int, color: tuple[float, float, float] | None) -> tupl
     return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
 
 
-def _hex(rgb: Sequence[float]) -> str:
-    return "#" + "".join(f"{round(255 * v):02x}" for v in rgb)
-
-
 def _white(opened: Content) -> float:
     """Return the data value that stands for a colour of 1."""
     kind = opened.volumes[0].data.dtype
@@ -320,7 +315,7 @@ def _white(opened: Content) -> float:
 
 
 def _overlapping(
-    opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None, access: Access
+    opened: Content, labels: str | LabelTable, own_tables: bool, distance: str | None, access: Access
 ) -> list[Layer]:
     """Return overlapping layers (.seg.nrrd) or segments (DICOM), each under its own table, or all under one.
 
@@ -329,7 +324,7 @@ def _overlapping(
     found = []
     for k, volume in enumerate(opened.volumes):
         if any(access.labels(volume)):
-            table = segments_of(str(opened.path), k) if own else labels
+            table = segments_of(str(opened.path), k) if own_tables else labels
             found.append(_labelled(volume, table, distance, access))
     if not found:
         raise DataError(f"{opened.path}: no label other than 0 in any layer; expected some to show")
@@ -337,20 +332,13 @@ def _overlapping(
 
 
 def _labelled(
-    volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access, empty: bool = False
+    volume: Volume, labels: str | LabelTable, distance: str | None, access: Access, empty: bool = False
 ) -> Layer:
     """Return a label map under its table; raise DataError if it has no labels, unless it may be ``empty``."""
-    numbers = access.labels(volume)
-    if empty and not any(numbers):
-        table = distinct(numbers)
-    elif isinstance(labels, str) and labels != AUTO:
-        table = read_labels(labels).warned(numbers, volume.name).of(numbers, volume.name)
-    elif isinstance(labels, LabelTable):
-        table = labels.of(numbers, volume.name)
-    elif any(numbers):
-        table = distinct(numbers)
-    else:
+    labels_there = access.labels(volume)
+    if not any(labels_there) and not empty:
         raise DataError(f"{volume.name}: no label other than 0; expected some to show")
+    table = table_for(labels, labels_there, volume.name) if any(labels_there) else distinct(labels_there)
     shows = any(label.opacity > 0 for label in table.labels)
     return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
 
@@ -377,7 +365,7 @@ def _channel(
     number: int,
     name: str,
     color: tuple[float, float, float] | None,
-    numbers: Statistics,
+    stats: Statistics,
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
 ) -> TransferFunction:
@@ -386,10 +374,10 @@ def _channel(
 
     rgb = channel_color(number, color)
     if tf is not None:
-        shown = resolve(tf, numbers, tf_range)
+        shown = resolve(tf, stats, tf_range)
         lo, hi = shown.node_range()
         return replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
-    lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
+    lo, hi = percentiles(stats, np.array([DARK, BRIGHT]))
     return _function(
         f"channel {number}{f' {name}' if name else ''}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb
     )

@@ -17,7 +17,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.layered import NONE, Content, content_of, open_content
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.runners import InProcess, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
@@ -25,6 +25,7 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.look.label_files import holds_table
+from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 LAYOUT = 5  # version of the stored blocks: increase it whenever their content changes
-HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
+MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
@@ -146,7 +147,7 @@ def blocked(
 
 def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
     """Return the volume, its values still in the file, and bytes per voxel where they are not those of its type."""
-    given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
+    given, layered = request.volume, request.labels not in (None, NO_LABELS) or bool(request.layers)
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
         content = open_content(given, read)
@@ -208,10 +209,10 @@ def _reader(source: Source, access: BlockAccess) -> tuple[Reader, float]:
 
     volume, frame = source.volume, source.volume.unit_frame()
     if not source.gridded:
-        task, whole, numbers = access.counts(volume)
+        task, whole, stats = access.counts(volume)
         rule = kernel_rule(volume, lambda: whole.stored)
         optics = build_tables(
-            source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
+            source.tf, (stats.lo, stats.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
             voxel=float(np.mean(frame.step)),
         )  # fmt: skip
@@ -273,7 +274,7 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
 
 
 def better_in_blocks(request: SourceRequest) -> bool:
-    """Return whether a volume in a file is large (`HELD`), or would not fit in memory with everything else.
+    """Return whether a volume in a file is large (`MIN_BLOCKED`), or would not fit in memory with everything else.
 
     Raises:
         DataError, UsageError: see `read_volume`.
@@ -293,7 +294,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     away = path.partition(":")[0] in STEPPED
     packed = away or zarr or h5 or tiff or index  # small files may hold many voxels
     size = sum(file.stat().st_size for file in files)
-    if not packed and size < HELD and (free is None or size <= LARGE * free):
+    if not packed and size < MIN_BLOCKED and (free is None or size <= LARGE * free):
         return False
     try:
         content = open_content(path, replace(request.read, stored=True, packed=True))
@@ -302,14 +303,14 @@ def better_in_blocks(request: SourceRequest) -> bool:
     volumes = content.volumes
     if not all(map(is_file_backed, volumes)):
         return False
-    if sum(volume.data.nbytes for volume in volumes) >= HELD:
+    if sum(volume.data.nbytes for volume in volumes) >= MIN_BLOCKED:
         return True
     if free is None:
         return False
     own = LAYER_VOXEL if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
-    held = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
+    loaded = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size
-    return held + (own + RANGES) * voxels + PROGRAM + CELL_BYTES * min(voxels, MAX_BASE_CELLS) > free
+    return loaded + (own + RANGES) * voxels + PROGRAM + CELL_BYTES * min(voxels, MAX_BASE_CELLS) > free
 
 
 def needs_histogram(request: SourceRequest) -> bool:
@@ -353,8 +354,8 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
 def _facts(volume: Any) -> list[Any]:
     """Return a file's name, size and time, or a digest of anything else."""
     if not isinstance(volume, str):
-        held = content_of(volume).volumes if isinstance(volume, Volume | Content) else ()
-        return [digest(*(one.data for one in held)) if held else repr(volume)]
+        volumes = content_of(volume).volumes if isinstance(volume, Volume | Content) else ()
+        return [digest(*(one.data for one in volumes)) if volumes else repr(volume)]
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
     files = next((some for name in outer if (some := files_of(name))), [])
     whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]

@@ -17,13 +17,12 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import camera_arrays
+from vvgt_cli.dvr.render import BoxFrame, camera_arrays
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, piece_edge
-from vvgt_cli.field.reader import Box
+from vvgt_cli.field.reader import VoxelBox
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.stored import give_back
 
@@ -66,7 +65,7 @@ class RayFile:
     kind: str
 
     @classmethod
-    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
+    def of(cls, bundles: Sequence[Bundle], frame: BoxFrame, blocks: Boxes, store: BlockStore) -> RayFile:
         """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``, or raise DataError."""
         arrays: dict[str, np.ndarray] = {}
         for k, bundle in enumerate(bundles):
@@ -121,7 +120,9 @@ def pieces_of(dims: tuple[int, int, int]) -> Boxes:
     return Boxes(dims, (edge, edge, edge))
 
 
-def save_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, store: BlockStore) -> None:
+def save_rays(
+    rays: RayFile, block: VoxelBox, number: int, blocks: Boxes, light: Light | None, store: BlockStore
+) -> None:
     """Cast all rays through the pieces of block ``number`` of ``blocks``, and save what they see.
 
     ``block`` has `HALO` or, under light, `LIT_HALO` voxels around it.
@@ -149,7 +150,7 @@ def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
 
 
 def _piece_rays(
-    rays: RayFile, box: Box, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
+    rays: RayFile, box: VoxelBox, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield, for the piece from voxel ``lo`` to ``hi`` (3,), bundle numbers and the rays that see anything."""
     from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
@@ -172,7 +173,7 @@ def _piece_rays(
 
 
 def caster(
-    box: Box, empty: np.ndarray, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
+    box: VoxelBox, empty: np.ndarray, lo: np.ndarray, hi: np.ndarray, dims: tuple[int, int, int], light: Light | None
 ) -> Callable[[KernelBundle, np.ndarray], np.ndarray]:
     """Return the function that casts rays through the voxels ``lo`` to ``hi`` (3,) of a volume, and those alone.
 
@@ -238,7 +239,7 @@ def composed(
     """
     pieces, bundles, kind = pieces_of(dims), rays.bundles(), rays.kind
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
-    held: dict[int, np.ndarray] = {}
+    mapped: dict[int, np.ndarray] = {}
     for number in numbers:
         path = store.path(kind, number, SUFFIX)
         offset = 0
@@ -246,17 +247,17 @@ def composed(
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:
-            held[number] = _mapped(path, offset)
+            mapped[number] = _mapped(path, offset)
     for bundle, found in zip(bundles, shown, strict=True):
         each = len(bundle.offsets)
         color, through = np.zeros((len(bundle.pixels) * each, 3)), np.ones(len(bundle.pixels) * each)
         for piece in front_to_back(pieces, bundle.eye, list(found)):
             number, part = found[piece]
-            ray, rgba = held[number]["ray"][part], held[number]["rgba"][part]
+            ray, rgba = mapped[number]["ray"][part], mapped[number]["rgba"][part]
             color[ray] += through[ray, None] * rgba[:, :3]
             through[ray] *= 1.0 - rgba[:, 3]
         for number in {number for number, _ in found.values()}:
-            give_back(held[number])
+            give_back(mapped[number])
         yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
 
 

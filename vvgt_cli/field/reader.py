@@ -24,7 +24,7 @@ CLASSIFIED = -1  # stands for the volume that determines the opacity of colours
 
 
 @dataclass(frozen=True)
-class Place:
+class VolumeOrigin:
     """The origin of a volume, by which any process can open it.
 
     Attributes:
@@ -53,7 +53,7 @@ def forget() -> None:
 
 
 @dataclass(frozen=True)
-class Box:
+class VoxelBox:
     """A box of voxels in the layout of the kernels.
 
     Attributes:
@@ -78,13 +78,13 @@ class Box:
         """`grid` in the kernels' type."""
         return None if self.grid is None else Texels(self.grid)
 
-    def part(self, lo: np.ndarray, hi: np.ndarray) -> Box:
+    def part(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Return a copy of the voxels ``lo`` to ``hi`` (3,) of the volume that lie in this box."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
-        return Box(_kept(self.values[index]), grid, self.optics, self.begin + a)
+        return VoxelBox(_kept(self.values[index]), grid, self.optics, self.begin + a)
 
 
 def _kept(values: np.ndarray) -> np.ndarray:
@@ -105,12 +105,12 @@ class Scalars:
         optics: tables over the kernels' values.
     """
 
-    place: Place
+    place: VolumeOrigin
     rule: KernelRule
     optics: Optics = field(repr=False)
 
     @property
-    def all_places(self) -> tuple[Place, ...]:
+    def all_places(self) -> tuple[VolumeOrigin, ...]:
         """Origin of each volume."""
         return (self.place,)
 
@@ -119,7 +119,7 @@ class Scalars:
         """Bytes per voxel while a box is read."""
         return self.rule.dtype.itemsize + 8
 
-    def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
+    def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Read the voxels ``lo`` to ``hi`` (3,), x first; raise DataError if the file or a chunk is damaged."""
         stored = read_block(self.place.volume(), lo, hi)
         if self.rule.half_width is None and stored.dtype == self.rule.dtype:
@@ -129,7 +129,7 @@ class Scalars:
             for z, plane in enumerate(stored):  # by planes: the intermediate is float64
                 values[z] = self.rule.apply(plane)
         values.flags.writeable = False
-        return Box(values, None, self.optics, lo.astype(np.int64))
+        return VoxelBox(values, None, self.optics, lo.astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class Layers:
     """
 
     layers: tuple[Layer, ...]
-    places: tuple[tuple[Place, ...], ...]
+    places: tuple[tuple[VolumeOrigin, ...], ...]
     grid: Volume
     dims: tuple[int, int, int]
     scale: float
@@ -154,7 +154,7 @@ class Layers:
     voxel_bytes = 60
 
     @property
-    def all_places(self) -> tuple[Place, ...]:
+    def all_places(self) -> tuple[VolumeOrigin, ...]:
         """Origin of each volume."""
         return tuple(place for places in self.places for place in places)
 
@@ -171,13 +171,13 @@ class Layers:
             found.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
         return found
 
-    def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
+    def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""
         texels = grid_box(self._opened, hollow(self.grid, self.dims), lo, hi)
         texels *= np.float32(1 / self.scale)
         values = np.ascontiguousarray(texels[..., 3])
         values.flags.writeable = False
-        return Box(values, texels, self.optics, lo.astype(np.int64))
+        return VoxelBox(values, texels, self.optics, lo.astype(np.int64))
 
     def visible(self) -> float:
         """Return the approximate number of visible voxels, from samples."""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, content_of, is_plain, layers_of
+from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_plain, layers_of
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.labels import LabelTable, check_labels
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
@@ -66,7 +66,7 @@ class SourceRequest:
         """Return the paths of all files that will be read."""
         given = [self.volume, self.tf, self.labels, self.read.mask]
         given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
-        return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
+        return [path for path in given if isinstance(path, str) and path not in (AUTO, NO_LABELS)]
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
@@ -292,16 +292,16 @@ def load_all(
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
     content = access.open(request.volume, request.read)
-    held = content is request.volume and access is IN_MEMORY  # for several functions
+    reused = content is request.volume and access is IN_MEMORY  # for several functions
     if not is_plain(content, functions[0], request.labels, request.layers, access):
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # report its errors first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
-    numbers = content.statistics if held else access.statistics(volume)
+    stats = content.statistics if reused else access.statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
-        whole = request.statistics[0] if request.statistics else numbers
+        whole = request.statistics[0] if request.statistics else stats
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
@@ -313,10 +313,10 @@ def load_all(
                 stacklevel=2,
             )
         if not request.statistics:  # a frame of a series may be dark
-            check_visible(shown, numbers)
+            check_visible(shown, stats)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
-        layout = content.layout if held else None
-        sources.append(Source((layer,), volume, numbers, lighting, layout, tuple(request.statistics)))
+        layout = content.layout if reused else None
+        sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 
 
@@ -336,10 +336,10 @@ def _layered(
             ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
-    numbers = access.statistics(layers[0].volume)
+    stats = access.statistics(layers[0].volume)
     _check_seen(layers, access, len(request.statistics))
     grid = common_grid(layers, content.stored)
-    return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
+    return Source(tuple(layers), grid, stats, lighting, series=tuple(request.statistics))
 
 
 def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
@@ -368,10 +368,10 @@ def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
 
 def describe_source(source: Source) -> str:
     """Return one line that describes a source: grid, type, values, function, unit distance."""
-    volume, numbers = source.volume, source.statistics
+    volume, stats = source.volume, source.statistics
     grid = " x ".join(map(str, volume.dims))
-    holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
-    values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
+    holes = [f"{n} {what} (transparent)" for n, what in ((stats.nan_count, "NaN"), (stats.inf_count, "inf")) if n]
+    values = ", ".join([f"values {stats.lo:g} to {stats.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
     light += " (its own; --light none omits it)" if light and source.lighting == source.tf.lighting else ""
@@ -381,16 +381,16 @@ def describe_source(source: Source) -> str:
 
 def volume_record(source: Source) -> dict[str, Any]:
     """Return the volume's entry in a report."""
-    volume, numbers = source.volume, source.statistics
+    volume, stats = source.volume, source.statistics
     return {
         "name": volume.name,
         "dims": volume.dims,
         "dtype": volume.data.dtype.name,
         "spacing": volume.spacing,
         "space": volume.space or "none",
-        "range": (numbers.lo, numbers.hi),
-        "nan": numbers.nan_count,
-        "inf": numbers.inf_count,
+        "range": (stats.lo, stats.hi),
+        "nan": stats.nan_count,
+        "inf": stats.inf_count,
     }
 
 

@@ -39,7 +39,7 @@ class Tile(NamedTuple):
     cells: int
 
 
-class Scores(NamedTuple):
+class TileScores(NamedTuple):
     """Scores of cells: that which splits the parent, the cell's own, and whether it has children."""
 
     above: np.ndarray
@@ -78,7 +78,7 @@ class Coarse:
         from vvgt_cli.cameras import default_views
         from vvgt_cli.closed_form.closed_form import MARCH_SIZE
         from vvgt_cli.closed_form.visibility import march_views
-        from vvgt_cli.dvr.render import Box
+        from vvgt_cli.dvr.render import BoxFrame
 
         march, fine = grid.coarse_shape(grid.march), grid.coarse_shape(grid.field)
         mass, field, deepest = np.zeros(march[::-1]), np.zeros(fine[::-1], np.float32), 0.0
@@ -96,7 +96,7 @@ class Coarse:
                 offset += count
         rows = np.array(tiles, np.int64).reshape(-1, 6)
         rows = rows[np.argsort(morton(rows[:, :3].astype(np.int32)))]
-        wide, box = grid.cell * 2.0**grid.march, Box(np.array(grid.half), np.array(grid.step))
+        wide, box = grid.cell * 2.0**grid.march, BoxFrame(np.array(grid.half), np.array(grid.step))
         extinction = (mass / (wide * box.step).prod()).astype(np.float32)
         seen = march_views(extinction, wide, box, default_views("train", size=MARCH_SIZE))
         store.prepare(COARSE)
@@ -262,7 +262,7 @@ class TiledTree:
         """Number of base cells that some view sees."""
         return sum(base for _, base, _ in self._sizes)
 
-    def _scores_of(self, row: int) -> Scores:
+    def _scores_of(self, row: int) -> TileScores:
         """Return the scores of the tree of tile ``row``."""
         size, base, offset = self._sizes[row]
         path = self._trees.store.path(TREES, self.tiles[row].block, SCORES)
@@ -273,16 +273,16 @@ class TiledTree:
         cap = self._capped[row]
         above, capped = np.minimum(above, cap), np.minimum(capped, cap)
         above[-1] = self._above[row]
-        return Scores(above, capped, np.arange(size) >= base)
+        return TileScores(above, capped, np.arange(size) >= base)
 
-    def scores(self) -> Iterator[Scores]:
+    def scores(self) -> Iterator[TileScores]:
         """Yield the scores of each tile in turn, then those of the inner cells of the top tree."""
         if self.top is None:
             return
         for row in range(len(self.tiles)):
             yield self._scores_of(row)
         over = slice(len(self.tiles), None)
-        yield Scores(self._above[over], self._capped[over], np.ones(len(self.top) - len(self.tiles), bool))
+        yield TileScores(self._above[over], self._capped[over], np.ones(len(self.top) - len(self.tiles), bool))
 
     def threshold(self, budget: int) -> float:
         """Return the score above which `vvgt_cli.closed_form.tree.select` would split cells for ``budget`` leaves."""

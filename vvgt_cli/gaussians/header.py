@@ -15,7 +15,7 @@ from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.labels import LabelTable, hex_color, labels_legend
 from vvgt_cli.look.lighting import Lighting, parse_lighting
 from vvgt_cli.version import VERSION
 
@@ -42,7 +42,7 @@ class FileFacts:
         scale, centre: the volume's `UnitFrame`; a file in world space needs both.
         unit_distance: world length that opacity refers to.
         unit_distance_label: how that distance was chosen; None is written as "given".
-        made_for: edge of the target screen in pixels.
+        screen_size: edge of the target screen in pixels.
         rule: name of the rendering rule that the Gaussians are made for.
         space: anatomical space of the world, "RAS", "LPS" or "none"; written with the affine.
         affine: 3 x 4 row-major, from voxel index (i, j, k, 1) of the volume to world position.
@@ -63,7 +63,7 @@ class FileFacts:
     centre: tuple[float, float, float] | None = None
     unit_distance: float | None = None
     unit_distance_label: str | None = None
-    made_for: int | None = None
+    screen_size: int | None = None
     rule: str | None = None
     space: str | None = None
     affine: tuple[float, ...] | None = None
@@ -242,7 +242,7 @@ def _one_comment(word: str, text: str) -> dict[str, Any]:
     if word == "size":
         if words[1] != "rule" or len(words) != 3 or not words[0].isdecimal() or not 0 < int(words[0]) <= 2**20:
             raise ValueError(text)
-        return {"made_for": int(words[0]), "rule": words[2]}
+        return {"screen_size": int(words[0]), "rule": words[2]}
     if word == "camera":
         return {"camera": camera_of(words)}
     if word == "space":
@@ -295,8 +295,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")
     if facts.camera is not None:
         lines.append(f"comment vvgt camera {' '.join(repr(float(v)) for v in facts.camera)}")
-    if facts.made_for is not None:
-        lines.append(f"comment vvgt size {facts.made_for} rule {facts.rule or 'inria'}")
+    if facts.screen_size is not None:
+        lines.append(f"comment vvgt size {facts.screen_size} rule {facts.rule or 'inria'}")
     if facts.light is not None:
         lines.append(f"comment vvgt light {facts.light.text()}")
     if facts.optics is not None:
@@ -317,7 +317,7 @@ def _finite(words: list[str]) -> list[float]:
     return values
 
 
-MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: space in a header is limited
+MAX_LEGEND_NODES, MAX_LEGEND = 32, 2500  # nodes, characters: space in a header is limited
 
 
 def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "") -> str | None:
@@ -332,25 +332,17 @@ def legend_text(tf: object, lo: float, hi: float, unit: str, quantity: str = "")
         quantity: what the values are, "" if unknown.
     """
     if tables := [one for one in (tf if isinstance(tf, list) else [tf]) if isinstance(one, LabelTable)]:
-        shown = [label for table in tables for label in table.labels if label.opacity > 0]
-        rows = [[label.name, _hex(label.color)] for label in shown[:MOST_LABELS]]
-        while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
-            rows.pop()
-        return text
+        return labels_legend([label for table in tables for label in table.labels], MAX_LEGEND)
     if not isinstance(tf, TransferFunction):
         return None
     places = np.unique(np.concatenate([[lo, hi], tf.opacity_nodes.x, tf.color_map.x]).clip(lo, hi))
-    if len(places) > MOST_NODES or tf.color_map.space != "RGB":
-        places = np.linspace(lo, hi, MOST_NODES) if hi > lo else np.array([lo])
+    if len(places) > MAX_LEGEND_NODES or tf.color_map.space != "RGB":
+        places = np.linspace(lo, hi, MAX_LEGEND_NODES) if hi > lo else np.array([lo])
     nodes: list[list[Any]] = []
     for x, limits in zip(places.tolist(), tf.limits(places).tolist(), strict=True):
-        below, above = ([float(f"{x:.6g}"), round(opacity, 4), _hex(rgb)] for opacity, *rgb in limits)
+        below, above = ([float(f"{x:.6g}"), round(opacity, 4), hex_color(rgb)] for opacity, *rgb in limits)
         nodes += [above] if x <= lo or below == above else [below] if x >= hi else [below, above]  # both at a step
     return json.dumps({"values": [lo, hi], "unit": unit, "quantity": quantity, "nodes": nodes})
-
-
-def _hex(rgb: Any) -> str:
-    return "".join(f"{round(255 * min(max(float(c), 0.0), 1.0)):02x}" for c in rgb)
 
 
 def checked(text: str) -> str:

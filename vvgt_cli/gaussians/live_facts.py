@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, NoLiveForm
 from vvgt_cli.look.convert import to_text
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.labels import Label
+from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Statistics, Volume
@@ -24,8 +24,8 @@ NXYZ, LABEL, LAYER = ("nx", "ny", "nz"), "label", "layer"
 VALUES, LABEL_ROW, LAYER_ID = slice(0, 6), 9, 10  # columns of `Gaussians.live`
 AXIS, GRADIENT = slice(3, 6), slice(6, 9)  # the same; the gradient is stored as the normal in a file
 SAMPLED = 64  # nodes of a function that cannot be stored exactly
-MOST_LABELS = 500  # labels that fit in a header
-LONGEST = 12_000  # characters of a function: some loaders read only the first 10 KB of a header, ours 64
+MAX_LABELS = 500  # that fit in a header
+MAX_FUNCTION = 12_000  # characters: some loaders read only the first 10 KB of a header, ours 64
 WORD = "live"
 
 
@@ -65,8 +65,8 @@ class LiveFacts:
 
     @property
     def grain(self) -> float:
-        """Edge of a voxel, unit-frame length, as if the box were a cube."""
-        return 2 / max(self.dims)
+        """Edge of a voxel, as by `grain_of`."""
+        return grain_of(self.dims)
 
     @property
     def most_labels(self) -> int:
@@ -74,11 +74,22 @@ class LiveFacts:
         return max(len(layer.labels) for layer in self.layers)
 
     @classmethod
-    def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction, several: int = 1) -> LiveFacts:
-        """Return the facts for a volume, its statistics and function; ``several`` is the file's number of layers."""
-        counts = tuple(int(n) for n in numbers.histogram)
-        lo, hi = numbers.lo, numbers.hi
-        unit, function = unit_of_values(volume.values_in, tf), function_text(tf, lo, hi, several)
+    def of(
+        cls, volume: Volume, stats: Statistics, look: TransferFunction | LabelTable, layer_count: int = 1
+    ) -> LiveFacts:
+        """Return the facts for a volume, its statistics and look; ``layer_count`` is the file's number of layers.
+
+        Raise NoLiveForm for more than `MAX_LABELS` labels.
+        """
+        if isinstance(look, LabelTable):
+            labels = look.structures
+            if len(labels) > MAX_LABELS:
+                raise NoLiveForm(f"{volume.name}: {len(labels)} labels; a live form has at most {MAX_LABELS}")
+            numbers = [float(label.number) for label in labels]
+            return cls(min(numbers, default=0.0), max(numbers, default=0.0), volume.dims, labels=labels)
+        counts = tuple(int(n) for n in stats.histogram)
+        lo, hi = stats.lo, stats.hi
+        unit, function = unit_of_values(volume.values_in, look), function_text(look, lo, hi, layer_count)
         return cls(lo, hi, volume.dims, counts, unit, function, quantity=volume.quantity)
 
     def statistics(self) -> Statistics:
@@ -104,7 +115,7 @@ class LiveFacts:
         unit = [f"comment vvgt live {word} {text}" for word, text in named if text]
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
         if self.labels:
-            return [values, *(f"comment vvgt live label {label_text(label)}" for label in self.labels)]
+            return [values, *(f"comment vvgt live label {label.comment()}" for label in self.labels)]
         return [
             values,
             *unit,
@@ -117,26 +128,25 @@ class LiveFacts:
         return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name)}"
 
 
-def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) -> str:
+def grain_of(dims: tuple[int, int, int]) -> float:
+    """Return the edge of a voxel, unit-frame length, as if the box were a cube."""
+    return 2 / max(dims)
+
+
+def function_text(tf: TransferFunction, lo: float, hi: float, layer_count: int = 1) -> str:
     """Return a function on data values as one line of minimal JSON, resampled to `SAMPLED` nodes if necessary.
 
-    ``several`` is the number of functions that must fit in a header.
+    ``layer_count`` is the number of functions that must fit in a header.
     """
     try:
         text = json.dumps(json.loads(to_text(tf, "minimal")))
-        if len(text) <= LONGEST // several:
+        if len(text) <= MAX_FUNCTION // layer_count:
             return text
     except DataError:
         pass
     x = np.linspace(lo, hi, SAMPLED) if hi > lo else np.array([lo])
     few = TransferFunction(tf.name, PiecewiseOpacity(x, tf.opacity(x).round(5)), ColorMap(x, tf.color(x).round(4)))
     return json.dumps(json.loads(to_text(few, "minimal")))
-
-
-def label_text(label: Label) -> str:
-    """Return number, colour, opacity and name as text; characters of the name that are not ASCII are escaped."""
-    color = " ".join(f"{channel:.4g}" for channel in label.color)
-    return f"{label.number} {color} {label.opacity:.6g} {json.dumps(label.name)}"
 
 
 def one_comment(text: str) -> dict[str, Any]:
@@ -151,9 +161,9 @@ def one_comment(text: str) -> dict[str, Any]:
         return {"lo": lo, "hi": hi, "dims": dims}
     if word == "layer":
         distance, name = text.split(None, 1)
-        if not 0 < float(distance) < math.inf:
+        if not 0 < float(distance) < math.inf or not isinstance(name := json.loads(name), str):
             raise ValueError(text)
-        return {"name": _quoted(name), "distance": float(distance)}
+        return {"name": name, "distance": float(distance)}
     if word in ("unit", "quantity"):
         return {word: text}
     if word == "histogram":
@@ -162,29 +172,17 @@ def one_comment(text: str) -> dict[str, Any]:
             raise ValueError(text)
         return {"histogram": counts}
     if word == "label":
-        number, *optics, name = text.split(None, 5)
-        red, green, blue, opacity = (float(x) for x in optics)
-        if not all(0 <= x <= 1 for x in (red, green, blue, opacity)):
-            raise ValueError(text)
-        return {"labels": (Label(int(number), _quoted(name), (red, green, blue), opacity),)}
+        return {"labels": (Label.parse(text),)}
     if word == "function" and isinstance(json.loads(text), dict):
         return {"function": text}
     raise ValueError(text)
 
 
-def _quoted(text: str) -> str:
-    """Return the text that a JSON string holds, or raise ValueError."""
-    found = json.loads(text)
-    if not isinstance(found, str):
-        raise ValueError(text)
-    return found
-
-
-def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
+def live_facts(layers: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
     """Merge the facts of comments, one mapping per layer; None if some, or some of the file's columns, are missing."""
-    whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in found)
-    whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in found)
-    if not whole or (len(found) > 1 and LAYER not in columns):
+    whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in layers)
+    whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in layers)
+    if not whole or (len(layers) > 1 and LAYER not in columns):
         return None
-    first, *others = [LiveFacts(**one) for one in found]
+    first, *others = [LiveFacts(**one) for one in layers]
     return replace(first, others=tuple(others))

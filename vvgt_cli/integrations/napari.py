@@ -79,11 +79,11 @@ def _converted(layers: Sequence[Any], step: int) -> Any:
     return together([(Content((v,)), _look(layer, v)) for layer, v in zip(layers, volumes, strict=True)], "none")
 
 
-def _lost(layer: Any, several: bool) -> list[str]:
-    """Return notes on how napari draws a layer, one of ``several`` or not, and its Gaussians do not."""
+def _lost(layer: Any, layered: bool) -> list[str]:
+    """Return notes on how napari draws a layer, one of ``layered`` or not, and its Gaussians do not."""
     own, scale = type(layer).__name__ != "Labels" and _colors(layer)[2], np.abs(layer.scale[-3:])
     lost = {
-        f"blending {layer.blending} (mixed by depth instead)": several and layer.blending not in BY_DEPTH,
+        f"blending {layer.blending} (mixed by depth instead)": layered and layer.blending not in BY_DEPTH,
         "the layer's opacity of a whole pixel (of each sample instead)": own and layer.opacity < 1,
         "opacity by voxels, which are uneven (by length instead)": own and scale.max() > 1.01 * scale.min(),
         f"rendering {layer.rendering} (translucent instead)": layer.rendering not in ("translucent", "iso_categorical"),

@@ -22,6 +22,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 sys.path.append(ROOT)  # behind ParaView's own packages, and for these modules alone
 try:
+    from vvgt_cli.defaults import MAX_GAUSSIANS, STEPS
     from vvgt_cli.integrations.command import Kept, tell
     from vvgt_cli.integrations.paraview_job import Job
 finally:
@@ -47,9 +48,9 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
     def __init__(self) -> None:
         """Set what ParaView shows as defaults."""
         super().__init__(nInputPorts=1, nOutputPorts=0, inputType="vtkDataObject")
-        self.options = {"Gaussians": 100_000, "Steps": 152, "Live": 0, "Light": 0, "Function": "", "AllSteps": 0}
-        self.name, self.step = "", 0
-        self.times: list[float] = []
+        self.options: dict[str, Any] = dict.fromkeys(("Live", "Light", "AllSteps"), 0)
+        self.options |= {"Gaussians": MAX_GAUSSIANS, "Steps": STEPS, "Function": ""}
+        self.name, self.step, self.times = "", 0, list[float]()
         self.job: Job | None = None
         self.vvgt = Kept()
 
@@ -60,12 +61,12 @@ class GaussianSplatWriter(VTKPythonAlgorithmBase):
         self.name = name
         self.Modified()
 
-    @smproperty.intvector(name="MaximumGaussians", default_values=100_000)
+    @smproperty.intvector(name="MaximumGaussians", default_values=MAX_GAUSSIANS)
     def SetMaximumGaussians(self, count: int) -> None:
         """Set --max-gaussians."""
         self._set("Gaussians", count)
 
-    @smproperty.intvector(name="Steps", default_values=152)
+    @smproperty.intvector(name="Steps", default_values=STEPS)
     def SetSteps(self, count: int) -> None:
         """Set --steps."""
         self._set("Steps", count)

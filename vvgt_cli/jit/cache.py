@@ -21,7 +21,7 @@ import llvmlite
 import numba
 
 from vvgt_cli.jit import store
-from vvgt_cli.jit.compile import Job, compile_in_subprocess
+from vvgt_cli.jit.compile import CompileJob, compile_in_subprocess
 from vvgt_cli.jit.numba_internals import dump_result, load_result, options_of, processor, python_function
 from vvgt_cli.version import VERSION
 
@@ -129,7 +129,7 @@ class KernelCache:
         file = self.file(types)
         payload = self.find(file)
         if payload is None:
-            compile_in_subprocess([Job(self.function.__module__, self.function.__qualname__, types, file)])
+            compile_in_subprocess([CompileJob(self.function.__module__, self.function.__qualname__, types, file)])
             payload = self.find(file)
         return None if payload is None else load_result(target_context, payload)
 

@@ -23,7 +23,7 @@ VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kern
 
 
 @dataclass(frozen=True)
-class Job:
+class CompileJob:
     """A kernel to compile.
 
     Attributes:
@@ -42,14 +42,14 @@ class Job:
         return getattr(import_module(self.module), self.function)
 
 
-def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[Job]:
+def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[CompileJob]:
     """Return jobs for the declared types of kernels ("vvgt_cli.room.module:function"); none where numba is off."""
-    jobs: list[Job] = []
+    jobs: list[CompileJob] = []
     for name in [] if config.DISABLE_JIT else dict.fromkeys(names):
         module, function = name.split(":")
         kernel = getattr(import_module(module), function)
         for types in dict.fromkeys(usual_types(kernel, kind) for kind in volumes):
-            jobs.append(Job(module, function, types, kernel.kernel_cache.file(types)))
+            jobs.append(CompileJob(module, function, types, kernel.kernel_cache.file(types)))
     return jobs
 
 
@@ -79,12 +79,12 @@ def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tupl
     return tuple(found)
 
 
-def missing(jobs: Iterable[Job]) -> list[Job]:
+def missing(jobs: Iterable[CompileJob]) -> list[CompileJob]:
     """Return those of ``jobs`` whose code is not on disk."""
     return [job for job in jobs if job.kernel().kernel_cache.find(job.file) is None]
 
 
-def compile_in_subprocess(jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None) -> bool:
+def compile_in_subprocess(jobs: Sequence[CompileJob], progress: Callable[[int, int], None] | None = None) -> bool:
     """Compile ``jobs`` in another process, one at a time on each processor.
 
     Args:

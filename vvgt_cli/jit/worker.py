@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-MOST = 8  # kernels at once: 0.3 GB each
+MAX_WORKERS = 8  # kernels at once: 0.3 GB each
 
 
 @contextlib.contextmanager
@@ -78,7 +78,7 @@ def run(folder: Path, jobs: list[Any]) -> int:
     gc.disable()  # a fork's objects live as long as it does
     if not hasattr(os, "fork"):
         return sum(_attempt(folder, job) for job in jobs)
-    failed, most = 0, min(MOST, processors())
+    failed, most = 0, min(MAX_WORKERS, processors())
     running: set[int] = set()
     for job in jobs:
         if len(running) >= most:

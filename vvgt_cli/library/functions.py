@@ -93,7 +93,7 @@ def convert(
     request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live, editor=not live)
     requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
-        requests, several=several, split_labels=split_labels, after=after, console=console_of(progress)
+        requests, as_clouds=several, split_labels=split_labels, after=after, console=console_of(progress)
     )
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.labels import LONGEST_NAME, SOLID, Label, LabelTable, distinct
+from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct
 from vvgt_cli.look.readers.fields import json_of, number, rgb, text_of
 from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, codes_of_tags, parents_of
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
@@ -41,7 +41,7 @@ COLUMNS = {  # names of columns in lower case; the first whose cell is not empty
     "color": ("color", "colour"),
 }
 NAMELESS = ("index", "name", "r", "g", "b", "a")
-MOST = 2**31  # of a label's number
+MAX_NUMBER = 2**31  # of a label
 HEADER = 2**20  # bytes of a .seg.nrrd that are looked at
 EXPECTED = (
     "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .csv or .tsv "
@@ -76,6 +76,21 @@ def is_table(path: Path) -> bool:
     rows = (line.strip() for line in text.splitlines())
     first = next((row for row in rows if row and not row.startswith("#")), "")
     return bool(_SNAP.fullmatch(first) or _plain(first))
+
+
+def table_for(labels: str | LabelTable, numbers: Sequence[int], where: str) -> LabelTable:
+    """Return the table of a volume's labels, ascending ``numbers``: read from a file, or ``auto``, or one that is read.
+
+    Raises:
+        DataError: the table does not match the labels; see `read_labels`, too.
+        UsageError: no such file.
+    """
+    if labels == AUTO:
+        return distinct(numbers)
+    table = read_labels(labels) if isinstance(labels, str) else labels
+    if table is not labels:
+        table.warn_hidden(numbers, where)
+    return table.restricted_to(numbers, where)
 
 
 def read_labels(source: str) -> LabelTable:
@@ -178,24 +193,24 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
     found = []
     for here, value, name, color, last, shown, codes in rows:
         alpha = 0.0 if not value else SOLID if last is None else last if opacity else 1 - last
-        found.append(_label(here, value, name or f"label {value}", color or colors[value], alpha, shown, codes))
+        found.append(_label(here, value, name, color or colors[value], alpha, shown, codes))
     return found
 
 
-def _is_opacity(given: list[float], path: Path, text: str) -> bool:
+def _is_opacity(alphas: list[float], path: Path, text: str) -> bool:
     """Return whether column A of a table is opacity (3D Slicer), not transparency (FreeSurfer).
 
-    FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``given`` is A / 255
+    FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``alphas`` is A / 255
     of every label but 0.
     """
     comments = " ".join(line for line in text.splitlines() if line.startswith("#")).lower()
-    if not any(given):
+    if not any(alphas):
         return False
-    if min(given) >= 1 or "color table file" in comments or "slicer" in comments:
+    if min(alphas) >= 1 or "color table file" in comments or "slicer" in comments:
         return True
     if "freesurfer" in comments or "label name" in comments:
         return False
-    opacity = 2 * sum(a > 0.5 for a in given) > len(given)
+    opacity = 2 * sum(a > 0.5 for a in alphas) > len(alphas)
     slicer = "opacity, as in 3D Slicer; for transparency begin the table with '#No. Label Name: R G B A'"
     freesurfer = "transparency, as in FreeSurfer; for opacity let its name end in .ctbl (or call A Color_A in a .csv)"
     warnings.warn(f"{path.name}: column A is read as {slicer if opacity else freesurfer}", stacklevel=2)
@@ -235,7 +250,7 @@ def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
         color, label = segment.get("Color", "").split(), segment.get("LabelValue", str(int(index) + 1))
         if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
             raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
-        name = segment.get("Name", segment.get("ID", f"label {label}"))
+        name = segment.get("Name", segment.get("ID", ""))
         codes = codes_of_tags(segment.get("Tags", ""))
         found.append(_label(f"{what}: segment {index}", int(label), name, list(map(float, color)), SOLID, codes=codes))
     return found
@@ -263,7 +278,7 @@ def table_of(parsed: Any, what: str) -> LabelTable:
         color = entry.get("color")
         color = _hex(color) or color if isinstance(color, str) else color
         opacity = number(f"{what}: label {key}: opacity", entry.get("opacity", SOLID if int(key) else 0.0))
-        name = str(entry.get("name", f"label {key}"))
+        name = str(entry.get("name", ""))
         groups, shown = entry.get("parents", []), entry.get("visible", True)
         groups = [groups] if isinstance(groups, str) else groups
         if not isinstance(groups, list) or not all(isinstance(one, str) and one for one in groups):
@@ -271,7 +286,7 @@ def table_of(parsed: Any, what: str) -> LabelTable:
         if not isinstance(shown, bool):
             raise DataError(f"{what}: label {key}: visible {str(shown)[:40]!r}; expected true or false")
         label = _label(f"{what}: label {key}", int(key), name, color, opacity, shown)
-        found.append(replace(label, parents=tuple(one[:LONGEST_NAME] for one in groups)) if groups else label)
+        found.append(replace(label, parents=tuple(one[:MAX_NAME] for one in groups)) if groups else label)
     return _table(found, what)
 
 
@@ -282,14 +297,12 @@ def _is_number(text: str) -> bool:
 def _label(
     what: str, value: int, name: str, color: Any, opacity: float, shown: bool = True, codes: Codes = ()
 ) -> Label:
-    """Make a label from checked values; warn if its name is cut to `LONGEST_NAME` characters."""
+    """Make a label from checked values."""
     if not 0 <= opacity <= 1:
         raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
-    if abs(value) > MOST:
+    if abs(value) > MAX_NUMBER:
         raise DataError(f"{what}: label {value}; expected a 32-bit number")
-    if len(name) > LONGEST_NAME:
-        warnings.warn(f"{what}: name of {len(name)} characters, cut to {LONGEST_NAME}: {name[:40]!r}...", stacklevel=2)
-    name = name[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8") or f"label {value}"
+    name = clean_name(what, value, name)
     parents = parents_of(name, codes)
     seen, hidden = (opacity, 0.0) if shown else (0.0, opacity)
     return Label(value, name, rgb(f"{what}: colour", color), seen, parents, codes, hidden)

@@ -1,9 +1,15 @@
-"""`LabelTable`: names, colours and opacities of a label map's labels; `label_files` reads its files."""
+"""`LabelTable`: names, colours and opacities of a label map's labels; `label_files` reads its files.
+
+A name is cleaned by `clean_name`, and leaves in headers (`Label.comment`), legends (`labels_legend`), pages
+(`Label.page_entry`) and names of files (`Label.stem`). `merge_labels` joins the labels of several files.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,11 +20,13 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import Named
 from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
-LISTED = 8  # labels that a message names
-LONGEST_NAME = 200  # characters of a label's name: files of Gaussians keep it in their headers
+AUTO, NO_LABELS = "auto", "none"  # values of --labels: distinct colours, or a scalar field
+MAX_NAME, MAX_STEM = 200, 80  # characters of a label's name: in headers, and in names of files
+MAX_LEGEND = 24  # labels of a legend
 SOLID = 1.0  # opacity of a label whose table says none
 
 
@@ -57,6 +65,34 @@ class Label:
         if self.codes:
             found["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
         return found if self.opacity else found | {"visible": False}
+
+    @property
+    def key(self) -> tuple[int, str]:
+        """Number and name; the labels of several files are the same if both are."""
+        return self.number, self.name
+
+    @property
+    def stem(self) -> str:
+        """Number, which is unique, and name in plain characters, for a file name."""
+        return f"{self.number}-{re.sub(r'[^0-9A-Za-z]+', '-', self.name)[:MAX_STEM].strip('-')}".strip("-")
+
+    def page_entry(self) -> dict[str, Any]:
+        """Return the entry of the label in a page."""
+        return {"number": self.number, "name": self.name, "rgb": list(self.color), "opacity": self.opacity}
+
+    def comment(self) -> str:
+        """Return number, colour, opacity and name as text for a header, in ASCII; `parse` reads it."""
+        color = " ".join(f"{channel:.4g}" for channel in self.color)
+        return f"{self.number} {color} {self.opacity:.6g} {json.dumps(self.name)}"
+
+    @classmethod
+    def parse(cls, text: str) -> Label:
+        """Parse the text that `comment` writes, or raise ValueError."""
+        number, *optics, name = text.split(None, 5)
+        red, green, blue, opacity = (float(x) for x in optics)
+        if not all(0 <= x <= 1 for x in (red, green, blue, opacity)) or not isinstance(name := json.loads(name), str):
+            raise ValueError(text)
+        return cls(int(number), name, (red, green, blue), opacity)
 
 
 @dataclass(frozen=True)
@@ -118,7 +154,12 @@ class LabelTable:
         """Return the visible labels in [lo, hi], as intervals."""
         return [(float(e.number),) * 2 for e in self.labels if e.opacity > 0 and lo <= e.number <= hi]
 
-    def of(self, numbers: Sequence[int], where: str) -> LabelTable:
+    @property
+    def structures(self) -> tuple[Label, ...]:
+        """All labels but a transparent 0, which is background."""
+        return tuple(label for label in self.labels if label.number != 0 or label.opacity > 0)
+
+    def restricted_to(self, numbers: Sequence[int], where: str) -> LabelTable:
         """Return the entries of a volume's labels, ascending ``numbers``; label 0 needs none.
 
         Raises:
@@ -126,26 +167,25 @@ class LabelTable:
         """
         known = {label.number: label for label in self.labels}
         missing = [n for n in numbers if n != 0 and n not in known]
-        shown = ", ".join(map(str, missing[:LISTED])) + (", ..." if len(missing) > LISTED else "")
+        shown = listed(missing, ", ")
         if not any(n in known for n in numbers if n != 0):
-            has = ", ".join(str(n) for n in list(known)[:LISTED]) + (", ..." if len(known) > LISTED else "")
-            raise DataError(f"{where}: none of its labels ({shown or 'only 0'}) is in {self.name}, which has {has}")
+            has = listed(list(known), ", ")
+            raise DataError(f"{where}: none of its labels ({shown}) is in {self.name}, which has {has}")
         if missing:
             raise DataError(
                 f"{where}: {len(missing)} labels have no entry in {self.name}: {shown}; add them (opacity 0 hides one)"
             )
         return replace(self, labels=tuple(known[n] for n in numbers if n in known))
 
-    def warned(self, numbers: Collection[float], where: str, split: bool = False) -> LabelTable:
-        """Return the table; warn about labels of the volume, ``numbers``, that it hides (0 aside).
+    def warn_hidden(self, numbers: Collection[float], where: str, split: bool = False) -> None:
+        """Warn about labels of the volume, ``numbers``, that the table hides (0 aside).
 
         With ``split``, labels that are only switched off are not hidden.
         """
         opacity = {e: e.shown_opacity if split else e.opacity for e in self.labels if e.number in numbers and e.number}
         if hidden := [f"{e.number} ({e.name})" for e in opacity if not opacity[e]]:
-            shown = ", ".join(hidden[:LISTED]) + (", ..." if len(hidden) > LISTED else "")
-            warnings.warn(f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {shown}", stacklevel=2)
-        return self
+            text = f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {listed(hidden, ', ')}"
+            warnings.warn(text, stacklevel=2)
 
     def only(self, number: int) -> LabelTable:
         """Return the table with one label, switched on, and the others transparent."""
@@ -164,5 +204,45 @@ def distinct(numbers: Sequence[int]) -> LabelTable:
     from matplotlib import colormaps
 
     colors = [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
-    labels = [Label(n, f"label {n}", colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]
+    labels = [Label(n, default_name(n), colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]
     return LabelTable("distinct colours", tuple(labels))
+
+
+def default_name(number: int) -> str:
+    """Return the name of a label whose table gives none."""
+    return f"label {number}"
+
+
+def clean_name(where: str, number: int, text: str) -> str:
+    """Return the name of a label, from the text in its table: valid Unicode, or `default_name` if empty.
+
+    Warn if it is cut to `MAX_NAME` characters.
+    """
+    if len(text) > MAX_NAME:
+        warnings.warn(f"{where}: name of {len(text)} characters, cut to {MAX_NAME}: {text[:40]!r}...", stacklevel=2)
+    return text[:MAX_NAME].encode("utf-8", "replace").decode("utf-8") or default_name(number)
+
+
+def labels_legend(labels: Sequence[Label], most: int) -> str:
+    """Return one line of JSON: names and colours of the first labels that are shown, and how many are.
+
+    It has at most ``most`` characters and `MAX_LEGEND` labels.
+    """
+    shown = [label for label in labels if label.opacity > 0]
+    rows = [[label.name, hex_color(label.color)] for label in shown[:MAX_LEGEND]]
+    while len(text := json.dumps({"labels": rows, "of": len(shown)})) > most:
+        rows.pop()
+    return text
+
+
+def hex_color(rgb: Sequence[float]) -> str:
+    """Return a colour in [0, 1] as ``rrggbb``."""
+    return "".join(f"{round(255 * min(max(float(c), 0.0), 1.0)):02x}" for c in rgb)
+
+
+def merge_labels(labels: Iterable[Label]) -> tuple[Label, ...]:
+    """Return the labels of several files by number, then name; each has the look that it has first."""
+    first: dict[tuple[int, str], Label] = {}
+    for label in labels:
+        first.setdefault(label.key, label)
+    return tuple(first[key] for key in sorted(first))

@@ -13,7 +13,7 @@ from vvgt_cli.volume.space import world_axis
 AMBIENT, DIFFUSE, SPECULAR, POWER = 0.1, 0.7, 0.2, 10.0  # vtkVolumeProperty's
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
-MOST = 1000.0  # of a coefficient: a highlight with a larger power is a point
+MAX_LIGHT = 1000.0  # of a coefficient: a highlight with a larger power is a point
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
 WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
 EXPECTED = f"expected {HEADLIGHT}, X,Y,Z, x, -x, y, -y, z, -z, {', '.join(WORDS[:-1])} or {WORDS[-1]}"
@@ -33,7 +33,7 @@ class Lighting:
         occlusion: unit-frame length within which surroundings attenuate ambient and diffuse light; None: not at all.
 
     Raises:
-        UsageError: no light, a direction of length zero, a coefficient that is not finite, negative or above `MOST`,
+        UsageError: no light, a direction of length zero, a coefficient outside of [0, `MAX_LIGHT`],
             shadows without a light that casts any.
     """
 
@@ -52,8 +52,8 @@ class Lighting:
             raise UsageError(f"no light; {EXPECTED}")
         for name in COEFFICIENTS:
             value = getattr(self, name)
-            if not 0 <= value <= MOST:
-                raise UsageError(f"--{name.replace('_', '-')} {value:g}: expected 0 to {MOST:g}")
+            if not 0 <= value <= MAX_LIGHT:
+                raise UsageError(f"--{name.replace('_', '-')} {value:g}: expected 0 to {MAX_LIGHT:g}")
         if self.occlusion is not None and not 0 < self.occlusion < math.inf:
             raise UsageError(f"--ambient-occlusion {self.occlusion:g}: expected a length above 0")
         if self.shadows and not self.directions:

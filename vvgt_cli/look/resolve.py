@@ -11,6 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import PER_VOXEL, TransferFunction
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import Volume
 
@@ -169,11 +170,11 @@ def check_visible(tf: TransferFunction, statistics: Statistics) -> None:
     lo, hi = _data_range(statistics)
     if tf.support(lo, hi):
         return
-    everywhere = tf.support(-math.inf, math.inf)
-    shown = ", ".join(f"[{a:g}, {b:g}]" for a, b in everywhere[:6]) + (", ..." if len(everywhere) > 6 else "")
+    everywhere = [f"[{a:g}, {b:g}]" for a, b in tf.support(-math.inf, math.inf)]
+    where = f"in {listed(everywhere, ', ', 6)}" if everywhere else "nowhere"
     raise DataError(
         f"{tf.name}: nothing is visible: the data lie in [{lo:g}, {hi:g}], opacity is above 0 "
-        f"{'in ' + shown if shown else 'nowhere'}; try --tf-range rescale, or another function"
+        f"{where}; try --tf-range rescale, or another function"
     )
 
 

@@ -17,7 +17,7 @@ FORMAT, SCHEMA = "vvgt-checkpoint", 1
 
 
 @dataclass
-class Checkpoint:
+class NetworkCheckpoint:
     """A trained network.
 
     Attributes:
@@ -45,7 +45,7 @@ class Checkpoint:
         }
 
 
-def save_checkpoint(path: str | Path, checkpoint: Checkpoint, more: dict[str, Any] | None = None) -> None:
+def save_checkpoint(path: str | Path, checkpoint: NetworkCheckpoint, more: dict[str, Any] | None = None) -> None:
     """Write a checkpoint to ``path`` (`vvgt_cli.files.atomic_write` makes that atomic).
 
     ``more`` is the trainer's own state: tensors and plain values.
@@ -53,7 +53,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint, more: dict[str, An
     torch.save(checkpoint.to_dict() | (more or {}), path)
 
 
-def load_checkpoint(path: str | Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> NetworkCheckpoint:
     """Read a checkpoint: tensors and plain values only; no pickled code is run.
 
     Raises:
@@ -67,7 +67,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         network = Vvgt(NetworkConfig.from_dict(document["config"]))
         load_weights(network, document["state"], str(path))
-        return Checkpoint(network.eval(), document["training"], document["metrics"], str(document["commit"]))
+        return NetworkCheckpoint(network.eval(), document["training"], document["metrics"], str(document["commit"]))
     except KeyError as error:
         raise DataError(f"{path}: checkpoint lacks {error}; it is incomplete") from None
 

@@ -14,7 +14,7 @@ PARAMETERS = 14  # of a Gaussian: mean 3, log-scale 3, quaternion 4, opacity log
 STEP = 13  # of a step in a Gaussian's own frame: centre 3, log-scale 3, turn 3, opacity logit 1, colour 3
 SLOPES = STEP + 9  # see `vvgt_cli.network.prepare.slope_rows`
 PATCH = 14  # pixels, DINOv2's
-MOST, DEEPEST = 1 << 16, 1 << 8  # of any number in a configuration; of blocks in a stage
+MAX_NUMBER, MAX_BLOCKS = 1 << 16, 1 << 8  # of any number in a configuration; of blocks in a stage
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class GeometryConfig:
             object.__setattr__(self, name, values)
             count = STAGES - name.startswith("decoder")
             least = 0 if name.endswith("depths") else 1
-            most = DEEPEST if name.endswith("depths") else MOST
+            most = MAX_BLOCKS if name.endswith("depths") else MAX_NUMBER
             if len(values) != count or min(values) < least or max(values) > most:
                 raise DataError(f"geometry {name} {values}: expected {count} numbers from {least} to {most}")
         pairs = zip(self.widths + self.decoder_widths, self.heads + self.decoder_heads, strict=True)
@@ -197,13 +197,13 @@ def _exactly(kind: type, values: Any) -> Any:
 
 
 def _alike(value: Any, usual: Any) -> bool:
-    """Return whether a value has the type of a usual one, and no number in it is beyond `MOST`."""
+    """Return whether a value has the type of a usual one, and no number in it is beyond `MAX_NUMBER`."""
     if isinstance(usual, tuple):
         return isinstance(value, list | tuple) and all(_alike(entry, 0) for entry in value)
     if isinstance(usual, bool) or not isinstance(usual, int | float):
         return isinstance(value, type(usual))
     kinds = int if isinstance(usual, int) else (int, float)
-    return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) <= MOST
+    return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
 
 
 NAMED = {

@@ -29,7 +29,7 @@ SAMPLE = 12_000  # Gaussians that are regressed on, or less than twice as many
 RIDGE = 1e-3  # of a feature's squares
 FARTHEST = 3.0  # standard deviations that a number counts
 BENT = 1.5  # length of the random directions
-ONE, MOST = 40, 127  # of a feature in 8 bits, which is what it is fitted with too
+ONE, MAX_FEATURE = 40, 127  # of a feature in 8 bits, which is what it is fitted with too
 BATCH = 1024 * LANES  # Gaussians whose features are made at once
 NONE = np.zeros((0, FEATURES, LANES), np.int8), np.zeros((KNOWN, FEATURES), np.float32)  # where nothing is shared
 
@@ -112,7 +112,7 @@ class SharedSteps:
         def rows(part: np.ndarray) -> np.ndarray:
             bent = np.maximum(part @ mixing + offsets, 0) - middle
             found = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
-            rounded: np.ndarray = np.clip(np.rint(found * ONE), -MOST, MOST)
+            rounded: np.ndarray = np.clip(np.rint(found * ONE), -MAX_FEATURE, MAX_FEATURE)
             return rounded
 
         numbers = rows(some).astype(np.float64)

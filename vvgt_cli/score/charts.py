@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.files import atomic_write
-from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, Series, cost, pareto, psnr, short, stage_names
+from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, ReportRuns, Run, cost, pareto, psnr, short, stage_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ class Chart:
         return f'<svg {box} role="img" aria-label="{escape(self.title)}">{body}'
 
 
-def draw(series: Sequence[Series]) -> list[Chart]:
+def draw(series: Sequence[ReportRuns]) -> list[Chart]:
     """Draw the charts of one report, or of several over each other; deterministic.
 
     Returns:
@@ -108,7 +108,7 @@ def log_ticks(lo: float, hi: float) -> list[float]:
     return ticks
 
 
-def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float]) -> None:
+def _scatter(axes: Any, series: Sequence[ReportRuns], value: Callable[[Run], float]) -> None:
     """Draw a mark for each run; runs on the Pareto front are ringed and joined."""
     several, used, labels = len(series) > 1, set(), []
     for n, one in enumerate(series):
@@ -163,7 +163,7 @@ def _label(axes: Any, labels: Sequence[tuple[Any, float, float, str, str]]) -> N
             note.remove()
 
 
-def _stages(axes: Any, series: Sequence[Series]) -> None:
+def _stages(axes: Any, series: Sequence[ReportRuns]) -> None:
     """Draw a bar for each run, a segment for each stage; scoring, which makes no file, is hatched."""
     rows = [run for one in series for run in one.runs]
     ends = [0.0] * len(rows)

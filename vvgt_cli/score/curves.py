@@ -32,7 +32,7 @@ SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
 
 
 @dataclass(frozen=True)
-class Series:
+class ReportRuns:
     """The runs of one report.
 
     Attributes:
@@ -146,7 +146,7 @@ def _seconds(run: Run) -> dict[str, float]:
     return found
 
 
-def read_series(path: str) -> Series:
+def read_series(path: str) -> ReportRuns:
     """Read the runs of a `report.json`, or the one run of a `--report` of convert, or raise DataError without any."""
     try:
         document = json.loads(Path(path).read_text("utf-8"))
@@ -156,7 +156,7 @@ def read_series(path: str) -> Series:
         runs = document["runs"] if kind == "vvgt-report" else [_named(document)]
         own = Path(path)
         title = own.resolve().parent.name if own.name == "report.json" else own.stem
-        series = Series(title, runs, document)
+        series = ReportRuns(title, runs, document)
         for run in runs:
             _check(run)
         count = len(series.scored())

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from vvgt_cli.score.charts import Chart
-from vvgt_cli.score.curves import Run, Series, cost, knee, pareto, psnr, short, worst_condition
+from vvgt_cli.score.curves import ReportRuns, Run, cost, knee, pareto, psnr, short, worst_condition
 
 GAIN = 8  # initial gain of the difference
 
@@ -29,7 +29,7 @@ class Pictures:
     ours: list[list[bytes]]
 
 
-def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures: Pictures | None = None) -> str:
+def page(series: Sequence[ReportRuns], charts: Sequence[Chart], title: str, pictures: Pictures | None = None) -> str:
     """Return the page of one report, with pictures to compare, or of several over each other."""
     notes = dict.fromkeys([chart.title for chart in charts], "") | {charts[0].title: FRONT_NOTE}
     drawn = [f"<section><h2>{one.title}</h2>{one.svg()}{notes[one.title]}</section>" for one in charts]
@@ -51,7 +51,7 @@ FRONT_NOTE = (
 )
 
 
-def _head(series: Sequence[Series], title: str) -> str:
+def _head(series: Sequence[ReportRuns], title: str) -> str:
     lines = []
     for one in series:
         volume, tf = one.document.get("volume") or {}, one.document.get("transfer_function") or {}
@@ -64,7 +64,7 @@ def _head(series: Sequence[Series], title: str) -> str:
     return f"<h1>{escape(title)}</h1>{''.join(lines)}"
 
 
-def _facts(series: Sequence[Series]) -> str:
+def _facts(series: Sequence[ReportRuns]) -> str:
     """Return the best run of each report; for a single report also the quickest and the knee."""
     chosen = [("nearest", max(one.scored(), key=lambda run: psnr(run) or 0)) for one in series]
     if len(series) == 1:
@@ -78,7 +78,7 @@ def _facts(series: Sequence[Series]) -> str:
     return f'<div class="facts">{"".join(cells)}</div>'
 
 
-def _unit_costs(series: Sequence[Series]) -> str:
+def _unit_costs(series: Sequence[ReportRuns]) -> str:
     rows = []
     for one in series:
         for key, seconds in (one.document.get("unit_costs") or {}).items():
@@ -139,7 +139,7 @@ def _cell(value: Any, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def _table(series: Sequence[Series]) -> str:
+def _table(series: Sequence[ReportRuns]) -> str:
     heads = ("run", "seconds", "PSNR", "foreground", "worst condition", "SSIM", "FLIP", "Gaussians", "MB")
     rows = []
     for one in series:
@@ -162,7 +162,7 @@ def _table(series: Sequence[Series]) -> str:
     )
 
 
-def _machine(one: Series, named: bool) -> str:
+def _machine(one: ReportRuns, named: bool) -> str:
     document = one.document
     machine, versions = document.get("machine") or {}, document.get("versions") or {}
     load, reference = machine.get("load"), document.get("reference") or {}

@@ -77,7 +77,7 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
     return replace(camera, fx=focal, fy=focal)
 
 
-class Place(NamedTuple):
+class ViewingPlace(NamedTuple):
     """A viewing condition without its rule; attributes as in `ViewingCondition`."""
 
     size: int
@@ -85,7 +85,7 @@ class Place(NamedTuple):
     where: str = ""
 
 
-ConditionPicture = tuple[Place, Camera, Blocks | None]
+ConditionPicture = tuple[ViewingPlace, Camera, Blocks | None]
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class ConditionView:
         reference: (h, w, 3) float32 picture of the blocks, or of the whole.
     """
 
-    place: Place
+    place: ViewingPlace
     camera: Camera
     blocks: Blocks | None
     reference: np.ndarray
@@ -113,7 +113,7 @@ def condition_pictures(
         cameras = default_views("test", size=size)
         for i in views:
             camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
-            found.append((Place(size, field_of_view), camera, blocks))
+            found.append((ViewingPlace(size, field_of_view), camera, blocks))
     return found
 
 
@@ -135,7 +135,7 @@ def eye_pictures(
         return []
     size, found = round(2 * device.focal * float(np.tan(np.radians(FIELD_OF_VIEW / 2)))), []
     for away in AWAY:
-        place = Place(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
+        place = ViewingPlace(size, FIELD_OF_VIEW, f"{device.name} both eyes {away:g} m")
         for i in views:
             x, y, _ = default_views("test")[i].position
             ring = away / float(np.hypot(x, y))
@@ -203,26 +203,27 @@ def texture_cameras(size: int) -> list[Camera]:
     return found
 
 
-def texture_note(found: Texture) -> str:
+def texture_note(texture: Texture) -> str:
     """Return texture as a message."""
-    if found.ours is None:
+    if texture.ours is None:
         return "nothing in it is opaque and smooth"
     return (
-        f"{found.ours:.2f} levels of 255, the volume {found.reference:.2f}; "
-        f"worst tenth {found.ours_worst:.2f} and {found.reference_worst:.2f}"
+        f"{texture.ours:.2f} levels of 255, the volume {texture.reference:.2f}; "
+        f"worst tenth {texture.ours_worst:.2f} and {texture.reference_worst:.2f}"
     )
 
 
 def score_conditions(
-    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES), own: str = INRIA.name
-) -> list[ViewingCondition]:
-    """Score every rule at every place, on the blocks of `condition_views`; worst first. ``own`` is a headset's rule."""
+    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES),
+    headset: str = INRIA.name,
+) -> list[ViewingCondition]:  # fmt: skip
+    """Score every rule at every place, on the blocks of `condition_views`; worst first; ``headset``: its rule."""
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    errors: dict[tuple[str, Place], list[float]] = {}
+    errors: dict[tuple[str, ViewingPlace], list[float]] = {}
     for view in seen:
-        for rule in (own,) if view.place.where else rules:
+        for rule in (headset,) if view.place.where else rules:
             ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
             shown = ours if view.blocks is None else view.blocks.pick(ours)
             errors.setdefault((rule, view.place), []).append(psnr(view.reference, shown))

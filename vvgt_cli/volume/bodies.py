@@ -13,7 +13,7 @@ from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import Stored, chunks_of, planes
 from vvgt_cli.volume.types import Volume
 
-HELD = 10  # bytes per voxel while bodies are found
+BODY_BYTES = 10  # per voxel, while bodies are found
 
 
 def without_other_bodies(volume: Volume, above: float) -> Volume:
@@ -28,7 +28,7 @@ def without_other_bodies(volume: Volume, above: float) -> Volume:
     @cache
     def whole() -> np.ndarray:
         what = f"{volume.name}: --keep-largest {above:g}"
-        check_memory(HELD * volume.data.size, what, "make a mask of it elsewhere and give that as --mask")
+        check_memory(BODY_BYTES * volume.data.size, what, "make a mask of it elsewhere and give that as --mask")
         matter = np.empty(volume.data.shape, bool)
         for row, plane in zip(matter, planes(volume), strict=True):
             np.greater(volume.slope * plane.astype(np.float64) + volume.intercept, above, out=row)

@@ -14,9 +14,10 @@ from vvgt_cli.volume.headers import printable
 LISTED = 12  # arrays, images or channels that an error lists
 
 
-def listed(rows: Sequence[str], between: str = "; ") -> str:
-    """Join the first `LISTED` texts for a message, and say where there are more; "none" for none."""
-    return between.join(map(printable, rows[:LISTED])) + (f"{between}..." if len(rows) > LISTED else "") or "none"
+def listed(items: Sequence[object], between: str = "; ", most: int = LISTED) -> str:
+    """Join the first ``most`` items for a message, and say where there are more; "none" for none."""
+    texts = [printable(str(item)) for item in items[:most]]
+    return between.join(texts) + (f"{between}..." if len(items) > most else "") or "none"
 
 
 def choose(

@@ -21,7 +21,7 @@ _TYPES = {
 }  # fmt: skip
 
 
-class Fields(dict[str, str]):
+class HeaderFields(dict[str, str]):
     """The fields of a header, keys in lower case; ``name`` is the file, for messages."""
 
     def __init__(self, name: str) -> None:
@@ -76,9 +76,9 @@ class Fields(dict[str, str]):
         except ValueError:
             raise DataError(f"{self.name}: {key} is {text!r}; expected a whole number") from None
 
-    def dtype(self, key: str, text: str, own: Mapping[str, str] | None = None) -> np.dtype:
+    def dtype(self, key: str, text: str, aliases: Mapping[str, str] | None = None) -> np.dtype:
         """Return the type of values that a field names, as C or numpy does (see `type_of`), or raise DataError."""
-        found = type_of(text, own)
+        found = type_of(text, aliases)
         if found is None:
             raise DataError(
                 f"{self.name}: {key} is {text[:40]!r}; expected a type of numbers such as uchar, short, uint16 or float"
@@ -86,12 +86,12 @@ class Fields(dict[str, str]):
         return found
 
 
-def type_of(text: str, own: Mapping[str, str] | None = None) -> np.dtype | None:
+def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | None:
     """Return the type of numbers that a name such as ``unsigned short int``, ``uchar`` or ``uint16_t`` stands for.
 
     Args:
         text: the name, in any case, words separated by blanks or underscores.
-        own: numpy's code of names that a format has for itself, without blanks, in lower case; they come first.
+        aliases: numpy's code of names that a format has for itself, without blanks, in lower case; they come first.
 
     Returns:
         The type in native byte order; None for an unknown name. A ``char`` is signed, a ``byte`` is not.
@@ -101,7 +101,7 @@ def type_of(text: str, own: Mapping[str, str] | None = None) -> np.dtype | None:
     unsigned = words[:1] == ["unsigned"]
     word = "".join(words[1:] if words[:1] in (["unsigned"], ["signed"]) else words)
     word = word.removesuffix("int") if word not in ("int", "uint") else word
-    codes = {**_TYPES, **(own or {})}
+    codes = {**_TYPES, **(aliases or {})}
     if word.startswith("u") and word[1:] in codes and word not in codes:
         unsigned, word = True, word[1:]
     if word in codes:

@@ -18,12 +18,12 @@ from vvgt_cli.volume.types import Volume
 
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
 NAMED = re.compile(r"label|seg(?![a-z])|segment|atlas|parc|aseg", re.I)
-MOST = 1 << 21  # labels that are counted
+MAX_LABELS = 1 << 21  # labels that are counted
 SORTED = 1 << 16  # span of a plane's values above which they are sorted, not counted
 
 
 def labels_in(volume: Volume) -> list[int]:
-    """List a volume's labels, ascending, without NaN; raise DataError for fractions, or more than `MOST`."""
+    """List a volume's labels, ascending, without NaN; raise DataError for fractions, or more than `MAX_LABELS`."""
     kind = volume.data.dtype
     if kind.kind in "iu" and kind.itemsize <= 2 and (volume.slope, volume.intercept) == (1, 0):
         counts, first = count_integers(volume)
@@ -39,8 +39,8 @@ def labels_in(volume: Volume) -> list[int]:
                 "scalars leave out --labels"
             )
         found = np.union1d(found, values)
-        if len(found) > MOST:
-            raise DataError(f"{volume.name}: more than {MOST} different values; expected a label map")
+        if len(found) > MAX_LABELS:
+            raise DataError(f"{volume.name}: more than {MAX_LABELS} different values; expected a label map")
     return [int(value) for value in found]
 
 

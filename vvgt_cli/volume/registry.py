@@ -15,6 +15,7 @@ from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
@@ -171,8 +172,7 @@ def _folder(path: Path, source: str) -> Reader:
             if reader.whole or own >= others:
                 return reader
     if lying:
-        listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
-                            for kind, names in lying.items())  # fmt: skip
+        listing = "; ".join(f"{len(names)} {kind} ({listed(names, ', ', 3)})" for kind, names in lying.items())
         raise DataError(f"{source}: a folder; expected one volume, found {listing}: give one of the files")
     kinds = ", ".join(reader.name for reader in READERS if reader.holds is not None)
     raise DataError(f"{source}: a folder; expected a volume file ({LISTED}) or a folder of {kinds}")

@@ -105,7 +105,7 @@ def slice_by_slice(read: Callable[[int], np.ndarray], dtype: np.dtype, shape: tu
     return Stored(part, dtype, shape, (1, *shape[1:]), source)
 
 
-def stored_or_held(
+def stored_or_loaded(
     read: Callable[[Slices], np.ndarray], dtype: np.dtype, shape: Sequence[int], chunks: Sequence[int], source: str,
     stored: bool,
 ) -> Any:  # fmt: skip
@@ -128,7 +128,7 @@ def put_overlap(out: np.ndarray, first: Sequence[int], block: np.ndarray, at: Se
         out[there] = block[here]
 
 
-def held(volume: Volume) -> Volume:
+def loaded(volume: Volume) -> Volume:
     """Load the values of a volume into memory; raise DataError if they do not fit."""
     if not isinstance(volume.data, Stored):
         return volume

@@ -38,7 +38,7 @@ ENOUGH = 1 << 14  # mean Gaussians of a region from which it is not widened
 LARGEST = 1 << 28  # bytes of its voxels while they are read
 
 
-class Node(NamedTuple):
+class CutNode(NamedTuple):
     """The Gaussians of a tile.
 
     Attributes:
@@ -81,7 +81,7 @@ class Cut:
 
     trees: TileTrees
     opaque: Opaque
-    plan: Plan
+    plan: ShardPlan
     key: str
 
     @property
@@ -122,7 +122,7 @@ class Cut:
         lo: np.ndarray = np.array(place) // regions.width * edge
         return lo, np.minimum(lo + edge, grid.dims)
 
-    def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[Node]:
+    def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[CutNode]:
         """Return the nodes of the tiles from ``begin`` to ``end``, with a level for each of their ``thresholds``.
 
         Tiles are made together, since the colours of neighbours depend on each other.
@@ -142,7 +142,7 @@ class Cut:
         made = []
         for node, size, last in zip(cuts, sizes, np.cumsum(sizes, axis=0), strict=True):
             gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, last, strict=True)]
-            made.append(Node(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
+            made.append(CutNode(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
         return made
 
     def make(self, leaves: Leaves) -> Gaussians:
@@ -207,7 +207,7 @@ def open_cut(store: BlockStore, key: str) -> Cut:
     from vvgt_cli.closed_form.surface_offset import SURFACE, nowhere, smoothed
     from vvgt_cli.field.tiled_tree import Coarse, TileTrees
 
-    plan, coarse = Plan.load(store), Coarse.load(store)
+    plan, coarse = ShardPlan.load(store), Coarse.load(store)
     grid, half = plan.grid, np.array(plan.grid.half)
     edge = grid.cell_edge * 2.0**grid.field
     opaque = nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
@@ -228,7 +228,7 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
     from vvgt_cli.field.tiled_tree import Coarse
 
     store = run_pass.store
-    plan = Plan.load(store)
+    plan = ShardPlan.load(store)
     lit = SHADE if load_light(store, plan) else ()
     run.compile(for_degree((*MERGE, *lit), plan.degree))
     with run.stage("pyramid") as stage:
@@ -254,7 +254,7 @@ KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels,
 
 
 @dataclass(frozen=True)
-class Plan:
+class ShardPlan:
     """The grid of cells, the budget and the layout of the output.
 
     Attributes:
@@ -295,7 +295,7 @@ class Plan:
             temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
 
     @classmethod
-    def load(cls, store: BlockStore) -> Plan:
+    def load(cls, store: BlockStore) -> ShardPlan:
         """Read the plan beside blocks; raise DataError if it is missing or damaged."""
         path = store.folder / PLAN
         try:
@@ -316,7 +316,7 @@ class Plan:
             raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
 
 
-def load_light(store: BlockStore, plan: Plan) -> Light | None:
+def load_light(store: BlockStore, plan: ShardPlan) -> Light | None:
     """Read the light beside a plan, None for none; raise DataError if the file is missing or damaged."""
     if plan.ply.light is None:
         return None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CUTS = 10
 STEP = 4.0  # factor of the score from a cut to the next: a cell's grows as the fourth power of its edge
 FEWER = 9  # ratio of Gaussians of a level to the next: three times the edge, on a surface
-MOST_LEVELS = 6
+MAX_LEVELS = 6
 LEAST_PRICE, HALVINGS = 1e-12, 60  # price of a Gaussian in squared error, and steps of its bisection
 FIELDS = ("counts", "squares", "energies", "pixels")
 FEWEST = 4  # mean Gaussians of a node below which no further level is made
@@ -83,7 +83,7 @@ class CutErrors:
         """Return the cuts (N,) of each level: the finest, then the best with a ninth of the Gaussians before."""
         found = [np.zeros(len(self.counts), np.int64)]
         before = self.total(found[0])
-        while len(found) < MOST_LEVELS and before >= FEWEST * len(self.counts):
+        while len(found) < MAX_LEVELS and before >= FEWEST * len(self.counts):
             further = self.for_count(before / FEWER)
             count = self.total(further)
             if 2 * count > before:

@@ -1,6 +1,6 @@
 """The Gaussians of a cut region by region, of the closed form or refined; a region is a task for any worker.
 
-The Gaussians of a `Part` of a volume are fitted to pictures of that part alone. Premultiplied pictures compose front to
+The Gaussians of a `VolumePart` of a volume are fitted to pictures of it alone. Premultiplied pictures compose front to
 back. So if the Gaussians of every part show what the part shows, all of them show what the volume shows, and parts can
 be fitted in any order, by any number of workers, without an exchange.
 """
@@ -17,17 +17,16 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import RADIUS, pixel_width
-from vvgt_cli.conversion.shards.cut import Cut, Node, Regions
+from vvgt_cli.conversion.shards.cut import Cut, CutNode, Regions
 from vvgt_cli.conversion.shards.level_selection import FIELDS, CutErrors, errors_of
 from vvgt_cli.conversion.stages.refinement import CHECK_EVERY, WIDER
 from vvgt_cli.conversion.stages.views import ray_settings, view_count
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import RenderSettings, camera_arrays, for_thin, tiers
+from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting
-from vvgt_cli.field.reader import Box, Layers, Scalars
+from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.frames import rescale
 from vvgt_cli.gaussians.rules import Rule
@@ -42,7 +41,7 @@ REACH = 16  # voxels around a part that may hide it
 PART_RADIUS = 1.25  # of a part in its frame: half its diagonal; the default views show all but its corners
 
 
-class Part:
+class VolumePart:
     """The voxels of a box, cut out of a volume: a ray is transparent before and behind them.
 
     Its frame is centred on the box, with the directions of the volume's box frame, scaled so that half the diagonal is
@@ -54,14 +53,14 @@ class Part:
     """
 
     def __init__(
-        self, reader: Scalars | Layers, frame: Frame, dims: tuple[int, int, int], lo: np.ndarray, hi: np.ndarray,
+        self, reader: Scalars | Layers, frame: BoxFrame, dims: tuple[int, int, int], lo: np.ndarray, hi: np.ndarray,
         light: Light | None = None,
     ) -> None:  # fmt: skip
         """Read the voxels ``lo`` to ``hi`` (3,), x first, of a volume of ``dims`` voxels with this ``frame``."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
         halo = REACH + (HALO if light is None else LIT_HALO)
-        self.box: Box = reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, dims))
+        self.box: VoxelBox = reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, dims))
         self._lo, self._hi, self._dims, self._frame, self._light = lo, hi, dims, frame, light
         self.centre = (lo + hi) / 2 * frame.step - frame.half
         self.scale = PART_RADIUS / float(np.linalg.norm((hi - lo) / 2 * frame.step))
@@ -72,7 +71,7 @@ class Part:
         """Render a picture (h, w, 4) of the part, as `render_view` does; the camera is in the part's frame."""
         eye, basis, lens = self._arrays(camera)
         out = np.zeros((camera.height, camera.width, 4), np.float32)
-        box = Frame((self._hi - self._lo) / 2 * self._frame.step * self.scale, self._frame.step * self.scale)
+        box = BoxFrame((self._hi - self._lo) / 2 * self._frame.step * self.scale, self._frame.step * self.scale)
         for rays in tiers(for_thin(settings, box, camera), out, blocks):
             for offsets, mask, known in rays:
                 row, column = np.nonzero(mask)
@@ -119,7 +118,7 @@ class Part:
 
     def _arrays(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return `camera_arrays` of a camera in the part's frame, in voxels of the volume."""
-        frame = Frame(self._frame.half * self.scale, self._frame.step * self.scale)
+        frame = BoxFrame(self._frame.half * self.scale, self._frame.step * self.scale)
         eye, basis, lens = camera_arrays(frame, camera)
         return eye + self.centre / self._frame.step, basis * self.scale, lens
 
@@ -180,11 +179,11 @@ class RegionNodes:
             errors = errors_of([node.levels for node in nodes]) if self.least else {}
         save(self.cut.store, self.kind, number, nodes, errors)
 
-    def _refined(self, nodes: list[Node], number: int, refiner: Refiner) -> list[Node]:
+    def _refined(self, nodes: list[CutNode], number: int, refiner: Refiner) -> list[CutNode]:
         """Return the nodes of a region, each level refined as a whole."""
         grid = self.cut.plan.grid
-        frame = Frame(np.array(grid.half), np.array(grid.step))
-        part = Part(refiner.reader, frame, grid.blocks.dims, *self.cut.box(self.regions, number), refiner.light)
+        frame = BoxFrame(np.array(grid.half), np.array(grid.step))
+        part = VolumePart(refiner.reader, frame, grid.blocks.dims, *self.cut.box(self.regions, number), refiner.light)
         levels = []
         for k, distance in enumerate(refiner.distances):
             own = [node.levels[k] for node in nodes]
@@ -192,12 +191,12 @@ class RegionNodes:
             ends = np.cumsum([len(each) for each in own])
             levels.append([refined.take(np.arange(e - len(each), e)) for each, e in zip(own, ends, strict=True)])
         return [
-            Node(list(made), node.spreads, node.normals)
+            CutNode(list(made), node.spreads, node.normals)
             for made, node in zip(zip(*levels, strict=True), nodes, strict=True)
         ]
 
 
-def save(store: BlockStore, kind: str, number: int, nodes: Sequence[Node], more: dict[str, np.ndarray]) -> None:
+def save(store: BlockStore, kind: str, number: int, nodes: Sequence[CutNode], more: dict[str, np.ndarray]) -> None:
     """Save nodes of one region."""
     arrays: dict[str, np.ndarray] = {
         "counts": np.array([[len(level) for level in node.levels] for node in nodes]),
@@ -212,7 +211,7 @@ def save(store: BlockStore, kind: str, number: int, nodes: Sequence[Node], more:
 
 
 @dataclass(frozen=True)
-class Made:
+class StoredGaussians:
     """The Gaussians of a cut, in the store.
 
     Attributes:
@@ -258,7 +257,7 @@ class Made:
 
 def make_regions(
     run: Run, run_pass: Pass, cut: Cut, thresholds: np.ndarray, refiner: Refiner | None = None, least: bool = True
-) -> Made:
+) -> StoredGaussians:
     """Make the Gaussians of a cut region by region; results of an interrupted run are reused.
 
     Args:
@@ -283,7 +282,7 @@ def make_regions(
         workers, edge = run_pass.runner.workers, int((regions.width * cut.plan.grid.tile).max())
         steps_of = "" if refiner is None else f"{refiner.descent.steps} steps in each of "
         stage.note = f"{steps_of}{len(task)} regions of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
-    return Made(cut.store, kind, regions.ends)
+    return StoredGaussians(cut.store, kind, regions.ends)
 
 
 PIXEL = 3.0  # width of a pixel of the training views, in median standard deviations of the middle axis
@@ -309,7 +308,7 @@ class PartDescent:
     seed: int = 0
     target_psnr: float | None = None
 
-    def __call__(self, part: Part, gaussians: Gaussians, distance: float = RADIUS) -> Gaussians:
+    def __call__(self, part: VolumePart, gaussians: Gaussians, distance: float = RADIUS) -> Gaussians:
         """Return Gaussians of the volume's box frame, refined; the given ones where descent does not help.
 
         Args:

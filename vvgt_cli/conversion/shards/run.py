@@ -20,10 +20,10 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
-from vvgt_cli.conversion.plan import FEWEST_STEPS
+from vvgt_cli.conversion.plan import most_steps, steps_in_time
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
-from vvgt_cli.conversion.shards.cut import Cut, Plan, cut_of, disk_bytes, most_cells
-from vvgt_cli.conversion.shards.regions import Made, PartDescent, Refiner, make_regions
+from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes, most_cells
+from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
 from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
@@ -126,21 +126,19 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     run.console.message(f"more than {MANY:,} Gaussians: refined region by region (docs/scale.md)")
     make_blocks(run, request, field)
     cut = cut_of(run, field.run_pass)
-    threshold, made, _ = closed_form(run, field.run_pass, cut)
+    threshold, stored, _ = closed_form(run, field.run_pass, cut)
     over = cut.over_tiles(threshold)
     refiner = refiner_of(run, request, field)
     if refiner is not None:
         thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
-        made = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
-    return concatenate([gaussians for gaussians, _ in chain(made.regions(), [] if over is None else [over])])
+        stored = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
+    return concatenate([gaussians for gaussians, _ in chain(stored.regions(), [] if over is None else [over])])
 
 
 def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | None:
     """Return the refiner of a request's steps, as many as there is time for; None for no steps."""
     fit, limits = request.fit, request.limits
-    ended = limits.target_psnr is not None or limits.time_budget is not None
-    steps = fit.most_steps(ended)
-    degree, fewest = degree_of(request, field.source), min(FEWEST_STEPS, steps)
+    steps, degree = most_steps(fit, limits), degree_of(request, field.source)
     chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
     if chosen.is_file():
         steps = int(chosen.read_text("ascii"))
@@ -148,10 +146,9 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     elif steps and limits.time_budget is not None:
         each = A_STEP * pace() * HARMONICS[degree] * fit.max_gaussians / field.run_pass.runner.workers
         left = limits.time_budget - run.elapsed() - A_WRITE * fit.max_gaussians
-        steps = min(steps, max(int(left / each), 0))
-        if steps < fewest:
+        steps = steps_in_time(steps, left, lambda steps: steps * each)
+        if not steps:
             run.skip("refinement", f"{max(left, 0.0):.1f} s remain")
-            steps = 0
         with atomic_write(chosen, overwrite=True) as temporary:
             temporary.write_text(str(steps), "ascii")
     if not steps:
@@ -171,7 +168,7 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     run = Run(console or Console(), ConversionReport("merge"))
     store = BlockStore(Path(folder).absolute())
     store.settings()
-    plan, threads = Plan.load(store), thread_count()
+    plan, threads = ShardPlan.load(store), thread_count()
     workers = worker_count(BlockOptions(), math.prod(plan.grid.blocks.dims), plan.budget, threads)
     with (
         _written(output) as outputs,
@@ -239,7 +236,7 @@ def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     field.views.expect(scored_views(size))
     cells = field.cells(size, budget, most_cells(budget))
     assert cells.rays is not None
-    Plan(
+    ShardPlan(
         cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
         tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree, field.reader.voxel_bytes,
     ).save(store, cells.light)  # fmt: skip
@@ -292,9 +289,9 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     from vvgt_cli.closed_form.lit import directions
 
     plan, size, free, store = cut.plan, cut.plan.size, free_memory(), run_pass.store
-    threshold, made, removed = closed_form(run, run_pass, cut)
+    threshold, stored, removed = closed_form(run, run_pass, cut)
     over = cut.over_tiles(threshold)
-    count = int(made.field("counts").sum()) + (0 if over is None else len(over[0]))
+    count = int(stored.field("counts").sum()) + (0 if over is None else len(over[0]))
     axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
     degree = plan.written_degree
     if output != STDOUT:
@@ -302,7 +299,7 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, size) < free else None
     with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
         sink.write(ply_header(count, degree, plan.ply))
-        for gaussians, normals in chain(made.regions(), [] if over is None else [over]):
+        for gaussians, normals in chain(stored.regions(), [] if over is None else [over]):
             normals = None if normals is None else directions(normals @ turned)
             sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
             if kept is not None:
@@ -322,7 +319,7 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
             run.report.scores, stage.note = asdict(found), score_text(found, size)
 
 
-def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, Made, int]:
+def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, StoredGaussians, int]:
     """Make the Gaussians of a plan's budget, or fewer where most are faint.
 
     Returns:
@@ -332,17 +329,17 @@ def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, Made, int]:
         DataError: a block is damaged.
     """
 
-    def cut_for(budget: int) -> tuple[tuple[float, Made], int, bool]:
+    def cut_for(budget: int) -> tuple[tuple[float, StoredGaussians], int, bool]:
         threshold = cut.tiled_tree.threshold(budget)
         thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
         found = make_regions(run, run_pass, cut, thresholds, least=False)
         logits = found.field("opacity_logits-0")
         return (threshold, found), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
 
-    (threshold, made), removed = thin(cut.plan.budget, cut_for)
+    (threshold, stored), removed = thin(cut.plan.budget, cut_for)
     if removed:
         run.skip(f"{removed} Gaussians", TOO_FAINT)
-    return threshold, made, removed
+    return threshold, stored, removed
 
 
 @contextmanager
@@ -372,7 +369,7 @@ def scored_views(size: int) -> list[Picture]:
     return [Picture(cameras[i], settings, spread_blocks(size, size, i, BLOCKS_A_VIEW)) for i in PREVIEW_VIEWS]
 
 
-def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: Plan, rule: str | Rule = INRIA) -> Scores:
+def score_gaussians(gaussians: Gaussians, store: BlockStore, plan: ShardPlan, rule: str | Rule = INRIA) -> Scores:
     """Score Gaussians (box frame), drawn by a rule, on the stored views; raise DataError if a block is damaged."""
     from vvgt_cli.images.metrics import score_views
     from vvgt_cli.splat import render

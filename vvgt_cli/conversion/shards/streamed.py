@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vvgt_cli.conversion.shards.level_selection import measure_cuts
-from vvgt_cli.conversion.shards.regions import Made, make_regions
+from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
@@ -49,13 +49,13 @@ NEAREST = 5 / SCALE  # distance in the unit frame up to which level 0 is shown; 
 def folder_of(output: str) -> Iterator[None]:
     """Make the folder of a manifest, and remove it after the block if it is empty."""
     folder = Path(output).absolute().parent
-    made = not folder.exists() and folder.parent.is_dir()
-    if made:
+    created = not folder.exists() and folder.parent.is_dir()
+    if created:
         folder.mkdir()
     try:
         yield
     finally:
-        if made:
+        if created:
             with suppress(OSError):
                 folder.rmdir()
 
@@ -92,18 +92,18 @@ def write_streamed(
         stage.note = f"{choices.shape[1]} levels of {len(tiled_tree.tiles)} nodes"
     if (refine := refiner()) is not None:
         refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
-    made = make_regions(run, run_pass, cut, errors.thresholds[choices], refine)
+    stored = make_regions(run, run_pass, cut, errors.thresholds[choices], refine)
     if refine is not None:
-        errors, choices = made.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
-    target, counts = Path(output), made.field("counts")
+        errors, choices = stored.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
+    target, counts = Path(output), stored.field("counts")
     before, folder = files_of(target), target.absolute().parent
     parts, places = divide(counts)
     axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), comments=False)
-    task = WrittenFiles(made, parts, folder, axes, SCALE, replace(options, sh_degree=cut.plan.degree))
+    task = WrittenFiles(stored, parts, folder, axes, SCALE, replace(options, sh_degree=cut.plan.degree))
     with run.stage("write") as stage, atomic_write(target, overwrite) as temporary:
         task.forget_changed()
         run_pass(task, "write")
-        spreads = made.field("spreads")
+        spreads = stored.field("spreads")
         levels = _levels(task, counts, spreads, errors, choices)
         rows = zip(*task.bounds(len(counts)), places, spreads, strict=True)
         nodes = [_node(*row) | errors.facts(k, choices[k].tolist()) for k, row in enumerate(rows)]
@@ -168,7 +168,7 @@ A_FILE = 1 << 17  # Gaussians in a file, except for those of its last node
 REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """The content of a file: a level of the nodes from ``begin`` to ``end``, and the file's number in that level."""
 
     level: int
@@ -177,7 +177,7 @@ class Part(NamedTuple):
     end: int
 
 
-def divide(counts: np.ndarray) -> tuple[tuple[Part, ...], list[list[dict[str, int]]]]:
+def divide(counts: np.ndarray) -> tuple[tuple[FilePart, ...], list[list[dict[str, int]]]]:
     """Divide the levels of nodes among files.
 
     Args:
@@ -187,13 +187,13 @@ def divide(counts: np.ndarray) -> tuple[tuple[Part, ...], list[list[dict[str, in
         The files, in the order in which their first nodes come; and for each node, by level, its file, offset and
         count.
     """
-    parts: list[Part] = []
+    parts: list[FilePart] = []
     for level in range(counts.shape[1]):
         begin, rows, number = 0, 0, 0
         for node, count in enumerate(counts[:, level].tolist(), 1):
             rows += count
             if rows >= A_FILE or node == len(counts):
-                parts.append(Part(level, number, begin, node))
+                parts.append(FilePart(level, number, begin, node))
                 begin, rows, number = node, 0, number + 1
     parts.sort(key=lambda part: (part.begin, part.level))
     places: list[list[dict[str, int]]] = [[{} for _ in range(counts.shape[1])] for _ in range(len(counts))]
@@ -213,7 +213,7 @@ class WrittenFiles:
     The store records its bytes and time, by which a later run recognises it, and the bounds of its nodes.
 
     Attributes:
-        made: Gaussians of all nodes, box frame.
+        gaussians: Gaussians of all nodes, box frame.
         parts: content of the files.
         folder: folder of the manifest.
         axes: (3, 3) turn into the frame of the file.
@@ -221,8 +221,8 @@ class WrittenFiles:
         options: layout of the Gaussians.
     """
 
-    made: Made
-    parts: tuple[Part, ...]
+    gaussians: StoredGaussians
+    parts: tuple[FilePart, ...]
     folder: Path
     axes: np.ndarray
     scale: float
@@ -231,7 +231,7 @@ class WrittenFiles:
     @property
     def kind(self) -> str:
         """Kind of the results."""
-        return f"written-{digest(self.made.kind, str(self.folder))[:16]}"
+        return f"written-{digest(self.gaussians.kind, str(self.folder))[:16]}"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -246,7 +246,7 @@ class WrittenFiles:
         """Write file ``number``."""
         part, target = self.parts[number], self.folder / self.names[number]
         lows, highs, waiting = [], [], []
-        for gaussians in self.made.level(part.level, part.begin, part.end):
+        for gaussians in self.gaussians.level(part.level, part.begin, part.end):
             splats = self._splats(gaussians)
             reach = REACH * np.exp(splats.log_scales.max(axis=1, keepdims=True))
             lows.append((splats.means - reach).min(axis=0))
@@ -254,7 +254,7 @@ class WrittenFiles:
             waiting.append(splats.take(morton_order(splats.means)))
         size = _written(target, joined(waiting))
         written = np.array([size, target.stat().st_mtime_ns])
-        self.made.store.save(self.kind, number, size=written, lows=np.array(lows), highs=np.array(highs))
+        self.gaussians.store.save(self.kind, number, size=written, lows=np.array(lows), highs=np.array(highs))
 
     def _splats(self, gaussians: Gaussians) -> Splats:
         splats = splats_of(transform(gaussians, self.axes), self.options)
@@ -263,7 +263,7 @@ class WrittenFiles:
 
     def forget_changed(self) -> None:
         """Forget files that are missing, or were changed since this run wrote them."""
-        store = self.made.store
+        store = self.gaussians.store
         done = [number for number in range(len(self)) if not store.missing(self.kind, [number])]
         for number in done:
             target = self.folder / self.names[number]
@@ -273,13 +273,13 @@ class WrittenFiles:
 
     def size(self, number: int) -> int:
         """Return the bytes of a written file."""
-        return int(self.made.store.load(self.kind, number, names=("size",))["size"][0])
+        return int(self.gaussians.store.load(self.kind, number, names=("size",))["size"][0])
 
     def bounds(self, nodes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest corners (nodes, 3) of all nodes, over their levels."""
         low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
         for number, part in enumerate(self.parts):
-            found, own = self.made.store.load(self.kind, number), slice(part.begin, part.end)
+            found, own = self.gaussians.store.load(self.kind, number), slice(part.begin, part.end)
             low[own] = np.minimum(low[own], found["lows"])
             high[own] = np.maximum(high[own], found["highs"])
         return low, high

@@ -10,7 +10,7 @@ from vvgt_cli.conversion.stages.refinement import step_seconds
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.jit.ahead import BACK_PROJECT
 
-STEPS = 105.0  # steps of gradient descent on whole views that take as long
+EQUIVALENT_STEPS = 105.0  # steps of gradient descent on whole views that take as long
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class BackProjection(Stage):
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost of as many steps of descent."""
-        return Cost(STEPS * step_seconds(workload, small=False))
+        return Cost(EQUIVALENT_STEPS * step_seconds(workload, small=False))
 
     def run(self, work: Work) -> None:
         """Split cells and solve colours."""

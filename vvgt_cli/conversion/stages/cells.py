@@ -50,11 +50,11 @@ class CellsByError(Stage):
         with run.stage(self.name) as stage:
             chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
-            before = work.psnr(work.made())
+            before = work.psnr(work.current())
             found = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
             after = work.psnr(found)
             stage.kept = work.keep_better(before, after, found)
             stage.note = f"{len(found)} Gaussians, by {len(chosen)} views; from {before:.2f} dB on the check views"
             stage.psnr_before, stage.psnr = before, after
         if self.keep:
-            work.checkpoint.save(CELLS, work.made())
+            work.checkpoint.save(CELLS, work.current())

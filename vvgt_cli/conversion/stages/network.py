@@ -41,7 +41,7 @@ class Network(Stage):
 
         assert work.train is not None
         assert work.train_rule is not None
-        run, given, train = work.run, work.made(), work.train
+        run, given, train = work.run, work.current(), work.train
         with run.stage(self.name) as stage:
             model = Model.open(find_model(self.model), numba.get_num_threads())
             bar, plain = run.console.bar(self.name), given.of_degree(0)  # the network takes no harmonics

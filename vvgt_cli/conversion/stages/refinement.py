@@ -79,7 +79,7 @@ class Refinement(Stage):
             seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
-        start = work.made()
+        start = work.current()
         begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
         work.gaussians = _drop_undrawn(work, refine(work.run, start, work.train, work.check, options, begin))
 

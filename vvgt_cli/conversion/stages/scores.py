@@ -69,7 +69,7 @@ class TestViews(Stage):
         with run.stage(self.name) as stage:
             scores = score_test_views(
                 work.field.views,
-                work.made(),
+                work.current(),
                 fit.size,
                 RenderSettings(),
                 rule=fit.rule,
@@ -132,7 +132,7 @@ class ViewingConditions(Stage):
             run.skip(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            made, settings = work.made(), RenderSettings()
+            made, settings = work.current(), RenderSettings()
             seen = condition_views(work.field.views, self._wanted(fit.size), settings)
             conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)), fit.rule)
             run.report.conditions = [asdict(condition) for condition in conditions]

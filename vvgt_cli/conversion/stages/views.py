@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
 
-MOST_VIEWS = 120  # maximal number of training views of gradient descent, in whole sets
+MAX_VIEWS = 120  # maximal number of training views of gradient descent, in whole sets
 VIEWS_A_STEP = 0.65, 0.85  # small and large views per step: fewer overfit, more cost steps (docs/log/refinement.md)
 MARGIN, SAMPLES = 4.0, 12.0  # dB, for views that are means over their pixels, and for samples of screen pixels
 LONGER = 6.0  # extra dB for longer steps, whose errors are the same from all sides
@@ -35,7 +35,7 @@ SOLID = 0.9  # median opacity of opaque bodies
 def view_count(steps: int, small: bool) -> int:
     """Return the number of training views for a number of steps, in whole sets."""
     fewest, each = SET_VIEWS["train"], VIEWS_A_STEP[0] if small else VIEWS_A_STEP[1]
-    return fewest * min(max(round(each * steps / fewest), 1), MOST_VIEWS // fewest)
+    return fewest * min(max(round(each * steps / fewest), 1), MAX_VIEWS // fewest)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class TrainingViews(Stage):
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:
-            settings = ray_settings(work.field.views, work.made(), self.edge, work.train_rule, _spread(footprint))
+            settings = ray_settings(work.field.views, work.current(), self.edge, work.train_rule, _spread(footprint))
         cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
             images = render_views(work.field.views, cameras, settings, progress=work.run.console.bar(self.name))

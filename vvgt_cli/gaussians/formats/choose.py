@@ -24,7 +24,7 @@ from vvgt_cli.volume.blocks import check_memory
 
 _HEAD = 1024  # bytes that identify a compressed .ply
 _LARGEST = 1 << 32  # bytes of a file that is read whole
-NOTHING = page_live.Extras()
+NO_EXTRAS = page_live.Extras()
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Format:
         read: maps bytes and the file's name, for errors, to columns.
         needs: given a name for errors, raises DataError if a library is not installed.
         layout: maps the options for a `.ply` to those for this format.
-        live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, the form
+        write_live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, the form
             without values to show first, or None, and slices of the volume, or None; None if the format cannot store
             values.
         write_nodes: like ``write`` for several clouds as nodes of one file; None if the format has no nodes.
@@ -48,7 +48,7 @@ class Format:
     read: Callable[[bytes, str], Splats]
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
-    live: Callable[[Gaussians, PlyOptions, str, Splats | None, Slices | None], bytes] | None = None
+    write_live: Callable[[Gaussians, PlyOptions, str, Splats | None, Slices | None], bytes] | None = None
     write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
 
@@ -84,7 +84,7 @@ def ready(path: str | Path) -> None:
 
 def encoded(
     known: Format, gaussians: Gaussians, options: PlyOptions, name: str,
-    extras: page_live.Extras = NOTHING,
+    extras: page_live.Extras = NO_EXTRAS,
 ) -> bytes:  # fmt: skip
     """Encode Gaussians (unit frame) in another format, with the layout of `PlyOptions`.
 
@@ -98,18 +98,18 @@ def encoded(
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
     """
-    if gaussians.live is not None and options.live is not None and known.live is not None:
-        return known.live(gaussians, options, name, None, extras.slices)
+    if gaussians.live is not None and options.live is not None and known.write_live is not None:
+        return known.write_live(gaussians, options, name, None, extras.slices)
     if gaussians.live is not None:
         why = f"{known.suffix} cannot store values for other functions"
         warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     splats = splats_of(gaussians, known.layout(options))
-    if known.live is None:
+    if known.write_live is None:
         return known.write(splats, name)
     if extras.live is None:
         return page_file.html(splats, name, extras.slices)
-    return known.live(*extras.live, name, splats, extras.slices)
+    return known.write_live(*extras.live, name, splats, extras.slices)
 
 
 def is_splats(path: str | Path) -> bool:

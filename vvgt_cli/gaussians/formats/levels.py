@@ -94,9 +94,9 @@ class StreamedLevels:
         """Read the Gaussians of each node at its own level."""
         places = []
         for node, level in zip(self._nodes, levels, strict=True):
-            held = {int(key): place for key, place in node["lods"].items()}
-            own = [key for key in held if key <= level]
-            places += [held[max(own) if own else min(held)]] if held else []
+            files = {int(key): place for key, place in node["lods"].items()}
+            own = [key for key in files if key <= level]
+            places += [files[max(own) if own else min(files)]] if files else []
         free, rows = free_memory(), sum(place["count"] for place in places)
         if free is not None and ROW_BYTES * rows > free:
             need = ROW_BYTES * rows / 2**30

@@ -92,11 +92,10 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Seq
 
 
 def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, Any]:
-    labels = [{"number": e.number, "name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in layer.labels]
     return {
         "title": layer.name,
         "row": row,
-        "labels": labels,
+        "labels": [label.page_entry() for label in layer.labels],
         "values": [layer.lo, layer.hi],
         "unit": layer.unit,
         "quantity": layer.quantity,

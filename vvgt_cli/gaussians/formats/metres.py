@@ -71,10 +71,10 @@ def offset_in(root: np.ndarray, place: np.ndarray, comments: tuple[str, ...], na
     return found
 
 
-def same_place(found: np.ndarray, comments: tuple[str, ...], name: str) -> None:
-    """Raise DataError unless ``found`` (4, 4), data to scene, is where vvgt puts a file, or the half turn alone."""
+def same_place(matrix: np.ndarray, comments: tuple[str, ...], name: str) -> None:
+    """Raise DataError unless ``matrix`` (4, 4), data to scene, is where vvgt puts a file, or the half turn alone."""
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
-    if not any(np.allclose(found, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
+    if not any(np.allclose(matrix, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(
             f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (rotated by "
             "180 degrees about z, in metres where their unit is known)"

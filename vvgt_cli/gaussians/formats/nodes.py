@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.volume.components import listed
 
 ROOT = "Splats"  # name of the node that places the others
 
@@ -63,5 +64,5 @@ def common_comments(nodes: Sequence[Node]) -> tuple[str, ...]:
 def report_off(name: str, off: Sequence[str]) -> None:
     """Warn that a file has nodes of Gaussians that are switched off, by their names."""
     if off:
-        shown = ", ".join(off[:5]) + (", ..." if len(off) > 5 else "")
+        shown = listed(off, ", ", 5)
         warnings.warn(f"{name}: {len(off)} of its nodes are switched off, and read all the same: {shown}", stacklevel=2)

@@ -25,7 +25,7 @@ from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
-from vvgt_cli.gaussians.formats.page_frames import held_frames
+from vvgt_cli.gaussians.formats.page_frames import stored_frames
 from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.frames import up_matrix
@@ -154,12 +154,12 @@ def page(
     Args:
         title: title of the window.
         splats: columns of the first frame.
-        frames: per frame its ``name`` and ``file``; if it is embedded in the page, the id of the element that it is
-            ``held`` in, and for a difference the number of the ``whole`` frame that it refers to.
+        frames: per frame its ``name`` and ``file``; if it is embedded in the page, the id of its
+            ``element``, and for a difference the number of the ``whole`` frame that it refers to.
         elements: HTML elements with the viewer.
         more: further entries of the scene for the viewer.
     """
-    seen = {"camera": camera(splats), "outermost": outermost([splats])}
+    seen = {"camera": camera(splats)} | ({} if "outermost" in more else {"outermost": outermost([splats])})
     return _text(title, {"rule": rule_parameters(splats), **seen, "frames": list(frames), **more}, elements)
 
 
@@ -198,7 +198,7 @@ def _digest(content: bytes) -> str:
 def html(splats: Splats, name: str, slices: Slices | None = None) -> bytes:
     """Return the page of one cloud as a single file, with the slices of its volume."""
     clouds = [(title_of(name, splats.comments), splats)]
-    return html_of_several(clouds, name, slices.held, slices.scene) if slices else html_of_several(clouds, name)
+    return html_of_several(clouds, name, slices.elements, slices.scene) if slices else html_of_several(clouds, name)
 
 
 def html_of_several(
@@ -219,17 +219,17 @@ def html_of_several(
         more: further entries of the scene for the viewer.
         prefix: of the ids of the elements with the clouds; `read_html` finds "splats".
     """
-    held = [("program", "text/plain", asset(PROGRAM))]
-    held += [(key, "application/octet-stream", content) for key, content in embedded.items()]
-    shown = held_frames(clouds)
-    held += [(f"{prefix}-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
+    contents = [("program", "text/plain", asset(PROGRAM))]
+    contents += [(key, "application/octet-stream", content) for key, content in embedded.items()]
+    shown = stored_frames(clouds)
+    contents += [(f"{prefix}-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
-        for key, kind, content in held
+        for key, kind, content in contents
     ]
     elements.append(f"<script>{asset('inflate.js').decode('utf-8')}</script>")
     frames: list[dict[str, Any]] = [
-        {"name": cloud, "file": f"{k}.compressed.ply", "held": f"{prefix}-{k}"} for k, (cloud, _) in enumerate(clouds)
+        {"name": text, "file": f"{k}.compressed.ply", "element": f"{prefix}-{k}"} for k, (text, _) in enumerate(clouds)
     ]
     for frame, (_, whole) in zip(frames, shown, strict=True):
         frame |= {} if whole is None else {"whole": whole}

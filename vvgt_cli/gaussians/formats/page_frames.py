@@ -16,16 +16,16 @@ LEAST = 0.2  # smallest share of rows in common with the whole frame
 GAP = 16  # equal bytes that are kept within a run, as a new run costs 8 bytes
 
 
-class Held(NamedTuple):
+class StoredFrame(NamedTuple):
     """A frame stored in a page: a `.compressed.ply`, or the difference from that of frame ``whole``."""
 
     content: bytes
     whole: int | None
 
 
-def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
+def stored_frames(clouds: Sequence[tuple[str, Splats]]) -> list[StoredFrame]:
     """Return all frames (name, columns), those that share rows with the last whole frame as differences."""
-    clouds, found = _of_one_length(clouds), list[Held]()
+    clouds, found = _of_one_length(clouds), list[StoredFrame]()
     while len(found) < len(clouds):
         first = len(found)
         key = clouds[first][1]
@@ -37,9 +37,9 @@ def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
             order = order[np.argsort(ever[order], kind="stable")]  # unchanged Gaussians first
         name, splats = clouds[first]
         base = compressed_ply(splats, name, order)
-        found.append(Held(base, None))
+        found.append(StoredFrame(base, None))
         for name, splats in clouds[first + 1 : first + 1 + count]:
-            found.append(Held(patch(base, compressed_ply(splats, name, order)), first))
+            found.append(StoredFrame(patch(base, compressed_ply(splats, name, order)), first))
     return found
 
 
@@ -76,13 +76,3 @@ def patch(base: bytes, content: bytes) -> bytes:
     first, last = at[np.concatenate([[0], breaks + 1])], at[np.concatenate([breaks, [len(at) - 1]])] + 1
     runs = zip(first.tolist(), last.tolist(), strict=True)
     return b"".join(struct.pack("<II", i, j - i) + content[i:j] for i, j in runs)
-
-
-def patched(base: bytes, runs: bytes) -> bytes:
-    """Apply a `patch` to ``base``."""
-    out, at = bytearray(base), 0
-    while at < len(runs):
-        place, length = struct.unpack_from("<II", runs, at)
-        out[place : place + length] = runs[at + 8 : at + 8 + length]
-        at += 8 + length
-    return bytes(out)

@@ -23,14 +23,16 @@ from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import OPAQUE, law_nodes
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.lighting import MATTE, MOST, Lighting
+from vvgt_cli.look.labels import merge_labels
+from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import named_function, names
 from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.tables import extinction
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
-HELD = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
+VALUES_ID = "values"  # prefix of the ids of elements with the bytes, followed by the number of the cloud
 SAMPLED, FEW = 96, 12  # nodes for colours that are not interpolated linearly in RGB: of the file's function, of presets
 ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
@@ -81,17 +83,18 @@ def live_html_of_several(
     light = clouds[0][2].light
     if light is not None and light.headlight + len(light.directions) > 1:
         warnings.warn(f"{name}: the page shows one light at a time, and begins with the first", stacklevel=2)
-    held = dict(zip(facts["held"], planes, strict=True)) | (slices.held if slices else {})
+    contents = dict(zip(facts["elements"], planes, strict=True)) | (slices.elements if slices else {})
     more: dict[str, Any] = {"live": facts} | (slices.scene if slices else {})
     if converted is not None:
-        held["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
+        contents["splats-0"] = compressed_ply(converted, name)  # what `read_html` finds
         found = clouds[0][2].certificate
         score = "" if found is None else f", {found.psnr:.1f} dB"
         more["converted"] = {
-            "file": "converted.compressed.ply", "held": "splats-0", "said": f"converted{score}", "count": len(converted)
+            "file": "converted.compressed.ply", "element": "splats-0", "said": f"converted{score}",
+            "count": len(converted),
         }  # fmt: skip
     named = [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)]
-    return html_of_several(named, name, held, more, "splats" if converted is None else "live")
+    return html_of_several(named, name, contents, more, "splats" if converted is None else "live")
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
@@ -124,7 +127,7 @@ def contents(options: PlyOptions, name: str, names: Sequence[str] = (), slices: 
     labels = sum(len(layer.labels) for layer in layers) or (slices.labels if slices else 0)
     parts += [f"names of {labels} label{'s' * (labels > 1)}"] if labels else []
     stated = [layer.name for layer in layers if layer.name] if len(layers) > 1 else list(names)
-    parts += [f"the names {', '.join(stated[:3])}{', ...' if len(stated) > 3 else ''}"] if stated else []
+    parts += [f"the names {listed(stated, ', ', 3)}"] if stated else []
     parts += [str(slices)] if slices else []
     parts += ["a checksum of the volume"] if options.certificate else []
     return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"
@@ -149,8 +152,7 @@ def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     """Return common facts about one layer of each file, None if there are none."""
     first = facts[0]
     if all(one.labels for one in facts):
-        labels = {(label.number, label.name): label for one in reversed(facts) for label in one.labels}
-        return replace(first, labels=tuple(labels[key] for key in sorted(labels)))
+        return replace(first, labels=merge_labels(label for one in facts for label in one.labels))
     looks = {(bool(one.labels), one.lo, one.hi, one.function) for one in facts}
     return first if len(looks) == 1 else None
 
@@ -181,15 +183,15 @@ def live_page_data(clouds: Sequence[tuple[Gaussians, PlyOptions]]) -> tuple[list
     return splats, planes, _facts(ordered, facts, clouds[0][1])
 
 
-def with_shared_labels(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
-    """Return Gaussians with their label rows changed from those of their ``own`` facts to those of ``facts``."""
+def with_shared_labels(gaussians: Gaussians, before: LiveFacts, after: LiveFacts) -> Gaussians:
+    """Return Gaussians with their label rows changed from those of their ``before`` facts to those of ``after``."""
     assert gaussians.live is not None
     live = gaussians.live.copy()
-    for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
+    for number, (one, all_) in enumerate(zip(before.layers, after.layers, strict=True)):
         if one.labels != all_.labels:
-            rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
-            mine = live[:, LAYER_ID] == number if facts.others else np.full(len(live), True)
-            to = np.array([rows[label.number, label.name] for label in one.labels])
+            rows = {label.key: row for row, label in enumerate(all_.labels)}
+            mine = live[:, LAYER_ID] == number if after.others else np.full(len(live), True)
+            to = np.array([rows[label.key] for label in one.labels])
             live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 
@@ -203,16 +205,16 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
     """Return the facts that the viewer needs in addition to the bytes; ``options`` are those of the first cloud."""
     distances = [layer.distance or options.unit_distance or 1.0 for layer in facts.layers]
     found = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
-    for own, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
-        own |= {"opacity_unit_distance": distance}
-        own |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, own)}
+    for entry, layer, distance in zip(found["layers"], facts.layers, distances, strict=True):
+        entry |= {"opacity_unit_distance": distance}
+        entry |= {"nodes": []} if layer.labels else {"nodes": nodes_of(layer), "presets": presets_of(layer, entry)}
     axes = _axes(upright(options).up)
     return found | {
-        "held": [f"{HELD}-{k}" for k in range(len(clouds))],
+        "elements": [f"{VALUES_ID}-{k}" for k in range(len(clouds))],
         "planes": planes_of(facts),
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
-        "dilation": DILATION * pixel_width(options.made_for or SIZE) ** 2,
+        "dilation": DILATION * pixel_width(options.screen_size or SIZE) ** 2,
         "axes": axes.tolist(),
         "box": [
             np.min([cloud.means.min(axis=0) for cloud in clouds], axis=0).tolist(),
@@ -243,9 +245,9 @@ def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
     toward = sent.get("from")
     if not isinstance(toward, list) or len(toward) != 3:
         raise DataError("the page's light: expected from, three numbers")
-    if not all(isinstance(x, int | float) and abs(x) <= MOST for x in (*toward, *map(sent.get, numbers))) or not any(
-        toward
-    ):
+    if not all(
+        isinstance(x, int | float) and abs(x) <= MAX_LIGHT for x in (*toward, *map(sent.get, numbers))
+    ) or not any(toward):
         raise DataError(f"the page's light: expected finite numbers for from, {', '.join(numbers)}")
     if sent["kind"] == "none":
         return None
@@ -266,25 +268,25 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
     return _nodes(read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED)
 
 
-def presets_of(facts: LiveFacts, own: Mapping[str, Any]) -> list[dict[str, Any]]:
+def presets_of(facts: LiveFacts, entry: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the named functions for values that are or look like Hounsfield units, or of the kind of the file's name.
 
     The file's own function is not among them, unless it was changed and has kept the name.
 
     Args:
         facts: of the layer.
-        own: its part of the scene, whose ``unit_distance`` opacities become per.
+        entry: its part of the scene, whose ``unit_distance`` opacities become per.
     """
     named, found, known = names(), [], facts.statistics()
     hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(known))
-    kind = "ct" if hounsfield else own["name"].split("-")[0] if own["name"] in named else ""
+    kind = "ct" if hounsfield else entry["name"].split("-")[0] if entry["name"] in named else ""
     for name in [name for name in named if name.split("-")[0] == kind]:
         tf = named_function(name)
         if tf.otherwise is not None and not hounsfield:  # a guess
             continue
         tf = resolve(tf, known, hounsfield=True)
         assert tf.opacity_unit_share is not None
-        times = own["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
+        times = entry["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
         tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
         light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
         if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):

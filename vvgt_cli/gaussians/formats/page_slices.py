@@ -22,12 +22,12 @@ from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
 from vvgt_cli.volume.types import Volume
 
-MOST = 1 << 22  # cells of all grids of a page
+MAX_CELLS = 1 << 22  # cells of all grids of a page
 FEWEST = 1 << 15  # where there is less room, none
 SMALLEST = FEWEST * 2 * 4 / 3 + 4096  # bytes that those take on a page at most
 CLOSER = 0.95  # of the room: grids that did not fit are made for this share of it
 LEVELS = 4096  # steps of the range of most values
-MOST_OF = (0.1, 99.9)  # percentiles that bound most values
+MOST_VALUES = (0.1, 99.9)  # percentiles that bound most values
 CODES = 1 << 16
 EXACT = 1e-6  # steps by which rounding may move a mean of equal values
 
@@ -63,9 +63,9 @@ class Slices(NamedTuple):
         return {"slices": self.facts}
 
     @property
-    def held(self) -> dict[str, bytes]:
+    def elements(self) -> dict[str, bytes]:
         """Contents by the ids of their elements."""
-        return {one["held"]: content for one, content in zip(self.facts, self.contents, strict=True)}
+        return {one["element"]: content for one, content in zip(self.facts, self.contents, strict=True)}
 
     def __str__(self) -> str:
         """Describe the grids for whoever sends the page."""
@@ -84,7 +84,7 @@ def slices_of(layers: Sequence[Layer | None], room: float | None = None) -> Slic
     Returns:
         None if no layer has a grid, or there is no room for `FEWEST` cells.
     """
-    most, found = MOST, _grids(layers, MOST)
+    most, found = MAX_CELLS, _grids(layers, MAX_CELLS)
     while found is not None and room is not None and found.size > room:
         if most <= FEWEST:
             return None
@@ -108,7 +108,7 @@ def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> 
         facts.append(
             {
                 "layer": number, "title": title, "dims": list(dims), "bits": 8 * codes.itemsize,
-                "affine": affine.ravel().tolist(), "held": f"slices-{number}",
+                "affine": affine.ravel().tolist(), "element": f"slices-{number}",
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
@@ -122,7 +122,7 @@ def _values(
     values = averaged(volume, dims)
     known = values[np.isfinite(values)]
     lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    a, b = map(float, np.percentile(known, MOST_OF)) if len(known) else (0.0, 0.0)
+    a, b = map(float, np.percentile(known, MOST_VALUES)) if len(known) else (0.0, 0.0)
     missing = int(len(known) < values.size)
     step = max(((b - a) or (hi - lo)) / LEVELS, (hi - lo) / (CODES - 3)) or 1.0
     if volume.data.dtype.kind in "iub":  # whole steps between stored values, so that these are exact
@@ -144,12 +144,12 @@ def _labels(
     table: LabelTable, volume: Volume, dims: tuple[int, int, int]
 ) -> tuple[dict[str, Any], np.ndarray]:  # fmt: skip
     """Return facts and codes (nz, ny, nx) of labels, as many as fit."""
-    labels = [one for one in table.labels if one.number != 0 or one.opacity > 0][: CODES - 1]
+    labels = table.structures[: CODES - 1]
     numbers = np.array([one.number for one in labels], np.float64)
     found = sampled(volume, dims)
     row = np.searchsorted(numbers, found).clip(max=len(numbers) - 1)
     codes = np.where(numbers[row] == found, row + 1, 0).astype(np.uint8 if len(labels) < 256 else np.uint16)
-    return {"labels": [{"name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in labels]}, codes
+    return {"labels": [label.page_entry() for label in labels]}, codes
 
 
 def packed(codes: np.ndarray) -> bytes:
@@ -158,16 +158,3 @@ def packed(codes: np.ndarray) -> bytes:
     steps = np.diff(codes, axis=2, prepend=codes.dtype.type(0)).view(signed)
     folded = ((steps << 1) ^ (steps >> (8 * codes.itemsize - 1))).astype(signed.newbyteorder("<"))
     return gzip.compress(folded.view(np.uint8).reshape(-1, codes.itemsize).T.tobytes(), 6, mtime=0)
-
-
-def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
-    """Decode values (nz, ny, nx) float64, NaN where unknown, or numbers in the list of labels, -1 for none."""
-    size = facts["bits"] // 8
-    planes = np.frombuffer(gzip.decompress(content), np.uint8).reshape(size, -1)
-    folded = np.ascontiguousarray(planes.T).view(f"<u{size}").reshape(facts["dims"][::-1])
-    steps = (folded >> 1) ^ (0 - (folded & 1))
-    codes = np.cumsum(steps, axis=2, dtype=folded.dtype).astype(np.int64)
-    if "labels" in facts:
-        return codes - 1
-    codes -= facts["missing"]
-    return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)

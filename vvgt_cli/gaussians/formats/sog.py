@@ -30,7 +30,7 @@ from vvgt_cli.gaussians.header import MIP
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume.libraries import library_errors
 
-MOST = 1 << 26  # Gaussians in one set of images
+MAX_GAUSSIANS = 1 << 26  # Gaussians in one set of images
 META = "meta.json"
 IMAGES = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
 _STEPS, _BYTE = 65535, 255
@@ -119,8 +119,8 @@ def splats_in(meta: Any, read: Callable[[str], bytes], name: str) -> Splats:
         found = meta.get("version") if isinstance(meta, dict) else None
         raise DataError(f"{name}: {META} has version {found!r:.40}; expected SOG of version 2")
     count = meta.get("count")
-    if type(count) is not int or not 0 < count <= MOST:
-        raise DataError(f"{name}: {META} has count {count!r:.40}; expected 1 to {MOST}")
+    if type(count) is not int or not 0 < count <= MAX_GAUSSIANS:
+        raise DataError(f"{name}: {META} has count {count!r:.40}; expected 1 to {MAX_GAUSSIANS}")
 
     def pixels(part: str, number: int = 0, width: int = 0, needed: int = count) -> np.ndarray:
         return _pixels(read, _files(meta, part, name), number, width, needed, name)
@@ -326,8 +326,8 @@ _LARGEST_TEXT = 1 << 20
 
 def sog(splats: Splats, name: str) -> bytes:
     """Encode columns as a `.sog`, along the Morton curve; raise DataError for more Gaussians than a file can hold."""
-    if len(splats) > MOST:
-        raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
+    if len(splats) > MAX_GAUSSIANS:
+        raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MAX_GAUSSIANS:,} in a .sog; try a .ply")
     images, meta = images_of(splats.take(morton_order(splats.means)))
     meta |= {"model": "antialiased"} if MIP in splats.comments else {}
     members = {META: json.dumps(meta, separators=(",", ":")).encode()}

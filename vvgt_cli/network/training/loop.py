@@ -20,7 +20,7 @@ from torch import Tensor, distributed, nn
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, save_checkpoint
+from vvgt_cli.network.checkpoint import NetworkCheckpoint, load_weights, read_tensors, save_checkpoint
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.training.config import TrainConfig, config_text, lists, read_config
 from vvgt_cli.network.training.lpips import Lpips, load_lpips
@@ -33,7 +33,7 @@ Scenes = dict[str, list[TrainingScene]]
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """State of a run beside weights and optimiser, saved with them.
 
     Attributes:
@@ -120,7 +120,7 @@ class _Run:
         self.commit = commit()  # now: the checkout may move on while this runs
         self.feeder = Feeder(scenes["train"], config)
         self.lpips = lpips.to(here.device) if lpips else None
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         if (folder / LAST).exists():
             self._resume()
             console.message(f"resuming at step {self.progress.step} of {config.steps}")
@@ -211,7 +211,7 @@ class _Run:
             "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
             "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
         }  # fmt: skip
-        checkpoint = Checkpoint(self.network, lists(training), lists(state.found), self.commit)
+        checkpoint = NetworkCheckpoint(self.network, lists(training), lists(state.found), self.commit)
         with atomic_write(self.folder / name, overwrite=True) as temporary:
             save_checkpoint(temporary, checkpoint, more)
 
@@ -221,7 +221,7 @@ class _Run:
         try:
             load_weights(self.network, document["state"], str(path))
             self.optimizer.load_state_dict(document["optimizer"])
-            self.progress = Progress(**document["progress"])
+            self.progress = TrainingProgress(**document["progress"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: not a checkpoint of a run ({error}); remove the folder to start over") from None
 
@@ -305,7 +305,7 @@ def world() -> Iterator[World]:
 MESSAGE_SECONDS = 20.0  # seconds
 
 
-class Table:
+class CsvTable:
     """A CSV file that grows; a resumed run removes the rows after its checkpoint."""
 
     def __init__(self, path: Path, step: int) -> None:
@@ -337,7 +337,7 @@ class Recorder:
 
     def __init__(self, folder: Path, step: int, steps: int, console: Console) -> None:
         """Open the tables and TensorBoard for a run that continues after ``step``."""
-        self.metrics, self.held = Table(folder / "metrics.csv", step), Table(folder / "held.csv", step)
+        self.metrics, self.held = CsvTable(folder / "metrics.csv", step), CsvTable(folder / "held.csv", step)
         self.board = _board(folder, step, console)
         self.console, self.first, self.steps = console, step, steps
         self.began = self.reported = time.monotonic()

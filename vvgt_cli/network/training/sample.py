@@ -28,7 +28,7 @@ from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 @dataclass
-class Tally:
+class SceneTally:
     """Contribution of a scene to a step's record; a scene that fails counts as ``bad`` and adds nothing else."""
 
     loss: float = 0.0
@@ -89,7 +89,7 @@ class Feeder:
 
 def accumulate_gradients(
     network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device, lpips: Lpips | None = None
-) -> Tally:
+) -> SceneTally:
     """Add the gradients of a random scene's loss in a random round: mean over views, over the batch."""
     config = feeder.config
     index, views, number = (int(rng.integers(n)) for n in (len(feeder.scenes), config.view_sets, config.network.rounds))
@@ -97,7 +97,7 @@ def accumulate_gradients(
     chosen = [int(i) for i in rng.permutation(len(scene.targets))[: config.views]]
     rows = run_network(network, inputs, device)
     if not torch.isfinite(rows).all():
-        return Tally(bad=1)
+        return SceneTally(bad=1)
     before = prepared.restore(prepared.rows)
     loss, gain = rows.new_zeros(()), 0.0
     for i in chosen:
@@ -107,9 +107,9 @@ def accumulate_gradients(
         loss = loss + view_loss(picture, target, start, config.loss, lpips) / len(chosen)
         gain += float(decibels(picture.detach(), target, start)) / len(chosen)
     if not torch.isfinite(loss):
-        return Tally(bad=1)
+        return SceneTally(bad=1)
     (loss / config.batch).backward()
-    return Tally(float(loss.detach()), gain)
+    return SceneTally(float(loss.detach()), gain)
 
 
 @torch.no_grad()

@@ -200,12 +200,12 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
     from vvgt_cli.volume import read_volume, statistics
 
     volume = read_volume(recipe.volume)
-    numbers = statistics(volume)
+    stats = statistics(volume)
     size = recipe.size
-    bands = suggest(numbers, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)
+    bands = suggest(stats, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)
     chosen = [bands[number] for number in recipe.functions]
     function: Any = minimal.read(merge_bands(chosen, recipe.densities), "bands")
-    scene = Scene.build(volume, function, chosen[0].unit_distance, (numbers.lo, numbers.hi))
+    scene = Scene.build(volume, function, chosen[0].unit_distance, (stats.lo, stats.hi))
     options = VbmOptions(recipe.gaussians, size, config.start, config.seed)
     begun = initialise(scene, options)
     parts = [f"{band.name} x {factor:.2g}" for band, factor in zip(chosen, recipe.densities, strict=True)]

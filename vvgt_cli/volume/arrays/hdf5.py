@@ -34,7 +34,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
-MOST_VISITED = 100_000
+MAX_VISITED = 100_000
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> Volume:
@@ -100,7 +100,7 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
         described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and item.shape and 2 <= len(item.shape) <= 5:
             found.append(item)
-        return True if seen >= MOST_VISITED else None
+        return True if seen >= MAX_VISITED else None
 
     group.visititems(visit)
     data = [d for d in found if d.name.rpartition("/")[2] not in described] or found

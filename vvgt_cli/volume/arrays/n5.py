@@ -33,8 +33,8 @@ from vvgt_cli.volume.types import Volume
 
 METADATA = "attributes.json"
 TYPES = {f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64)} | {"float32", "float64"}
-MOST_AXES = 5
-MOST_VISITED = 10_000  # folders
+MAX_AXES = 5
+MAX_VISITED = 10_000  # folders
 LZ4_BLOCK = struct.Struct("<8sBiiI")  # of Java's LZ4BlockOutputStream
 
 
@@ -189,7 +189,7 @@ def _arrays(root: Path) -> list[Path]:
     """List the arrays and pyramids in a group and the groups below it."""
     found: list[Path] = []
     groups, seen = [root], 0
-    while groups and seen < MOST_VISITED:
+    while groups and seen < MAX_VISITED:
         group, seen = groups.pop(0), seen + 1
         facts = _metadata(group)
         if _levels(group) or len(facts.get("dimensions", ())) >= 2:
@@ -205,13 +205,13 @@ def _array(place: Path) -> N5Array:
     kind, packed = facts.get("dataType"), facts.get("compression", facts.get("compressionType", "raw"))
     compression = {"type": packed} if isinstance(packed, str) else packed
     good = all(
-        isinstance(some, list) and 2 <= len(some) <= MOST_AXES and all(type(n) is int and 0 < n < 1 << 62 for n in some)
+        isinstance(some, list) and 2 <= len(some) <= MAX_AXES and all(type(n) is int and 0 < n < 1 << 62 for n in some)
         for some in (sizes, blocks)
     )
     if not good or len(sizes) != len(blocks) or kind not in TYPES or not isinstance(compression, dict):  # type: ignore[arg-type]
         raise DataError(
             f"{place}: dimensions {str(sizes)[:80]}, blocks {str(blocks)[:80]} of {str(kind)[:40]}; expected 2 to "
-            f"{MOST_AXES} sizes of each, and a type such as uint16"
+            f"{MAX_AXES} sizes of each, and a type such as uint16"
         )
     dtype = np.dtype(str(kind)).newbyteorder(">")
     if math.prod(blocks) * dtype.itemsize > MAX_CHUNK:  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ from vvgt_cli.volume.microscopy.image import Bounded
 Source = Path | zipfile.Path
 
 HEAD = 1024  # bytes that tell DICOM from other formats
-MOST = 100_000  # files
+MAX_FILES = 100_000  # files
 TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
 TAGS = [  # all that is read of a header but its pixels: those of scanners hold up to a megabyte of other things
     *ATTRIBUTES,
@@ -107,8 +107,8 @@ def headers_in(path: Path) -> list[tuple[Source, Any]]:
     """
     path = path.parent if path.name == "DICOMDIR" else path
     files = [os.path.join(root, name) for root, _, names in os.walk(path) for name in names] or [str(path)]
-    if len(files) > MOST:
-        raise DataError(f"{path}: more than {MOST} files; expected the folder of one series")
+    if len(files) > MAX_FILES:
+        raise DataError(f"{path}: more than {MAX_FILES} files; expected the folder of one series")
     states = (os.lstat(file) for file in files)
     return _headers(path, tuple((state.st_size, state.st_mtime_ns) for state in states))
 

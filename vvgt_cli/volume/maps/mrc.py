@@ -29,7 +29,7 @@ _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 _OTHERS = {3: "complex integers", 4: "complex numbers", 101: "4-bit integers"}
 IMOD, SIGNED = b"IMOD", 1  # its mark, and the flag that bytes are signed
 STACKS = range(401, 631)  # space groups: several volumes, one behind the other
-MOST_EXTRA = 1 << 30  # bytes of the extended header
+MAX_EXTRA = 1 << 30  # bytes of the extended header
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def parse_header(head: bytes, name: str) -> Header:
     sizes, mode, start, intervals, cell, angles = (words[a:b] for a, b in
                                                    ((0, 3), (3, 4), (4, 7), (7, 10), (10, 13), (13, 16)))  # fmt: skip
     group, extra = words[22:24]
-    if min(sizes) < 1 or not 0 <= extra <= MOST_EXTRA:
+    if min(sizes) < 1 or not 0 <= extra <= MAX_EXTRA:
         raise DataError(
             f"{name}: sizes {sizes}, {extra} bytes of extended header; expected an MRC or CCP4 map of at least 1 voxel "
             "along each axis"

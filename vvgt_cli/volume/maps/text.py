@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import load_block
-from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.components import listed, select_component
 from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -27,7 +27,7 @@ from vvgt_cli.volume.types import Volume
 
 BOHR = 0.529177210903  # angstroms (CODATA 2018)
 LINE, LINES = 4096, 100_000  # bytes of a line of a header, and lines
-MOST_ATOMS, MOST_ORBITALS = 1_000_000, 10_000
+MAX_ATOMS, MAX_ORBITALS = 1_000_000, 10_000
 _DX_TYPES = ("float", "double", "int", "short", "byte")
 
 
@@ -70,7 +70,7 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
             sizes.append(_whole(words, path, f"the size of axis {k + 1}"))
             steps.append(_floats(words[1:], 3, path, f"the step of axis {k + 1}"))
         # a file of orbitals has minus the number of atoms; sizes below 0 mean that lengths are in angstroms already
-        if abs(atoms) > MOST_ATOMS or 0 in sizes or not 1 <= values <= MOST_ORBITALS:
+        if abs(atoms) > MAX_ATOMS or 0 in sizes or not 1 <= values <= MAX_ORBITALS:
             raise DataError(
                 f"{path}: {atoms} atoms, axes of {sizes} values, {values} a voxel; expected a cube file of at least "
                 "1 voxel along each axis"
@@ -82,7 +82,7 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
     values *= max(len(orbitals), 1)
     shape = (*map(abs, sizes), values)
     block = load_block(path, np.dtype(np.float32), shape, offset=start, encoding="text")
-    listing = ", ".join(orbitals[:12]) + (", ..." if len(orbitals) > 12 else "")
+    listing = listed(orbitals, ", ")
     label = f"orbitals {listing}:" if orbitals else "its values"
     if len(orbitals) > 1:
         label = f"the cube of orbitals {listing}"
@@ -98,13 +98,13 @@ def _orbitals(file: IO[bytes], path: Path) -> list[str]:
     words = _words(file, path, "the orbitals")
     n = _whole(words, path, "the number of orbitals")
     found = words[1:]
-    while len(found) < n <= MOST_ORBITALS:
+    while len(found) < n <= MAX_ORBITALS:
         more = _words(file, path, "the orbitals")
         if not more:
             break
         found += more
     if not 1 <= n == len(found):
-        raise DataError(f"{path}: {n} orbitals, of which {len(found)} have a number; expected 1 to {MOST_ORBITALS}")
+        raise DataError(f"{path}: {n} orbitals, of which {len(found)} have a number; expected 1 to {MAX_ORBITALS}")
     return found
 
 
@@ -208,7 +208,7 @@ def _vasp_cell(file: IO[bytes], path: Path) -> np.ndarray:
     words = words if words and words[0].isdecimal() else _words(file, path, "the numbers of atoms")
     atoms = sum(_whole([word], path, "a number of atoms") for word in words)
     selective = "".join(_words(file, path, "the kind of coordinates")).lower().startswith("s")
-    for _ in range(min(atoms, MOST_ATOMS) + selective):
+    for _ in range(min(atoms, MAX_ATOMS) + selective):
         _words(file, path, "an atom")
     result: np.ndarray = cell * scale
     return result

@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, unit_rows
@@ -23,9 +23,9 @@ from vvgt_cli.volume.types import Volume
 _SCALING = (("slope", 1), ("offset", 0))
 
 
-def read_header(path: Path) -> tuple[Fields, int]:
+def read_header(path: Path) -> tuple[HeaderFields, int]:
     """Read the fields of a MetaImage header, and the position behind its last, ElementDataFile, or raise DataError."""
-    fields = Fields(path.name)
+    fields = HeaderFields(path.name)
     with open(path, "rb") as file:
         while (line := file.readline(MAX_HEADER)) and file.tell() <= MAX_HEADER:
             key, equals, value = line.decode("utf-8-sig", "replace").partition("=")
@@ -36,14 +36,14 @@ def read_header(path: Path) -> tuple[Fields, int]:
     raise DataError(f"{path}: its header has no ElementDataFile; expected a MetaImage file")
 
 
-def _flag(fields: Fields, *keys: str) -> bool:
+def _flag(fields: HeaderFields, *keys: str) -> bool:
     for key in keys:
         if key in fields:
             return fields[key].lower() in ("true", "1", "t", "yes")
     return False
 
 
-def _dtype(fields: Fields) -> np.dtype:
+def _dtype(fields: HeaderFields) -> np.dtype:
     name = fields.need("elementtype")
     own = {"long": "i4"}  # MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h)
     plain = name.lower().removeprefix("met_").removesuffix("_array")
@@ -51,14 +51,14 @@ def _dtype(fields: Fields) -> np.dtype:
     return fields.dtype(f"ElementType {name} of kind", plain, own).newbyteorder(">" if big else "<")
 
 
-def _first(fields: Fields, keys: tuple[str, ...], n: int, default: float) -> np.ndarray:
+def _first(fields: HeaderFields, keys: tuple[str, ...], n: int, default: float) -> np.ndarray:
     """Return the numbers (3,) of the first of these fields that is there, of which ``n`` are stated."""
     key = next((key for key in keys if key in fields), None)
     stated = [] if key is None else fields.floats(key, fields[key], min(n, 3))
     return np.array([*stated, default, default, default][:3])
 
 
-def _place(fields: Fields, n: int, options: ReadOptions) -> dict[str, Any]:
+def _place(fields: HeaderFields, n: int, options: ReadOptions) -> dict[str, Any]:
     """Return spacing, direction, origin, space and unit, as keywords of `Volume`.
 
     TransformMatrix lists the axes one after the other. The space is LPS, in mm, where the header names an orientation
@@ -115,7 +115,7 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     return Volume(field, name=volume_name(path), **_place(fields, len(sizes), options))
 
 
-def _load(fields: Fields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:
+def _load(fields: HeaderFields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:
     header = fields.integer("headersize", 0)
     if header < -1:
         raise DataError(f"{fields.name}: HeaderSize {header}; expected 0 or more, or -1 (data at the file's end)")

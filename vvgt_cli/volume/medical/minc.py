@@ -22,7 +22,7 @@ from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, volume_name
 from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.stored import Slices, give_back, stored_or_held
+from vvgt_cli.volume.stored import Slices, give_back, stored_or_loaded
 from vvgt_cli.volume.types import Volume
 
 IMAGE, DIMENSIONS = "minc-2.0/image/0/", "minc-2.0/dimensions/"
@@ -143,7 +143,7 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
         raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
     lead = (step,) if len(shape) == 4 else ()
     read, chunk = _scaled(image, lead, path), (1, *shape[-2:])
-    field = stored_or_held(read, np.dtype(np.float32), shape[-3:], chunk, str(path), options.stored)
+    field = stored_or_loaded(read, np.dtype(np.float32), shape[-3:], chunk, str(path), options.stored)
     return placed(field, *_place(image.axes, spatial, path), options, volume_name(path), space="RAS")
 
 

@@ -22,7 +22,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.blocks import Packed, check_memory, count, data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MARK, MAX_HEADER, Fields
+from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed, unit_rows
@@ -33,16 +33,16 @@ _ENCODINGS = {
     "ascii": "text",
 }  # fmt: skip
 _SPATIAL_KINDS = {"domain", "space", "???", "none"}
-MOST_FILES = 100_000
+MAX_FILES = 100_000
 _SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
-def read_header(path: Path) -> tuple[Fields, int]:
+def read_header(path: Path) -> tuple[HeaderFields, int]:
     """Read the fields of a NRRD header, and the position behind its blank line (or the end), or raise DataError."""
     with open(path, "rb") as file:
         if not file.readline(MAX_HEADER).removeprefix(MARK).startswith(b"NRRD000"):
             raise DataError(f"{path}: does not begin with NRRD000; expected a NRRD file")
-        fields = Fields(path.name)
+        fields = HeaderFields(path.name)
         while line := file.readline(MAX_HEADER):
             if file.tell() > MAX_HEADER:
                 raise DataError(f"{path}: no blank line ends its header; check that the file is whole")
@@ -56,7 +56,7 @@ def read_header(path: Path) -> tuple[Fields, int]:
         return fields, file.tell()
 
 
-def _dtype(fields: Fields, encoding: str) -> np.dtype:
+def _dtype(fields: HeaderFields, encoding: str) -> np.dtype:
     dtype = fields.dtype("type", fields.need("type"))
     if dtype.itemsize > 1 and encoding != "text":
         endian = fields.need("endian").lower()
@@ -66,7 +66,7 @@ def _dtype(fields: Fields, encoding: str) -> np.dtype:
     return dtype
 
 
-def _vectors(fields: Fields, n: int) -> list[list[float] | None] | None:
+def _vectors(fields: HeaderFields, n: int) -> list[list[float] | None] | None:
     """Return the space directions of the n axes: a vector of three, or None for an axis that is not spatial.
 
     Returns None where the header has no space directions.
@@ -82,7 +82,7 @@ def _vectors(fields: Fields, n: int) -> list[list[float] | None] | None:
     return [None if token == "none" else _vector(fields, "space directions", token) for token in tokens]
 
 
-def _vector(fields: Fields, key: str, text: str) -> list[float]:
+def _vector(fields: HeaderFields, key: str, text: str) -> list[float]:
     """Return a vector ``(x,y,z)`` of the header's space; the third of two dimensions is 0, a fourth is time's."""
     space = fields.get("space", "").lower()
     edge = fields.integer("spacedimension", 4 if space.endswith("-time") else 3 if space else text.count(",") + 1)
@@ -92,7 +92,7 @@ def _vector(fields: Fields, key: str, text: str) -> list[float]:
     return [*fields.floats(key, inner, edge), 0.0, 0.0][:3]
 
 
-def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
+def _component_axis(fields: HeaderFields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
     """Find the axis (fastest first) of components, None without one; raise DataError for several axes beside space."""
     kinds = fields.get("kinds", "").lower().split()
     odd = [k for k, vector in enumerate(vectors) if vector is None] if vectors else []
@@ -119,8 +119,9 @@ def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | N
 
 
 def _place(
-    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None, sizes: list[int], options: ReadOptions
-) -> dict[str, Any]:
+    fields: HeaderFields, vectors: list[list[float] | None] | None, axis: int | None, sizes: list[int],
+    options: ReadOptions,
+) -> dict[str, Any]:  # fmt: skip
     """Return the arguments ``steps``, ``origin``, ``space`` and ``unit`` of `placed`.
 
     Coordinates of left-handed spaces (left-anterior-superior, 3D-left-handed) are made right-handed ones.
@@ -150,7 +151,7 @@ def _place(
     return {"steps": axes * factors, "origin": origin * factors + 0.0, "space": space, "unit": unit}
 
 
-def _along_axes(fields: Fields, axis: int | None, sizes: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def _along_axes(fields: HeaderFields, axis: int | None, sizes: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return step and first position (3,) along each axis, by ``spacings``, ``axis mins`` and ``axis maxs``.
 
     Where values are cells, as in teem unless ``centers`` says ``node``, they begin half a step behind the minimum.
@@ -176,7 +177,7 @@ def _along_axes(fields: Fields, axis: int | None, sizes: list[int]) -> tuple[np.
     return steps, first
 
 
-def _words(fields: Fields, key: str) -> list[str]:
+def _words(fields: HeaderFields, key: str) -> list[str]:
     """Return the words of a field, each in quotes or, as some writers have it, without."""
     return [a or b for a, b in re.findall(r'"([^"]*)"|(\S+)', fields.get(key, ""))]
 
@@ -190,7 +191,7 @@ def _third(axes: list[list[float]]) -> np.ndarray:
     return result
 
 
-def _space(fields: Fields) -> tuple[np.ndarray, str | None]:
+def _space(fields: HeaderFields) -> tuple[np.ndarray, str | None]:
     """Return signs that make the file's coordinates right-handed, and the anatomical space that they then are in."""
     name = fields.get("space", "").lower().removesuffix("-time")
     letters = "".join(word[:1] for word in name.split("-")) if name.count("-") == 2 else name
@@ -245,7 +246,7 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
     return _volume(path, fields, block, sizes, options)
 
 
-def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
+def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
     vectors = _vectors(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
     place = _place(fields, vectors, axis, sizes, options) | {"options": options, "name": volume_name(path)}
@@ -280,7 +281,7 @@ def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
         try:
             lo, hi, step = (int(w) for w in words[1:4])
             number = re.fullmatch(r"([^%]*)%(0?)(\d*)d([^%]*)", words[0])
-            if number is None or step == 0 or not 0 <= (hi - lo) // step < MOST_FILES:
+            if number is None or step == 0 or not 0 <= (hi - lo) // step < MAX_FILES:
                 raise ValueError
         except ValueError:
             raise DataError(
@@ -293,7 +294,7 @@ def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
     else:
         return None
     axes = int(rest[0]) if rest and rest[0].isdecimal() else n - 1
-    if not names or len(names) > MOST_FILES or not 1 <= axes <= n:
+    if not names or len(names) > MAX_FILES or not 1 <= axes <= n:
         raise DataError(f"{path}: data file {named!r} with {len(names)} names of {axes} axes each; expected slices")
     return names, axes
 

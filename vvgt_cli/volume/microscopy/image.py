@@ -20,17 +20,16 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageEr
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, magnitude
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.stored import Slices, stored_or_held
+from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.types import Volume
 
 EXTRA = "microscopy"
 MAX_XML = 64 << 20
 Color = tuple[float, float, float] | None
-Box = Slices
 
 
 @dataclass(frozen=True)
-class Picture:
+class Micrograph:
     """An image of a microscope.
 
     Attributes:
@@ -52,7 +51,7 @@ class Picture:
     channels: int
     shape: tuple[int, int, int]
     dtype: np.dtype
-    read: Callable[[int, int, Box], np.ndarray]
+    read: Callable[[int, int, Slices], np.ndarray]
     chunks: tuple[int, int, int]
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -62,7 +61,7 @@ class Picture:
     mapped: bool = False
 
 
-def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
+def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name: str) -> Volume:
     """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
 
     Errors are those of `Reader.read`.
@@ -82,7 +81,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
         field = magnitude(np.stack(bands, axis=-1))
     elif not picture.mapped:
         read = partial(picture.read, time, channel)
-        field = stored_or_held(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
+        field = stored_or_loaded(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
     else:
         field = picture.read(time, channel, box)
         if not field.flags.c_contiguous:
@@ -95,15 +94,15 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
     return Volume(field, spacing, picture.origin, name=name, unit=unit)
 
 
-def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
+def _channel(picture: Micrograph, wanted: int | str | None, source: str) -> int | None:
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
-    colors, own = picture.colors, not picture.rgb
-    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, own)
+    colors, separate = picture.colors, not picture.rgb
+    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, separate)
 
 
 def choose_channel(
     n: int, names: Sequence[str], dtype: np.dtype, wanted: int | str | None, source: str,
-    colors: Sequence[Color] = (), rgb: bool = False, own: bool = True,
+    colors: Sequence[Color] = (), rgb: bool = False, separate: bool = True,
 ) -> int | None:  # fmt: skip
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
 
@@ -115,7 +114,7 @@ def choose_channel(
         source: for messages.
         colors: RGB in [0, 1] of the channels, where they have any.
         rgb: they are red, green, blue and perhaps opacity.
-        own: they are channels of their own, not samples of pixels.
+        separate: they are channels of their own, not samples of pixels.
 
     Raises:
         SeveralComponents: several and none chosen.
@@ -138,7 +137,7 @@ def choose_channel(
     if wanted is not None:
         raise UsageError(f"{what}, not {wanted!r}; {expected}")
     raise SeveralComponents(
-        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), own, names
+        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), separate, names
     )
 
 

@@ -14,14 +14,15 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.libraries import read_part
-from vvgt_cli.volume.microscopy.image import Box, Color, Picture, picture_volume
+from vvgt_cli.volume.microscopy.image import Color, Micrograph, picture_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6
-MOST = 1_000_000  # time steps or channels
+MAX_COUNT = 1_000_000  # time steps or channels
 
 
 def is_imaris(file: Any) -> bool:
@@ -65,7 +66,7 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
     image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
     spacing, origin = _placed(image, shape)
     channel_facts = [_channel(file, c) for c in range(channels)]
-    picture = Picture(
+    picture = Micrograph(
         times, channels, shape, first.dtype, partial(_read, path, level), first.chunks or (1, *shape[1:]), spacing,
         origin, [name for name, _ in channel_facts], [color for _, color in channel_facts],
     )  # fmt: skip
@@ -76,7 +77,7 @@ def _place(level: int, time: int, channel: int) -> str:
     return f"DataSet/ResolutionLevel {level}/TimePoint {time}/Channel {channel}/Data"
 
 
-def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarray:
+def _read(path: Path, level: int, time: int, channel: int, box: Slices) -> np.ndarray:
     """Read a box; datasets are padded to whole chunks."""
     return read_part(path, _place(level, time, channel), box)
 
@@ -84,7 +85,7 @@ def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarr
 def _count(group: Any, what: str, inside: str = "DataSet") -> int:
     """Count the groups ``what 0``, ``what 1``, ... in a row."""
     group = group[inside] if inside else group
-    return next(k for k in range(MOST) if f"{what} {k}" not in group)
+    return next(k for k in range(MAX_COUNT) if f"{what} {k}" not in group)
 
 
 def _shape(file: Any, level: int) -> tuple[int, int, int]:

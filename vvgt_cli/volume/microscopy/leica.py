@@ -16,10 +16,11 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Box, Color, Picture, choose_image, picture_volume, safe_xml
+from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume, safe_xml
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6  # metres
@@ -82,7 +83,7 @@ def _deep(image: Any) -> bool:
         return False
 
 
-def _picture(image: Any, path: Path) -> Picture:
+def _picture(image: Any, path: Path) -> Micrograph:
     sizes = {a: int(n) for a, n in image.sizes.items() if a in "TCSZYX" or n > 1}
     odd = [a for a in sizes if a not in "TCSZYX"]
     if odd or min(sizes.values(), default=0) < 1 or not {"Y", "X"} <= set(sizes):
@@ -98,13 +99,13 @@ def _picture(image: Any, path: Path) -> Picture:
     values = np.transpose(stored, [axes.index(a) for a in ("T", "C", "S", "Z", "Y", "X")])
     times, channels, samples, nz, ny, nx = values.shape
 
-    def read(time: int, channel: int, box: Box) -> np.ndarray:
+    def read(time: int, channel: int, box: Slices) -> np.ndarray:
         part: np.ndarray = values[time, channel // samples, channel % samples][box]
         return part
 
     spacing, origin = _placed(image)
     names, colors = _channels(image) if samples == 1 else ([], [])
-    return Picture(
+    return Micrograph(
         times, channels * samples, (nz, ny, nx), image.dtype, read, (1, ny, nx), spacing, origin,
         names, colors, rgb=samples > 1 and channels == 1, mapped=True,
     )  # fmt: skip

@@ -16,15 +16,16 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Box, Color, Picture, choose_image, picture_volume
+from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
 CHUNK_MAGIC = 0x0ABECEDA
 MAP_END = b"ND2 CHUNK MAP SIGNATURE 0000001!"
 END, CHUNK = struct.Struct("<32sQ"), struct.Struct("<IIQ")  # the end of the file; before every chunk
-MOST = 10_000_000  # frames
+MAX_FRAMES = 10_000_000  # frames
 
 
 def read_nd2(path: Path, options: ReadOptions) -> Volume:
@@ -39,7 +40,7 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         place = _position(file, sizes, options, path)
         loops = [a for a in sizes if a not in "CYXS"]
         frames = int(np.prod([sizes[a] for a in loops], dtype=object))
-        found = sum(k in there for k in range(min(frames, MOST)))
+        found = sum(k in there for k in range(min(frames, MAX_FRAMES)))
         if found < frames:
             raise DataError(f"{path}: of {frames} frames {found} are there; check that the file is whole")
         names, colors = _channels(file)
@@ -52,7 +53,7 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         x, y, z = (float(v) for v in file.voxel_size())
         several = sizes.get("C", 1) > 1
         read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
-        picture = Picture(
+        picture = Micrograph(
             sizes.get("T", 1), sizes.get("C", 1) * sizes.get("S", 1), (sizes.get("Z", 1), sizes["Y"], sizes["X"]),
             np.dtype(file.dtype), read, (1, sizes["Y"], sizes["X"]),
             (x, y, z if sizes.get("Z", 1) > 1 else None), names=names if sizes.get("S", 1) == 1 else (), colors=colors,
@@ -148,7 +149,7 @@ def _reader(
 
     samples = sizes.get("S", 1)
 
-    def read(time: int, channel: int, box: Box) -> np.ndarray:
+    def read(time: int, channel: int, box: Slices) -> np.ndarray:
         z, y, x = box
         out = np.empty([k.stop - k.start for k in box], dtype)
         with turn, library_errors(str(path), "ND2"):

@@ -26,9 +26,8 @@ from vvgt_cli.volume.microscopy.image import (
     EXTRA,
     MAX_XML,
     Bounded,
-    Box,
     Color,
-    Picture,
+    Micrograph,
     choose_image,
     hex_color,
     picture_volume,
@@ -36,6 +35,7 @@ from vvgt_cli.volume.microscopy.image import (
 )
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
 SEGMENT = struct.Struct("<16sqq")  # name, bytes set aside, bytes used
@@ -49,12 +49,12 @@ PIXELS = {
 }  # fmt: skip
 NONE, JPEG_XR, ZSTD, ZSTD_HEADED = 0, 4, 5, 6
 OTHERS = {1: "JPEG", 2: "LZW"}
-MOST = 1 << 31  # pixels from the first to the last of an axis
+MAX_SIDE = 1 << 31  # pixels from the first to the last of an axis
 SPARSE = 1000  # times as many pixels as all tiles have
 
 
 @dataclass(frozen=True)
-class Tile:
+class CziTile:
     """A tile of the finest level.
 
     Attributes:
@@ -75,7 +75,7 @@ class Tile:
     size: int
 
 
-def tiles_of(path: Path) -> tuple[list[Tile], str]:
+def tiles_of(path: Path) -> tuple[list[CziTile], str]:
     """Read the tiles and the metadata, XML; raise DataError for segments beyond the file, or impossible numbers."""
     size = path.stat().st_size
     with Bounded(path) as file:
@@ -125,12 +125,12 @@ def tiles_of(path: Path) -> tuple[list[Tile], str]:
     return found, xml
 
 
-def _tile(spans: dict[str, tuple[int, int, int]], facts: tuple[int, int, int, int], path: Path) -> Tile:
-    if not {"X", "Y"} <= set(spans) or any(not (1 <= n < MOST and abs(k) < MOST) for k, n, _ in spans.values()):
+def _tile(spans: dict[str, tuple[int, int, int]], facts: tuple[int, int, int, int], path: Path) -> CziTile:
+    if not {"X", "Y"} <= set(spans) or any(not (1 <= n < MAX_SIDE and abs(k) < MAX_SIDE) for k, n, _ in spans.values()):
         raise DataError(f"{path}: a tile of {str(spans)[:200]}; expected X and Y of at least one pixel")
     (x, width, _), (y, height, _) = spans["X"], spans["Y"]
     at = {a: first for a, (first, _, _) in spans.items() if a not in "XY"}
-    return Tile(at, x, y, width, height, *facts)
+    return CziTile(at, x, y, width, height, *facts)
 
 
 def _fits(path: Path, size: int, place: int, length: int, what: str) -> None:
@@ -138,7 +138,7 @@ def _fits(path: Path, size: int, place: int, length: int, what: str) -> None:
         raise DataError(f"{path}: {what} of {length} bytes at byte {place} of {size}; check that the CZI file is whole")
 
 
-def pixels_of(tile: Tile, path: Path) -> np.ndarray:
+def pixels_of(tile: CziTile, path: Path) -> np.ndarray:
     """Read a tile, (height, width, samples), blue first; raise DataError for damage, or an unknown compression."""
     kind, samples = PIXELS[tile.pixel]
     shape, dtype = (tile.height, tile.width, samples), np.dtype(kind).newbyteorder("<")
@@ -218,7 +218,7 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
         first = {a: ends[a][0] for a in "TCZ" if a in ends}
         read = partial(_read, path, _by_plane(tiles, first), (x, y), samples, np.dtype(dtype))
         chunk = max(TILE, max(t.height for t in tiles)), max(TILE, max(t.width for t in tiles))
-        picture = Picture(
+        picture = Micrograph(
             times, channels * samples, (slices, height, width), np.dtype(dtype), read, (1, *chunk), spacing,
             names=names if samples == 1 else (), colors=colors, rgb=samples > 1 and channels == 1,
         )  # fmt: skip
@@ -226,9 +226,9 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
         return picture_volume(picture, options, str(path), name)
 
 
-def _scene(tiles: list[Tile], options: ReadOptions, path: Path) -> tuple[int | None, list[Tile]]:
+def _scene(tiles: list[CziTile], options: ReadOptions, path: Path) -> tuple[int | None, list[CziTile]]:
     """Return the number of the scene asked for, None where there is one, and its tiles."""
-    found: dict[int, list[Tile]] = {}
+    found: dict[int, list[CziTile]] = {}
     for tile in tiles:
         found.setdefault(tile.at.get("S", 0), []).append(tile)
     keys = sorted(found)
@@ -241,10 +241,10 @@ def _scene(tiles: list[Tile], options: ReadOptions, path: Path) -> tuple[int | N
     return keys[number] if len(keys) > 1 else None, found[keys[number]]
 
 
-Planes = dict[tuple[int, ...], list[Tile]]
+Planes = dict[tuple[int, ...], list[CziTile]]
 
 
-def _by_plane(tiles: list[Tile], first: dict[str, int]) -> Planes:
+def _by_plane(tiles: list[CziTile], first: dict[str, int]) -> Planes:
     """Group the tiles by (time, channel, slice), those that lie above others last."""
     planes: Planes = {}
     for tile in sorted(tiles, key=lambda t: t.at.get("M", 0)):
@@ -261,7 +261,7 @@ def _read(
     dtype: np.dtype,
     time: int,
     channel: int,
-    box: Box,
+    box: Slices,
 ) -> np.ndarray:
     """Read a box, 0 where no tile is. Samples of colours are blue first in the file."""
     z, y, x = box

@@ -16,7 +16,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, type_of
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import one_unit, placed
@@ -37,7 +37,7 @@ def read_amira(path: Path, options: ReadOptions) -> Volume:
     mark = re.search(rb"^@\d+[ \t]*\r?\n", head, re.MULTILINE)
     start = len(head) if mark is None else mark.start()
     text = re.sub(r"^[ \t]*#.*$", "", head[:start].decode("utf-8", "replace"), flags=re.MULTILINE)
-    fields, words, depth = Fields(path.name), [""], 0
+    fields, words, depth = HeaderFields(path.name), [""], 0
     for word in re.findall(r'"[^"\n]*"|[{}]|[^\s{},"]+', text):
         depth += {"{": 1, "}": -1}.get(word, 0)
         words += [word.strip('"')] if depth < 2 else []  # outside of the bundles within Parameters
@@ -62,7 +62,7 @@ def read_amira(path: Path, options: ReadOptions) -> Volume:
     return _placed(field, fields, text, path, options)
 
 
-def _placed(field: np.ndarray, fields: Fields, text: str, path: Path, options: ReadOptions) -> Volume:
+def _placed(field: np.ndarray, fields: HeaderFields, text: str, path: Path, options: ReadOptions) -> Volume:
     """Return the volume of a field (nz, ny, nx), where BoundingBox and TransformationMatrix say."""
     low, step, matrix = np.zeros(3), np.ones(3), np.eye(4)
     if "BoundingBox" in fields:

@@ -14,17 +14,17 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, type_of
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import IDENTITY, Volume
 
 
-def _fields(path: Path) -> Fields:
+def _fields(path: Path) -> HeaderFields:
     with open(path, "rb") as file:
         text = file.read(MAX_HEADER).decode("utf-8-sig", "replace")
-    fields = Fields(path.name)
+    fields = HeaderFields(path.name)
     for line in text.splitlines():
         key, colon, value = line.split("#")[0].partition(":")
         if colon and not key.startswith("/"):
@@ -32,7 +32,7 @@ def _fields(path: Path) -> Fields:
     return fields
 
 
-def _format(fields: Fields) -> tuple[np.dtype, int]:
+def _format(fields: HeaderFields) -> tuple[np.dtype, int]:
     match = re.fullmatch(r"(?:vec([234]))?(\w+)", fields.need("format").lower())
     dtype = None if match is None else type_of(match[2], {"ushort12": "u2"})  # the last: Voreen's
     if match is None or dtype is None:
@@ -41,7 +41,7 @@ def _format(fields: Fields) -> tuple[np.dtype, int]:
     return dtype.newbyteorder(">" if big else "<"), int(match[1] or 1)
 
 
-def _scaling(fields: Fields) -> tuple[float, float]:
+def _scaling(fields: HeaderFields) -> tuple[float, float]:
     """Return slope and intercept that take DataRange to ValueRange (both must be there)."""
     if not fields.get("datarange") or not fields.get("valuerange"):
         return 1.0, 0.0
@@ -53,7 +53,7 @@ def _scaling(fields: Fields) -> tuple[float, float]:
     return slope, v0 - slope * d0
 
 
-def _geometry(fields: Fields, dims: list[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _geometry(fields: HeaderFields, dims: list[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return spacing (x, y, z) and direction (row-major).
 
     Basis vectors are rows of the matrix whose columns span the whole box: so Inviwo's DatVolumeSequenceReader takes

@@ -140,11 +140,11 @@ def lazy_pages(
     return slice_by_slice(read, dtype, (lead[axis], rows, columns), str(path))
 
 
-def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Return slices that stay in their files; ``of`` reads one as (1, y, x), all as ``plane``, the first of them."""
+def lazy_files(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], source: str) -> Stored:
+    """Return slices that stay in their files; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
 
     def read(k: int) -> np.ndarray:
-        values = of(files[k])
+        values = load(files[k])
         if values.shape != plane.shape or values.dtype != plane.dtype:
             raise DataError(
                 f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "

@@ -95,21 +95,21 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     return Volume(field, spacing, name=volume_name(path), unit=facts.length)
 
 
-def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) -> bool:
+def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], all_channels: bool) -> bool:
     """Tell whether slices are pages of which nothing but rows and columns is kept."""
     kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
     ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
-    return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
+    return not all_channels and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
 
 
 def _arranged(
-    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path, view: bool
+    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], all_channels: bool, path: Path, view: bool
 ) -> np.ndarray:
     """Return (z, y, x) of what was read, the magnitude of several channels; ``view``: one of the file will do."""
     kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
     field = values.transpose([kept.index(a) for a in "ZYXCS" if a in kept])
     field = field[tuple(slice(None) if a in kept else None for a in "ZYX")]
-    if several:
+    if all_channels:
         check_memory(field[..., 0].size * 4, str(path))
         return magnitude(field.reshape(*field.shape[:3], -1))
     if view or field.flags.c_contiguous:

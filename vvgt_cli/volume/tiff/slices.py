@@ -16,8 +16,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields
+from vvgt_cli.volume.components import listed, select_component
+from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
@@ -25,7 +25,7 @@ from vvgt_cli.volume.tiff.pages import lazy_files
 from vvgt_cli.volume.tiff.reader import read_tiff
 from vvgt_cli.volume.types import Volume
 
-MOST = 100_000  # files
+MAX_FILES = 100_000  # files
 
 
 def matching(pattern: str) -> list[Path]:
@@ -54,12 +54,13 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     Errors are those of `Reader.read`.
     """
     files, others = _of_one_format(files) if len(files) > 1 else (files, [])
-    if len(files) > MOST:
-        raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
+    if len(files) > MAX_FILES:
+        raise DataError(f"{source}: {len(files)} files; expected at most {MAX_FILES} slices")
     if not files:
         raise DataError(f"{source}: no slices ({', '.join(SUFFIXES)})")
     if others:
-        warnings.warn(f"{source}: skipped {listed(others)}: not of the format of most slices", stacklevel=2)
+        names = listed([path.name for path in others], ", ", 3)
+        warnings.warn(f"{source}: skipped {names}: not of the format of most slices", stacklevel=2)
     files, step = in_order(files, source)
 
     def page(path: Path, slices: int = 1) -> Volume:
@@ -184,11 +185,11 @@ _SIZES = {  # field of the size along x: of those along y and z, of the pixels a
 Spacing = tuple[float, float, float]
 
 
-def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | None) -> tuple[Spacing, str] | None:
+def log_spacing(first: Path, size: tuple[int, int], step: int, spacing: Spacing | None) -> tuple[Spacing, str] | None:
     """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None, and a warning, if unsure.
 
     Slices must have the ``size`` (x, y) in pixels that the log states. Their distance goes by the ``step`` of their
-    numbers, or the log's. Sizes that are ``given`` replace the log's. If there are several logs, the one
+    numbers, or the log's. Sizes that are given as ``spacing`` replace the log's. If there are several logs, the one
     with the longest name that the name of the ``first`` slice begins with counts.
 
     Raises:
@@ -203,8 +204,8 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | 
     along_x = next(key for key in _SIZES if key in log)
     along_y, along_z, pixels, axes, unit = _SIZES[along_x]
     unit = log.get("xtekct/units") or unit
-    if given is not None:
-        return given, unit
+    if spacing is not None:
+        return spacing, unit
     x, y, z = (log.floats(key, log.need(key), 1)[0] for key in (along_x, along_y or along_x, along_z or along_x))
     stated = [log[key] for axis in axes if (key := pixels.format(axis)) in log]
     between = "reconstruction/section to section step"
@@ -219,18 +220,15 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | 
     return None
 
 
-def _fields(path: Path) -> Fields:
+def _fields(path: Path) -> HeaderFields:
     """Return the fields of a log, ``section/key`` in lower case."""
-    fields, section = Fields(str(path)), ""
+    fields, section = HeaderFields(str(path)), ""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file.read(MAX_HEADER).splitlines():
             key, equals, value = line.partition("=")
             section = line.strip().strip("[]").lower() if line.startswith("[") else section
             fields.update({f"{section}/{key.strip().lower()}": value.strip()} if equals else {})
     return fields
-
-
-_SHOWN = 3  # numbers or files that a message names
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:
@@ -258,7 +256,8 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
     if len(alone) >= len(main) or not columns:
         return files, 1
     if alone:
-        warnings.warn(f"{source}: skipped {listed(alone)}: not numbered as the other slices", stacklevel=2)
+        names = listed([path.name for path in alone], ", ", 3)
+        warnings.warn(f"{source}: skipped {names}: not numbered as the other slices", stacklevel=2)
     parts = re.split(r"(\d+)", main[0].name)
     for k in (k for k in range(len(columns) - 1) if parts[2 * k + 2] == "."):  # decimals: 0.5, 1.0, 1.5
         places = [float(f"{text[k]}.{text[k + 1]}") for text in texts]
@@ -272,13 +271,8 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
     step = int(min(_steps(numbers)))
     gaps = [n for a, b in pairwise(sorted(numbers)) for n in range(a + step, min(b, a + 5 * step), step)]
     if gaps:
-        warnings.warn(f"{source}: no slices numbered {listed(gaps)}; read as if evenly spaced", stacklevel=2)
+        warnings.warn(f"{source}: no slices numbered {listed(gaps, ', ', 3)}; read as if evenly spaced", stacklevel=2)
     return [path for _, path in sorted(zip(numbers, series, strict=True))], step
-
-
-def listed(items: Sequence[Path | int]) -> str:
-    """Return the first few numbers, or names of files, and that there are more."""
-    return ", ".join(str(getattr(i, "name", i)) for i in items[:_SHOWN]) + (", ..." if len(items) > _SHOWN else "")
 
 
 def _steps(numbers: Sequence[float]) -> set[float]:

@@ -35,13 +35,13 @@ from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 from vvgt_cli.volume.vtk.programs import PROGRAMS, read_program
-from vvgt_cli.volume.vtk.resample import MOST
+from vvgt_cli.volume.vtk.resample import MAX_EDGE
 
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 KEYS = ("dims", "spacing", "array", "component", "time")
-MOST_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
+MAX_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
 
 
@@ -83,7 +83,7 @@ def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[st
 
 def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
     size = path.stat().st_size if program == SINGLE else _bytes_near(path)
-    samples = count(options.dims) if options.dims else min(40 * size, MOST**3)
+    samples = count(options.dims) if options.dims else min(40 * size, MAX_EDGE**3)
     seconds = math.ceil(SECONDS + A_BYTE * size + A_VOXEL * samples)
     request = {
         "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
@@ -349,8 +349,8 @@ def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any
 
 
 def _short(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    left = len(rows) - MOST_ROWS
-    return rows if left <= 0 else [*rows[:MOST_ROWS], {"more": left}]
+    left = len(rows) - MAX_ROWS
+    return rows if left <= 0 else [*rows[:MAX_ROWS], {"more": left}]
 
 
 def _array(info: ArrayInfo, leaves: Sequence[Leaf]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.libraries import library_errors, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.stored import Slices, stored_or_held
+from vvgt_cli.volume.stored import Slices, stored_or_loaded
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk.child import volume_by_child
 from vvgt_cli.volume.vtk.index import chosen_time
@@ -72,7 +72,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
         return np.ascontiguousarray(read_part(path, name, (*before, *box, *behind)), dtype)
 
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
-    values = stored_or_held(read, dtype, shape, chunks, source, options.stored)
+    values = stored_or_loaded(read, dtype, shape, chunks, source, options.stored)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 

@@ -19,7 +19,7 @@ from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.vtk.blocks import walk_xml
 
-MOST = 100_000  # files that an index may name
+MAX_FILES = 100_000  # files that an index may name
 DEEPEST = 8  # indexes that name indexes
 MAX_BYTES = 64 << 20  # of an index
 PIECES = {"PUnstructuredGrid", "PRectilinearGrid", "PStructuredGrid", "PImageData"}
@@ -74,7 +74,7 @@ def chosen_time(times: list[float], time: int | None, source: str) -> float | No
 
 
 def read_index(path: Path) -> Index:
-    """Read an index file, XML or JSON, but none of its files; raise DataError if it names none, or more than `MOST`."""
+    """Read an XML or JSON index, none of its files; raise DataError if it names none, or more than `MAX_FILES`."""
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise DataError(f"{path}: {size} bytes; expected an index of at most {MAX_BYTES >> 20} MiB")
@@ -103,8 +103,8 @@ def _series(path: Path) -> Index:
 
 
 def _add(found: Index, entry: Entry) -> None:
-    if len(found.entries) >= MOST:
-        raise DataError(f"{found.path}: an index of more than {MOST} files; expected fewer")
+    if len(found.entries) >= MAX_FILES:
+        raise DataError(f"{found.path}: an index of more than {MAX_FILES} files; expected fewer")
     found.entries.append(entry)
 
 

@@ -18,7 +18,7 @@ from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
-from vvgt_cli.volume.vtk.resample import MOST, Samples, grid_of, probe, sampled_volume
+from vvgt_cli.volume.vtk.resample import MAX_EDGE, Samples, grid_of, probe, sampled_volume
 
 ALIGNED = 1e-3  # voxels that images of one lattice may lie off
 EDGE = 1e-6  # of a cell: samples that lie on the face of a block are in it
@@ -39,17 +39,17 @@ class Leaf:
     name: str = ""
 
 
-def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
-    """Yield the datasets in a vtkDataObject: itself, or those of its blocks that are there, with their levels."""
+def leaves_of(root: Any, name: str = "") -> Iterator[Leaf]:
+    """Yield the datasets in the vtkDataObject ``root``: itself, or its blocks that are there, with their levels."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet
 
-    if found is None or found.IsA("vtkDataSet"):
-        if found is not None:
-            yield Leaf(found, 0, name)
+    if root is None or root.IsA("vtkDataSet"):
+        if root is not None:
+            yield Leaf(root, 0, name)
         return
-    if not found.IsA("vtkCompositeDataSet"):
+    if not root.IsA("vtkCompositeDataSet"):
         return
-    walk = found.NewIterator()
+    walk = root.NewIterator()
     amr = hasattr(walk, "GetCurrentLevel")
     walk.InitTraversal()
     while not walk.IsDoneWithTraversal():
@@ -164,7 +164,7 @@ def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: 
         finest = np.min([leaf.data.GetSpacing() for leaf in leaves], axis=0)
         if (finest > 0).all() and np.isfinite(box).all():
             wanted = np.maximum(np.round((box[:, 1] - box[:, 0]) / finest), 1)
-            dims = triple(np.ceil(wanted / max(wanted.max() / MOST, 1)).astype(int).tolist())
+            dims = triple(np.ceil(wanted / max(wanted.max() / MAX_EDGE, 1)).astype(int).tolist())
     return grid_of(box, dims, cells, source)
 
 

@@ -25,7 +25,7 @@ from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, re
 from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
-HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
+MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
 DEPTH = 64  # slices that are read at once where the volume is walked through
 FEW = 4096  # pieces of which every pair is compared
@@ -65,15 +65,15 @@ class _Pieces:
         chunks: (z, y, x) voxels of the largest piece, `DEPTH` slices at most.
     """
 
-    def __init__(self, found: Scan, info: ArrayInfo, options: ReadOptions, path: Path) -> None:
+    def __init__(self, document: Scan, info: ArrayInfo, options: ReadOptions, path: Path) -> None:
         self.path, self.info, self.options = path, info, replace(options, stored=False)  # a piece is held as a whole
-        self.names = [name for name, _ in found.sources]
-        whole = np.array(extent_of(found.image.get("WholeExtent", ""), path)).reshape(3, 2)
-        extents = [extent_of(text, path, f"Extent of piece {name!r}") for name, text in found.sources]
+        self.names = [name for name, _ in document.sources]
+        whole = np.array(extent_of(document.image.get("WholeExtent", ""), path)).reshape(3, 2)
+        extents = [extent_of(text, path, f"Extent of piece {name!r}") for name, text in document.sources]
         boxes = np.array(extents, np.int64).reshape(-1, 3, 2)
         bad = (boxes[..., 0] > boxes[..., 1]) | (boxes[..., 0] < whole[:, 0]) | (boxes[..., 1] > whole[:, 1])
         if bad.any():
-            name, text = found.sources[int(np.flatnonzero(bad.any(axis=1))[0])]
+            name, text = document.sources[int(np.flatnonzero(bad.any(axis=1))[0])]
             raise DataError(f"{path}: piece {name!r} has Extent {text!r}; expected one within {whole.ravel().tolist()}")
         self._first = whole[:, 0]
         self._lo = boxes[..., 0] - self._first
@@ -83,12 +83,12 @@ class _Pieces:
         self._overlap: bool = _overlapping(self._lo, self._hi)
         self._kept: OrderedDict[int, tuple[Volume, np.ndarray]] = OrderedDict()
         self._lock = Lock()
-        self.image = found.image
+        self.image = document.image
         opened = self._scan(0)
-        if "Direction" not in found.image and "Direction" in opened.image:
-            self.image = {**found.image, "Direction": opened.image["Direction"]}  # VTK's writer leaves it out
+        if "Direction" not in document.image and "Direction" in opened.image:
+            self.image = {**document.image, "Direction": opened.image["Direction"]}  # VTK's writer leaves it out
         extent_dims(self.image, path)
-        self.dtype = self._dtype(found)
+        self.dtype = self._dtype(document)
         if self.hiding and info.where == "point":  # one is hidden where all pieces that have it say so
             self._hi, self._overlap = boxes[..., 1] - self._first + 1, True
         z, y, x = (self._hi - self._lo).max(axis=0)[::-1].tolist()
@@ -102,10 +102,10 @@ class _Pieces:
             raise DataError(f"{file}: a VTK file of type {found.kind or 'unknown'}; expected ImageData, a piece")
         return found
 
-    def _dtype(self, found: Scan) -> np.dtype:
+    def _dtype(self, document: Scan) -> np.dtype:
         """Return the type of the values: that of the index, or what NaN and magnitudes need."""
         dtype = selected_dtype(self.info, self.options.component, str(self.path))
-        self.hiding = any(found.find(GHOSTS, where) for where in HIDDEN) and not all(
+        self.hiding = any(document.find(GHOSTS, where) for where in HIDDEN) and not all(
             map(self._shown, range(len(self.names)))
         )
         return float_dtype(dtype) if self.hiding else dtype
@@ -153,7 +153,7 @@ class _Pieces:
                 return self._kept[k]
             made = self._opened(k)
             self._kept[k] = made
-            while len(self._kept) > 1 and (len(self._kept) > OPEN or self._bytes() > HELD):
+            while len(self._kept) > 1 and (len(self._kept) > OPEN or self._bytes() > MAX_KEPT):
                 self._kept.popitem(last=False)
             return made
 

@@ -22,7 +22,7 @@ from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
-MOST_NAMES = 100_000  # files that a case may name
+MAX_NAMES = 100_000  # files that a case may name
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
     """Refuse files named by another that do not lie in its folder, or are not there; a pattern stands for several."""
-    if len(names) > MOST_NAMES:
-        raise DataError(f"{path}: it names {len(names)} files; expected at most {MOST_NAMES}")
+    if len(names) > MAX_NAMES:
+        raise DataError(f"{path}: it names {len(names)} files; expected at most {MAX_NAMES}")
     for named in dict.fromkeys(names):
         if not re.search(r"[*%]", named):
             data_file(path, named, exact=True)  # VTK opens it

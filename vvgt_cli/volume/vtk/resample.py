@@ -13,7 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.types import Volume, float_dtype, triple
 
-MOST = 512  # voxels along an axis, where nobody said how many
+MAX_EDGE = 512  # voxels along an axis, where nobody said how many
 
 
 def rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
@@ -40,7 +40,7 @@ def resample(
         mesh: a vtkDataSet.
         values: (n,) scalars of its points or cells.
         where: ``point`` or ``cell``.
-        dims: voxels along (x, y, z); None: cubic ones, about as many as the mesh has cells, `MOST` along an axis.
+        dims: voxels along (x, y, z); None: cubic ones, about as many as the mesh has cells, `MAX_EDGE` along an axis.
         source: for messages.
         name: of the volume.
 
@@ -129,8 +129,8 @@ def _grid(
     thick = extent > 0
     if dims is None:
         edge = (np.prod(extent[thick]) / cells) ** (1 / max(thick.sum(), 1)) if thick.any() else 1.0
-        edge = max(edge, extent.max() / MOST)
-        wanted = np.clip(np.ceil(extent / edge - 1e-9), 1, MOST).astype(int)
+        edge = max(edge, extent.max() / MAX_EDGE)
+        wanted = np.clip(np.ceil(extent / edge - 1e-9), 1, MAX_EDGE).astype(int)
     else:
         wanted = np.where(thick, dims, 1)
     steps = np.where(thick, extent / wanted, 0.0)

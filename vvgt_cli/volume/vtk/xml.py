@@ -107,7 +107,7 @@ def scan(path: Path) -> Scan:
     return found
 
 
-def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
+def _note_array(document: Scan, attributes: dict[str, str], path: Path) -> None:
     dtype = type_of(attributes.get("type", ""), {"bit": "u1"})
     if dtype is None:
         return
@@ -115,8 +115,8 @@ def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
     if components < 1:
         raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
     name = attributes.get("Name", "")
-    active = bool(name) and name == found.active.get(found.where)
-    found.arrays.append((ArrayInfo(name, found.where, components, dtype.name, active), attributes))
+    active = bool(name) and name == document.active.get(document.where)
+    document.arrays.append((ArrayInfo(name, document.where, components, dtype.name, active), attributes))
 
 
 def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
@@ -153,9 +153,9 @@ def extent_dims(image: dict[str, str], path: Path) -> list[int]:
     return dims
 
 
-def stored_ratio(found: Scan, path: Path) -> int:
+def stored_ratio(document: Scan, path: Path) -> int:
     """Return the most bytes of values that a byte can stand for; raise DataError for an unknown compressor."""
-    compressor = found.root.get("compressor", "")
+    compressor = document.root.get("compressor", "")
     if compressor not in _RATIO:
         raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
     return _RATIO[compressor]
@@ -195,33 +195,33 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 
 
-def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
+def image_values(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
     """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
     With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden. Errors are
     those of `Reader.read`.
     """
-    packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
+    packed: np.ndarray | None = _packed(document, info, grid, options, path) if options.stored else None
     if packed is not None:
         return packed
-    component = select_from_array(_stored(found, info, grid, path), info, options.component, str(path))
+    component = select_from_array(_stored(document, info, grid, path), info, options.component, str(path))
     for where in ("point", "cell"):
-        row = found.find(GHOSTS, where)
+        row = document.find(GHOSTS, where)
         if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
             continue
-        marks = _stored(found, row[0], image_grid(found.image, where, path), path)[..., 0]
+        marks = _stored(document, row[0], image_grid(document.image, where, path), path)[..., 0]
         hidden = marks.astype(np.uint8) & HIDDEN[where] != 0
         component = without(component, hidden if where == info.where else around(hidden, component.shape))
     return component
 
 
-def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
+def _stored(document: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
     """Read the values (nz, ny, nx, c) of an array, mapped or by VTK."""
-    row = found.find(info.name, info.where)
+    row = document.find(info.name, info.where)
     shape = (*reversed(grid.dims), info.components)
-    _check_declared(found, info, count(shape), path)
+    _check_declared(document, info, count(shape), path)
     check_memory(count(shape) * np.dtype(info.dtype).itemsize, str(path))
-    values = None if row is None else _mapped(found, row[1], info, shape, path)
+    values = None if row is None else _mapped(document, row[1], info, shape, path)
     return _by_vtk(path, info, shape) if values is None else values
 
 
@@ -241,60 +241,60 @@ def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return cells
 
 
-def _check_declared(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+def _check_declared(document: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
     """Refuse sizes that the file cannot hold."""
     need = n_values * np.dtype(info.dtype).itemsize
     size = path.stat().st_size
-    if need > size * stored_ratio(found, path):
+    if need > size * stored_ratio(document, path):
         raise DataError(
             f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
             "declares; check that the file is whole"
         )
-    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
+    check_blocks(path, document.root, document.appended, document.data_start, stored_ratio(document, path))
 
 
 def _mapped(
-    found: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
+    document: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
 ) -> np.ndarray | None:
     """Map an array that is stored plainly, in one piece; None for others."""
-    plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
-    if not plain or found.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
+    plain = document.appended == "raw" and not document.root.get("compressor") and document.data_start >= 0
+    if not plain or document.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
         return None
-    word, dtype = _order(found, info)
-    start = found.data_start + int(attributes.get("offset", "0"))
+    word, dtype = _order(document, info)
+    start = document.data_start + int(attributes.get("offset", "0"))
     declared = int(load_block(path, word, (1,), offset=start)[0])
-    if start < found.data_start or declared != count(shape) * dtype.itemsize:
+    if start < document.data_start or declared != count(shape) * dtype.itemsize:
         raise DataError(
             f"{path}: array {info.name!r} stores {declared} bytes, its header declares {count(shape) * dtype.itemsize}"
         )
     return load_block(path, dtype, shape, offset=start + word.itemsize)
 
 
-def _order(found: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
+def _order(document: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
     """Return the types of the words before an array's values and of the values, as stored."""
-    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
-    word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
+    order = ">" if document.root.get("byte_order") == "BigEndian" else "<"
+    word = np.dtype(order + ("u8" if document.root.get("header_type") == "UInt64" else "u4"))
     return word, np.dtype(order + np.dtype(info.dtype).str[1:])
 
 
-def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
+def _packed(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
     """Wrap an array that is appended and compressed, in one piece, with no hidden value; None for others."""
-    row = found.find(info.name, info.where)
-    hidden = any(found.find(GHOSTS, where) for where in HIDDEN)
-    plain = not found.root.get("compressor") or found.appended not in ("raw", "base64") or found.data_start < 0
-    if row is None or plain or hidden or found.pieces != 1 or options.component == "magnitude":
+    row = document.find(info.name, info.where)
+    hidden = any(document.find(GHOSTS, where) for where in HIDDEN)
+    plain = not document.root.get("compressor") or document.appended not in ("raw", "base64") or document.data_start < 0
+    if row is None or plain or hidden or document.pieces != 1 or options.component == "magnitude":
         return None
     if row[1].get("format") != "appended" or row[1]["type"] == "Bit":
         return None
     shape = (*reversed(grid.dims), info.components)
-    _check_declared(found, info, count(shape), path)
-    start = found.data_start + int(row[1].get("offset", "0"))
-    if start < found.data_start:
+    _check_declared(document, info, count(shape), path)
+    start = document.data_start + int(row[1].get("offset", "0"))
+    if start < document.data_start:
         raise DataError(f"{path}: array {info.name!r} begins before the appended data; check that the file is whole")
     component = None if options.component is None else int(options.component)
-    word, dtype = _order(found, info)
+    word, dtype = _order(document, info)
     return packed_array(
-        path, found.root["compressor"], word, found.appended == "base64", start, dtype, shape, component, info
+        path, document.root["compressor"], word, document.appended == "base64", start, dtype, shape, component, info
     )  # fmt: skip
 
 

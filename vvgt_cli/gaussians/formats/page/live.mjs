@@ -27,7 +27,7 @@ export async function liveLook({ app }, live) {
   const { planes } = live, layers = layersOf(live), carried = new WeakMap();  // bytes of the resources that have them
   async function carry(k, to) {
     if (carried.has(to)) return carried.get(to);
-    const bytes = await unpacked(live.held[k], live.held.length === 1, planes * to.gsplatData.numSplats), count = bytes.length / planes;
+    const bytes = await unpacked(live.elements[k], live.elements.length === 1, planes * to.gsplatData.numSplats), count = bytes.length / planes;
     to.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
     for (const [name, own] of STREAMS) {
       const texture = to.getTexture(name), texels = texture.lock();

@@ -27,16 +27,16 @@ const settings = {
 };
 
 // what the file itself holds (base64), or the server's answer
-function content({ file, held, whole }) {
-  if (!held) return fetch(file);
-  const own = heldBytes(held), bytes = whole === undefined ? own : patched(heldBytes(scene.frames[whole].held), own);
+function content({ file, element, whole }) {
+  if (!element) return fetch(file);
+  const own = bytesOf(element), bytes = whole === undefined ? own : patched(bytesOf(scene.frames[whole].element), own);
   if (!wholePly(bytes)) throw new Damaged('its Gaussians are incomplete');
-  if (scene.frames.length === 1) document.getElementById(held).remove();  // of several, one that left memory is read again
+  if (scene.frames.length === 1) document.getElementById(element).remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
 }
 
-function heldBytes(held) {
-  const text = atob(document.getElementById(held).textContent), bytes = new Uint8Array(text.length);
+function bytesOf(element) {
+  const text = atob(document.getElementById(element).textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   return bytes;
 }
@@ -69,7 +69,7 @@ function series(viewer, live) {
 
   function loaded(k) {
     if (!assets.has(k)) {
-      const { file, held } = scene.frames[k], contents = held && content(scene.frames[k]);
+      const { file, element } = scene.frames[k], contents = element && content(scene.frames[k]);
       assets.set(k, new Promise((done, fail) => {
         const asset = new Asset(file, 'gsplat', { url: file, filename: file, contents });
         asset.once('load', () => done(asset));

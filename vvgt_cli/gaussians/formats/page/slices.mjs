@@ -10,8 +10,8 @@ const HTML = `<header><b>slices</b><select class="grid" aria-label="volume" titl
 <label title="window: width of the range of greys">W <input class="window" type="number" step="any" min="0"></label><label title="level: middle of the range of greys">L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
 const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="1">';
 
-// facts of the grids; those of a server are fetched, and held by elements as in a file
-async function held(slices) {
+// facts of the grids; those of a server are fetched, and their contents put in elements as in a file
+async function factsOf(slices) {
   if (!slices.from) return slices;
   const answer = await fetch(slices.from);
   if (!answer.ok) throw new Error(`vvgt view: ${await answer.text()}`);
@@ -199,7 +199,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     if (grids) return;
     said.textContent = 'loading';
     const read = [];
-    for (const facts of await held(scene.slices)) read.push(await gridOf(facts));
+    for (const facts of await factsOf(scene.slices)) read.push(await gridOf(facts));
     grids = read;
     labels = grids.filter((grid) => grid.labels);
     const valued = grids.filter((grid) => !grid.labels), bases = valued.length ? valued : labels.slice(0, 1), list = find('.grid');

@@ -17,7 +17,7 @@ const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 *
 
 // {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, near(x, y, z): that between the eight around it, toWorld, toIndex, from(other): indices of another grid to its own}
 export async function gridOf(facts) {
-  const { dims: [nx, ny, nz], bits, held, affine, lo, step, missing } = facts, n = nx * ny * nz, bytes = await unpacked(held, true, (bits / 8) * n);
+  const { dims: [nx, ny, nz], bits, element, affine, lo, step, missing } = facts, n = nx * ny * nz, bytes = await unpacked(element, true, (bits / 8) * n);
   const codes = bits === 8 ? new Uint8Array(n) : new Uint16Array(n), high = bits === 8 ? null : bytes.subarray(n);
   for (let i = 0; i < n; i++) {
     const folded = high ? bytes[i] | (high[i] << 8) : bytes[i];
