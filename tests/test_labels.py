@@ -253,6 +253,14 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
     )
 
 
+def test_a_series_without_labels_is_one_line(vvgt, tmp_path: Path) -> None:
+    for k in range(2):
+        np.save(tmp_path / f"v{k}.npy", balls() * 0)
+    given = ("--labels", table(tmp_path, SLICER, "t.ctbl"), "-o", tmp_path / "a_{}.ply")
+    done = vvgt.fails(1, "convert", tmp_path / "v?.npy", *given)
+    assert "the series: none of its labels (only 0) is in t.ctbl" in done
+
+
 def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> None:
     for k in range(2):
         np.save(tmp_path / f"run_seg_{k}.npy", np.where(balls() == 3, 3 if k else 1, balls()).astype(np.uint8))

@@ -132,15 +132,18 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
             np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
 
 
-def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path) -> None:
+@pytest.mark.parametrize("labelled", [False, True])
+def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path, labelled: bool) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
     ball = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32)
     for k in range(3):
-        np.save(tmp_path / f"f{k}.npy", ball * (k != 1))
+        values = (ball > 0.5).astype(np.uint8) if labelled else ball
+        np.save(tmp_path / f"f{k}.npy", values * (k != 1))
     np.save(tmp_path / "low.npy", (z < -0.5).astype(np.uint8))
     (tmp_path / "tf.json").write_text(json.dumps(TF))
     low = f"{tmp_path / 'low.npy'},labels=auto"
-    source = ("convert", tmp_path / "f?.npy", "--tf", tmp_path / "tf.json", "--layer", low)
+    look = ("--labels", "auto") if labelled else ("--tf", tmp_path / "tf.json")
+    source = ("convert", tmp_path / "f?.npy", *look, "--layer", low)
     done = vvgt(*source, "--live", *SMALL, "-o", tmp_path / "f_{}.ply")
     assert (done.code, "skipped: f1 (only background)" in done.err) == (0, True), done.err
     for k, numbers in enumerate(([0, 1], [1], [0, 1])):

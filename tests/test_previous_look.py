@@ -1,5 +1,7 @@
 """Conversions that go on from an earlier one of the same volume: when, how near, and what is refused."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -113,6 +115,18 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
     assert np.array_equal(later.gaussians.means, alone.gaussians.means)
     assert np.array_equal(later.gaussians.colors, alone.gaussians.colors)
     assert names(later)[-1] == "conditions"
+
+
+def test_a_volume_that_went_on_is_released_at_once(session, earlier):
+    gc.disable()
+    try:
+        later = session.convert(SHELL, GOAL, after=earlier)
+        assert started_warm(later)
+        field = weakref.ref(later.field)
+        del later
+        assert field() is None
+    finally:
+        gc.enable()
 
 
 def test_refused(session, earlier):

@@ -143,7 +143,7 @@ def run_conversion(
         return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
     regions = finished is None and start is None and isinstance(field, Blocked) and by_regions(request)
     if start is not None:
-        field.renderer = start.views(field.views)
+        field.renderer = start.renderer(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None and not regions)
     report_target(run, work.fit, request.megabytes)
     if finished is not None or regions:

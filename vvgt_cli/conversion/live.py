@@ -130,7 +130,7 @@ def convert_live(
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     else:
         facts, look = LiveFacts.of(source.volume, source.overall, source.tf), source.tf
-        gaussians = _one_layer(run, request, field, facts.labels)
+        gaussians = _one_layer(run, request, field)
     table = lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
     gaussians = as_stored(apply_light(baked(gaussians, table, pixel), lighting))
     found = Conversion(to_unit_frame(gaussians, source.volume), run.report, replace(ply, live=facts), field)
@@ -142,10 +142,11 @@ def convert_live(
     return found
 
 
-def _one_layer(run: Run, request: ConvertRequest, field: Field, labels: tuple[Label, ...]) -> Gaussians:
-    """Return the live Gaussians of one layer, box frame; ``labels`` are those of a label map."""
+def _one_layer(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
+    """Return the live Gaussians of one layer, box frame."""
     source = field.source
     if isinstance(source.tf, LabelTable):
+        labels = source.tf.structures
         foggy = label_fog_field(field, labels)
         found = with_labels(run, foggy, fog_start(run, foggy, request), labels)
     else:
@@ -166,7 +167,7 @@ def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Ga
         layer_facts = replace(layer_facts, name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(layer_facts, dims=source.volume.dims))
         try:
-            some = _one_layer(run, share, alone, layer_facts.labels)
+            some = _one_layer(run, share, alone)
         except NothingVisible:  # a frame of a series in which it is empty
             run.skip(layer.volume.name, "only background")
             continue

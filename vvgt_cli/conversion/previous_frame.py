@@ -77,8 +77,8 @@ class PreviousFrame(WarmStart):
         self._turn = 0
         self._moved: int | None = None  # number of Gaussians that differ from the previous frame
 
-    def views(self, views: ViewRenderer) -> ViewRenderer:
-        """Implement `WarmStart.views`."""
+    def renderer(self, views: ViewRenderer) -> ViewRenderer:
+        """Implement `WarmStart.renderer`."""
         self._pictures.views = views
         return self._pictures
 

@@ -24,9 +24,9 @@ class WarmStart(ABC):
         If they are not, ``work`` is reset.
         """
 
-    def views(self, views: ViewRenderer) -> ViewRenderer:
-        """Return the views to convert by, which may cache their pictures."""
-        return views
+    def renderer(self, views: ViewRenderer) -> ViewRenderer | None:
+        """Return the renderer to convert by, which caches pictures of ``views``; None for no other."""
+        return None
 
     def keep(self, work: Work, plan: Plan) -> None:  # noqa: B027
         """Store a conversion that did not start from another."""

@@ -82,7 +82,7 @@ class LiveFacts:
         Raise NoLiveForm for more than `MAX_LABELS` labels.
         """
         if isinstance(look, LabelTable):
-            labels = look.structures
+            labels = look.structures or look.labels  # of a frame without labels, its background
             if len(labels) > MAX_LABELS:
                 raise NoLiveForm(f"{volume.name}: {len(labels)} labels; a live form has at most {MAX_LABELS}")
             numbers = [float(label.number) for label in labels]

@@ -167,7 +167,7 @@ class LabelTable:
         """
         known = {label.number: label for label in self.labels}
         missing = [n for n in numbers if n != 0 and n not in known]
-        shown = listed(missing, ", ")
+        shown = listed(missing, ", ") if missing else "only 0"
         if not any(n in known for n in numbers if n != 0):
             has = listed(list(known), ", ")
             raise DataError(f"{where}: none of its labels ({shown}) is in {self.name}, which has {has}")
