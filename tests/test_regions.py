@@ -28,6 +28,7 @@ from vvgt_cli.volume import ReadOptions
 
 FIT = ("--max-gaussians", "6000", "--size", "150", "--up", "z", "-q")
 STEPS = ("--steps", "24")
+SINGLE = RenderSettings(step=1.0, samples=1)
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +85,9 @@ def test_pictures_of_parts_compose_to_that_of_the_volume(volume: Path, light: st
 def test_a_part_is_shown_through_what_lies_before_it(volume: Path) -> None:
     (near, far), _ = parts_of(volume, None, (30, 46), (46, 100))
     camera = next(c for c in default_views("train", size=60) if c.position[0] < -2)
-    single = RenderSettings(step=1.0, samples=1)
-    before = near.view(moved(camera, near), single)[..., 3]
+    before = near.view(moved(camera, near), SINGLE)[..., 3]
     shown = far.shown(moved(camera, far))
-    behind = far.view(moved(camera, far), single)[..., 3] > 0.01
+    behind = far.view(moved(camera, far), SINGLE)[..., 3] > 0.01
     assert behind.any()
     assert before[behind].max() > 0.5
     apart = np.abs(shown[behind] - (1 - before[behind]))  # bricks of the two begin elsewhere
@@ -98,6 +98,15 @@ def test_a_part_is_shown_through_what_lies_before_it(volume: Path) -> None:
 def test_a_box_that_nothing_hides_is_shown_whole(volume: Path) -> None:
     (whole,), _ = parts_of(volume, None, (0, 100))
     assert (whole.shown(default_views("train", size=64)[0]) == 1).all()
+
+
+def test_errors_count_less_at_faces_that_cut_the_volume_alone(volume: Path) -> None:
+    (whole, part), _ = parts_of(volume, None, (0, 100), (40, 100))
+    for made, camera in ((whole, default_views("train", size=64)[0]), (part, default_views("train", size=64)[3])):
+        weights, width = made.weights(camera, 0.05), 0.05 / (made._frame.step * made.scale)
+        moved = np.abs(np.subtract(*(made.view(camera, SINGLE, grown=sign * width) for sign in (1, -1)))).max(axis=2)
+        np.testing.assert_allclose(weights, made.shown(camera) * (1 - moved), atol=1e-6)
+        assert (moved.max() > 0.5) == (made is part)
 
 
 def ball(count: int = 200) -> Gaussians:
@@ -118,6 +127,19 @@ def test_pixels_without_weight_change_nothing() -> None:
     assert (same.opacity_logits == ones.opacity_logits).all()
     assert np.abs(same.opacity_logits - start.opacity_logits).max() > 0.05
     np.testing.assert_allclose(none.opacity_logits, start.opacity_logits, atol=1e-6)
+
+
+def test_errors_without_weight_change_neither_rates_nor_scores() -> None:
+    start, cameras = ball(), default_views("train", size=64)
+    images = np.stack([0.9 * render(start, camera) for camera in cameras])  # near, so that rates are not at their limit
+    wrong, half = images.copy(), np.zeros((64, 64), np.float32)
+    half[:32], wrong[:, 32:] = 1, 1
+    weights, options = [half] * len(cameras), OptimizeOptions(steps=6)
+    found = [optimize(start, cameras, views, options, (cameras, views, None, weights), weights=weights)
+             for views in (images, wrong)]  # fmt: skip
+    assert found[0][1].checks[-1][2] > found[0][1].psnr_before + 0.1
+    assert [look[2] for look in found[0][1].checks] == [look[2] for look in found[1][1].checks]
+    assert (found[0][0].opacity_logits == found[1][0].opacity_logits).all()
 
 
 def scores(path: Path, *files: Path | str) -> list[float]:

@@ -29,11 +29,13 @@ OPAQUE, SMOOTH = 0.97, 1.0  # least alpha, and largest texture of the reference 
 WORST = 0.1  # share of the blocks that count as the worst
 
 
-def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None) -> float:
+def psnr(
+    reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None, weights: np.ndarray | None = None
+) -> float:
     """Return ``-10 log10(mean squared error)`` in dB of images in [0, 1] (clipped), at most `CAP`.
 
-    Images are (h, w) or (h, w, c); pixels in ``mask`` (h, w) count, by default all. Raise DataError where shapes
-    differ, none counts or one is not finite.
+    Images are (h, w) or (h, w, c); pixels in ``mask`` (h, w) count, by default all, and differences are multiplied by
+    ``weights`` (h, w). Raise DataError where shapes differ, none counts or one is not finite.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape:
@@ -43,6 +45,8 @@ def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None
     if reference.size == 0:
         raise DataError("PSNR of no pixels; expected at least one")
     difference = np.clip(reference, 0, 1) - np.clip(ours, 0, 1)
+    if weights is not None:
+        difference = difference * weights[..., None]
     error = float(np.mean(np.square(difference, dtype=np.float64)))
     if not math.isfinite(error):
         raise DataError("PSNR of images that are not finite; expected finite values")

@@ -32,12 +32,13 @@ def optimize(
         cameras: of the training views.
         images: (n, h, w, 4) float32 premultiplied.
         options: how, and when to stop.
-        check: cameras and images to judge by, and `Blocks` of each where the images hold only those: what is returned
-            is the best that they have seen, the input included. Without them the last step's Gaussians are returned.
+        check: cameras and images to judge by, `Blocks` of each where the images hold only those, and weights as below:
+            what is returned is the best that they have seen, the input included. Without a check the last step's
+            Gaussians are returned.
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
         free: (K,) bool, those that move, of the method "frame"; None: all.
-        weights: of each training view, (h, w) weights of its pixels in the loss; None: 1. Not on a device.
+        weights: of each training view, (h, w) factors of differences in the loss; None: 1. Not on a device.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.

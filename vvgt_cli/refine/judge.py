@@ -35,13 +35,13 @@ class Judge:
         if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
             return False
         scores = []
-        cameras, views, *rest = self.check
-        blocks = rest[0] if rest else None
+        cameras, views, blocks, weights = (*self.check, None, None)[:4]
         for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
             part = None if blocks is None else blocks[i]
             projection = self.state.project(camera, self.rule)
             image = blend(projection, np.maximum(self.state.colors_from(camera), 0), camera.height, camera.width, part)
-            scores.append(psnr(view[..., :3], (image if part is None else part.pick(image))[..., :3]))
+            image = image if part is None else part.pick(image)
+            scores.append(psnr(view[..., :3], image[..., :3], weights=None if weights is None else weights[i]))
         now = float(np.mean(scores))
         record.checks.append((record.steps, seconds, now))
         fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY

@@ -51,7 +51,7 @@ def run(
     """Run `optimize` without its defaults."""
     _fit("training", cameras, images)
     if check is not None:
-        _fit("check", *check)
+        _fit("check", *check[:3])
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)
@@ -143,7 +143,7 @@ def step(
 ) -> float:
     """Forward, loss, backward, update for one view; takes and returns the running RMS error.
 
-    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``. ``weight`` (h, w): of the pixels.
+    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``. ``weight`` (h, w): of differences.
     """
     if options.device != "cpu":
         there: Any = state  # an `OwnAxesOnDevice`
@@ -154,14 +154,15 @@ def step(
 
     projection = state.project(camera, options.rule)
     image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
+    seen = image if weight is None else target + weight[..., None] * (image - target)
     grad = np.empty_like(image)
     l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)
     squares = np.empty(camera.height)
-    loss_gradient(image, target, l1, l2, alpha, grad, squares)
+    loss_gradient(seen, target, l1, l2, alpha, grad, squares)
     if options.ssim > 0:
-        add_ssim_gradient(image, target, options.ssim, grad)
+        add_ssim_gradient(seen, target, options.ssim, grad)
     if options.texture > 0:
-        add_texture_gradient(image, target, options.texture, grad)
+        add_texture_gradient(seen, target, options.texture, grad)
     if weight is not None:
         grad *= weight[..., None]
     now = math.sqrt(squares.sum() / ((3 + options.alpha) * camera.height * camera.width))

@@ -23,7 +23,7 @@ TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs
 LOSSES: dict[str, dict[str, float]] = {"frame": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Progress = Callable[[int, int], None]
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
-Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None]"
+Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None, Sequence[np.ndarray] | None]"
 
 
 @dataclass(frozen=True)

@@ -112,11 +112,19 @@ VIEW_BYTES = 2 * 16  # bytes per pixel: float32 RGBA, twice while views are stac
 
 @dataclass(frozen=True)
 class Views:
-    """Cameras and their pictures, (n, h, w, 4) float32 premultiplied; with ``blocks``, only those of each view."""
+    """Cameras and their pictures.
+
+    Attributes:
+        cameras: n cameras.
+        images: (n, h, w, 4) float32 premultiplied.
+        blocks: of each view, those that its image holds; None for all.
+        weights: of each view, (h, w) factors of differences in its picture; None for 1.
+    """
 
     cameras: list[Camera]
     images: np.ndarray
     blocks: list[Blocks] | None = None
+    weights: list[np.ndarray] | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -125,7 +133,8 @@ class Views:
     def take(self, index: Sequence[int] | np.ndarray) -> Views:
         """Return the views at ``index``."""
         blocks = None if self.blocks is None else [self.blocks[i] for i in index]
-        return Views([self.cameras[i] for i in index], self.images[list(index)], blocks)
+        weights = None if self.weights is None else [self.weights[i] for i in index]
+        return Views([self.cameras[i] for i in index], self.images[list(index)], blocks, weights)
 
     def pictures(self, gaussians: Gaussians, rule: Rule = INRIA) -> Iterator[np.ndarray]:
         """Draw Gaussians in each view, whole or in its blocks."""
@@ -144,8 +153,9 @@ class Views:
         """
         from vvgt_cli.images.metrics import FOREGROUND, psnr
 
-        pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
-        found = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])
+        weights = [None for _ in self.cameras] if self.weights is None else self.weights
+        pairs = zip(self.images, self.pictures(gaussians, rule), weights, strict=True)
+        found = np.array([psnr(view[..., :3], image[..., :3], weights=weight) for view, image, weight in pairs])
         seen = np.array([view[..., 3].max() > FOREGROUND for view in self.images])
         return float(found[seen | ~seen.any()].mean())
 

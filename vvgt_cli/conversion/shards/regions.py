@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,11 +65,22 @@ class VolumePart:
         self.centre = (lo + hi) / 2 * frame.step - frame.half
         self.scale = PART_RADIUS / float(np.linalg.norm((hi - lo) / 2 * frame.step))
         self._empty = empty_distance(brick_ranges(self.box.values), self.box.optics)
-        self._cast = caster(self.box, self._empty, lo, hi, dims, light)
 
-    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """Render a picture (h, w, 4) of the part, as `render_view` does; the camera is in the part's frame."""
+    def view(
+        self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None, grown: np.ndarray | float = 0.0
+    ) -> np.ndarray:
+        """Render a picture (h, w, 4) of the part, as `render_view` does.
+
+        Args:
+            camera: camera in the part's frame.
+            settings: settings of the rays.
+            blocks: blocks to render, None for all.
+            grown: voxels along each axis by which the faces that cut the volume move outwards, at most `REACH`.
+        """
         eye, basis, lens = self._arrays(camera)
+        lo = np.where(self._lo > 0, self._lo - grown, 0.0)
+        hi = np.where(self._hi < self._dims, self._hi + grown, self._dims)
+        cast = caster(self.box, self._empty, lo, hi, self._dims, self._light)
         out = np.zeros((camera.height, camera.width, 4), np.float32)
         box = BoxFrame((self._hi - self._lo) / 2 * self._frame.step * self.scale, self._frame.step * self.scale)
         for rays in tiers(for_thin(settings, box, camera), out, blocks):
@@ -77,9 +88,9 @@ class VolumePart:
                 row, column = np.nonzero(mask)
                 pixels = np.stack([column, row], axis=1)
                 bundle = KernelBundle(eye, basis, lens, min(settings.step, LONGEST), pixels, offsets)
-                near = meeting(bundle, self._lo - 0.5, self._hi - 0.5)
+                near = meeting(bundle, lo - 0.5, hi - 0.5)
                 sums = np.zeros((len(pixels), 4))
-                sums[near] = self._cast(bundle, near).sum(axis=1)
+                sums[near] = cast(bundle, near).sum(axis=1)
                 out[row, column] = (known * out[row, column] + sums) / (known + len(offsets))
         return out
 
@@ -98,6 +109,22 @@ class VolumePart:
             seen = caster(self.box, self._empty, lo, hi, self._dims, self._light)(bundle, near)
             through[near] *= 1 - seen[:, 0, 3]
         return through.reshape(camera.height, camera.width)
+
+    def weights(self, camera: Camera, width: float) -> np.ndarray:
+        """Return (h, w) factors by which errors of a part's picture count in pictures of the volume.
+
+        They are `shown`, and lower where the picture changes with the place of the faces that cut the volume: Gaussians
+        reach over these, and only those of both sides together show what is there.
+
+        Args:
+            camera: camera in the part's frame.
+            width: length by which Gaussians reach over a face, in the part's frame.
+        """
+        grown = np.minimum(width / (self._frame.step * self.scale), REACH)
+        single = RenderSettings(step=LONGEST, samples=1)
+        inner, outer = (self.view(camera, single, grown=by) for by in (-grown, grown))
+        found: np.ndarray = self.shown(camera) * (1 - np.abs(outer - inner).max(axis=2))
+        return found
 
     def _before(self, eye: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield boxes of voxels (first, end) that rays from an eye, in voxels, may pass before they enter the part.
@@ -287,6 +314,7 @@ def make_regions(
 
 PIXEL = 3.0  # width of a pixel of the training views, in median standard deviations of the middle axis
 SMALLEST, LARGEST, MULTIPLE = 64, 384, 16  # pixels along the edge of a view
+FACES = 2.0  # median standard deviations of the middle axis by which Gaussians reach over a face
 SPREAD = 0.5  # share of a screen pixel's width in a training pixel from which rays cover all of the latter
 
 
@@ -325,11 +353,16 @@ class PartDescent:
             return gaussians
         start = part.moved_in(gaussians)
         screen = pixel_width(self.size) * distance / RADIUS * part.scale
-        edge = view_edge(start, screen)
+        width = float(np.exp(np.median(np.sort(start.log_scales, axis=1)[:, 1])))
+        edge = view_edge(width, screen)
         footprint = min(screen / pixel_width(edge), 1.0)
         rule = self.rule.at(footprint)
         settings = ray_settings(part, start, edge, rule, 1.0 if footprint >= SPREAD else footprint)
         check = render_check_views(part, default_views("check", size=edge), settings)
+        weights = [part.weights(camera, FACES * width) for camera in check.cameras]
+        if check.blocks is not None:
+            weights = [b.pick(w[..., None])[..., 0] for b, w in zip(check.blocks, weights, strict=True)]
+        check = replace(check, weights=weights)
         before, target = check.psnr(start, rule), self.target_psnr
         if target is not None and before >= target:
             return gaussians
@@ -340,20 +373,20 @@ class PartDescent:
         )  # fmt: skip
         result, record = optimize(
             widened(start, WIDER, screen), cameras, render_views(part, cameras, settings), options,
-            check=(check.cameras, check.images, check.blocks), weights=[part.shown(camera) for camera in cameras],
+            check=(check.cameras, check.images, check.blocks, check.weights),
+            weights=[part.weights(camera, FACES * width) for camera in cameras],
         )  # fmt: skip
         if not (record.psnr_after or 0.0) > before:
             return gaussians
         return as_stored(part.moved_out(result))
 
 
-def view_edge(gaussians: Gaussians, screen: float) -> int:
+def view_edge(width: float, screen: float) -> int:
     """Return the pixels along the edge of views of Gaussians, whose pixels are as wide as neighbours are apart.
 
     Args:
-        gaussians: Gaussians in the frame of the views.
+        width: median standard deviation of the middle axis, in the frame of the views.
         screen: width of a screen's pixel there, the least width of a view's pixel.
     """
-    middle = float(np.exp(np.median(np.sort(gaussians.log_scales, axis=1)[:, 1])))
-    edge = pixel_width(1) / max(PIXEL * middle, screen)
+    edge = pixel_width(1) / max(PIXEL * width, screen)
     return int(np.clip(math.ceil(edge / MULTIPLE) * MULTIPLE, SMALLEST, LARGEST))

@@ -113,7 +113,7 @@ def refine(
             start if begin is None else begin[0],
             train.cameras,
             train.images,
-            check=(check.cameras, check.images, check.blocks),
+            check=(check.cameras, check.images, check.blocks, check.weights),
             progress=run.console.bar("refinement"),
             stop=stop,
             free=free,
