@@ -235,6 +235,11 @@ def test_minc_1_as_vtk_writes_it(tmp_path: Path, code: str) -> None:
     assert volume.space == "RAS"
 
 
+def test_minc_1_without_steps(tmp_path: Path) -> None:
+    (tmp_path / "v.mnc").write_bytes((MINC / "minc1_1_scale.mnc").read_bytes().replace(b"step", b"stop"))
+    assert read_volume(str(tmp_path / "v.mnc")).spacing == pytest.approx((1, 1, 1))
+
+
 @pytest.mark.parametrize(("old", "new", "message"), [
     (b"regular__", b"irregular", "irregular steps"),
     (b"zspace", b"qspace", "expected three in space"),
