@@ -23,14 +23,16 @@ def cells(times: int = 1, channels: int = 2, dtype: str = "uint16") -> np.ndarra
 
 
 def lif(
-    images: Sequence[tuple[str, np.ndarray]], spacing: Sequence[float] = SPACING, origin: Sequence[float] = (0, 0, 0)
-) -> bytes:
+    images: Sequence[tuple[str, np.ndarray]], spacing: Sequence[float] = SPACING, origin: Sequence[float] = (0, 0, 0),
+    interleaved: bool = False,
+) -> bytes:  # fmt: skip
     """A LIF file, version 2: header, XML in UTF-16, and a memory block an image; values are (t, c, z, y, x)."""
     elements, blocks = "", b""
     for number, (name, values) in enumerate(images):
         item = values.itemsize
-        dims, step = "", item
-        sizes = values.shape[::-1]
+        stored = np.moveaxis(values, 1, -1) if interleaved else values
+        dims, step = "", item * (values.shape[1] if interleaved else 1)
+        sizes = values[:, : 1 if interleaved else None].shape[::-1]
         order = (("1", sizes[0]), ("2", sizes[1]), ("3", sizes[2]), ("c", sizes[3]), ("4", sizes[4]))
         channel_step = 0
         for kind, size in order:
@@ -59,7 +61,7 @@ def lif(
         )
         title = f"MemBlock_{number}"
         head = struct.pack("<IIBQBI", 0x70, 0, 0x2A, values.nbytes, 0x2A, len(title))
-        blocks += head + title.encode("utf-16-le") + values.tobytes()
+        blocks += head + title.encode("utf-16-le") + stored.tobytes()
     xml = (
         '<LMSDataContainerHeader Version="2"><Element Name="all"><Children>'
         f"{elements}</Children></Element></LMSDataContainerHeader>"

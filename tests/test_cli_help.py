@@ -10,9 +10,10 @@ from vvgt_cli.cli.sections import SECTIONS, SectionedCommand
 
 
 def options(command: str) -> list[click.Option]:
-    found = cli.get_command(click.Context(cli), command)
+    group = click.Context(cli, **cli.context_settings)  # a command keeps the names of the first help that it makes
+    found = cli.get_command(group, command)
     assert isinstance(found, SectionedCommand)
-    return [parameter for parameter in found.get_params(click.Context(found)) if isinstance(parameter, click.Option)]
+    return [option for option in found.get_params(click.Context(found, group)) if isinstance(option, click.Option)]
 
 
 @pytest.mark.parametrize("command", ["convert", "init", "render-views", "evaluate", "report", "view", "check", "info"])

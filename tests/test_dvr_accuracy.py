@@ -9,6 +9,7 @@ import pytest
 from tests.test_dvr_render import LinearExtinction, smooth
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
+from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.reference import march, trilinear
 from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
@@ -123,6 +124,7 @@ def _runs(voxels, optics, starts, speeds, out):
         sample_run(voxels, p[0], p[1], p[2], v[0], v[1], v[2], optics, run)
         for n in range(RUN):
             out[i, n] = run[n]
+        out[i, RUN] = sample(voxels.values, p[0], p[1], p[2])
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
@@ -133,12 +135,13 @@ def test_runs_of_samples_match_the_twin(kind, shape):
     size = np.array(shape[::-1], float)
     starts = rng.uniform(-1, 1, (200, 3)) + rng.uniform(0, 1, (200, 3)) * size  # some leave the volume
     speeds = rng.uniform(-1, 1, (200, 3)) * rng.choice([0.0, 0.1, 4.0], (200, 3))
-    out = np.empty((200, RUN))
+    out = np.empty((200, RUN + 1))
     stored = data if shape[2] > 1 else data.astype(np.float32)  # as `kernel_values` does
     _runs(Voxels(stored), IDENTITY, starts, speeds, out)
     points = starts[:, None] + np.arange(RUN)[:, None] * speeds[:, None]
     exact = trilinear(Volume(data), points.reshape(-1, 3)).reshape(200, RUN)
-    np.testing.assert_allclose(out, exact, atol=200 * 2e-5)  # positions within a run to 1e-5 voxels, three axes
+    np.testing.assert_allclose(out[:, RUN], exact[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(out[:, :RUN], exact, atol=200 * 2e-5)  # positions in a run to 1e-5 voxels
 
 
 def test_samples_beside_a_voxel_that_is_not_finite_are_marked():
@@ -146,7 +149,7 @@ def test_samples_beside_a_voxel_that_is_not_finite_are_marked():
     data[1, 1, 4] = np.nan
     data[3, 3, 0] = np.inf
     starts = np.array([[0.0, 1.0, 1.0], [0.0, 3.0, 3.0]])
-    out = np.empty((2, RUN))
+    out = np.empty((2, RUN + 1))
     _runs(Voxels(data), IDENTITY, starts, np.array([[0.5, 0, 0], [0.5, 0, 0]]), out)
     np.testing.assert_array_equal(out[0, :RUN] == -1, [3 <= 0.5 * n < 5 for n in range(RUN)])
     np.testing.assert_array_equal(out[1, :RUN] == -1, [0.5 * n < 1 for n in range(RUN)])

@@ -49,6 +49,12 @@ def test_a_machine_without_opengl_is_told_so(monkeypatch):
         view_renderer("vtk", scene())(view())
 
 
+def test_the_padding_of_vtks_image_lies_around_it():
+    padded, image = (np.array(vtk_renderer.image_data(scene(), padded).GetBounds()) for padded in (True, False))
+    np.testing.assert_allclose((padded - image)[::2], -scene().step)
+    np.testing.assert_allclose((padded - image)[1::2], scene().step)
+
+
 VTK_VIEWS = """
 import sys
 import numpy as np

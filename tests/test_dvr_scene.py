@@ -8,7 +8,7 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.dvr.layout import BRICK, Voxels
+from vvgt_cli.dvr.layout import BRICK, Optics, Voxels
 from vvgt_cli.dvr.runs import sample_run, stack_run
 from vvgt_cli.dvr.scene import kernel_type, kernel_values
 from vvgt_cli.look.tables import FLAT, MAX_OPACITY, build_tables, extinction
@@ -206,6 +206,11 @@ def test_spans_are_flat_up_to_a_difference_of_extinction_or_colour():
             ends.append(first + sum(span * voxel <= FLAT for span in spans) - 1)
         assert tables.flat.tolist() == ends
         assert len(set(ends)) > 3
+
+
+def test_linear_tables_are_extinctions_themselves():
+    linear = Optics.linear(4.0)
+    assert (linear.nodes[-1, 3], linear.inv_width * 4) == (4, linear.bins)
 
 
 def test_extinction_is_capped_where_opacity_is_one():

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.closed_form.lit import point_normals
+from vvgt_cli.closed_form.columns import COLUMNS, X, Z
+from vvgt_cli.closed_form.lit import ARRIVING, TINT, _shade, point_normals
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.backends import view_renderer
+from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.light import ANGLE, OFFSET, RAYS, cone, sphere, transmittance
 from vvgt_cli.dvr.reference import grid_values, normals, optics, trilinear
 from vvgt_cli.errors import UsageError
@@ -216,6 +218,16 @@ def test_occlusion_leaves_a_plane_open_and_darkens_a_corner():
     assert shade[8, 20, 12] > 0.9
     assert shade[8, 8, 12] < 0.75 * shade[8, 20, 12]
     assert shade[3, 3, 12] < 0.05
+
+
+def test_the_openness_at_a_gaussian_is_interpolated_between_cells():
+    random, half, step = np.random.default_rng(4), np.array([3.0, 2.0, 1.0]), np.array([0.1, 0.2, 0.3])
+    places, shade = random.uniform(0, (24, 20, 16), (50, 3)), random.uniform(size=(1, 4, 5, 6)).astype(np.float32)
+    light = Light(1.0, 0.0, 0.0, 1.0, 1, np.zeros((0, 3)), shade, 0, 1, 0.25, np.ones(3), np.zeros(3))
+    moments, rows, out = np.ones((50, COLUMNS)), np.arange(50), np.empty((50, ARRIVING))
+    moments[:, X : Z + 1] = places * step - half
+    _shade(light, np.zeros((50, 3)), moments, rows, rows + 1, half, step, out)
+    np.testing.assert_allclose(out[:, TINT.start], trilinear(Volume(shade[0]), places / 4 - 0.5), atol=1e-6)
 
 
 def test_directions_are_spread_evenly():

@@ -178,6 +178,7 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
         (("--layer", "t,tf=viridis"), "3 layers of that name"),
         (("--layer", "2,tf=viridis"), "carry labels, not values"),
         (("--layer", "0"), "expected LAYER,tf=TF"),
+        (("--layer", "0,tf=a=b.json"), "a=b.json"),
     ):
         assert said in vvgt.fails(2, "recolor", live, *more, "-o", tmp_path / "x.ply")
     told = json.loads(vvgt("info", live, "--json").out)["live_layers"]

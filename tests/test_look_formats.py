@@ -103,6 +103,7 @@ def test_slicer_vp_json(file) -> None:
     tf = read_transfer_function(file(vp_json(), "bone.vp.json"))
     assert (tf.domain, tf.opacity_unit_distance) == ("data", 0.75)
     check_vtk(tf, OPACITY, COLORS, sharpness=0.3)
+    assert tf.color_map.nan_color == vtkColorTransferFunction().GetNanColor()
     slopes = {"points": [{"x": 0, "y": 0.0}, {"x": 255, "y": 1.0}]}
     assert tf.opacity_unit_label == "file"
     with pytest.warns(UserWarning, match=r"a.json: gradient opacity not used"):

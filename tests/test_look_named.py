@@ -248,6 +248,7 @@ def flame(rng: np.random.Generator) -> np.ndarray:
         (brain, "u1", {"space": "RAS"}, None),
         (flame, "f4", {}, None),
         (lambda rng: cushion(rng, -800), "i2", {"modality": "CT", "hounsfield": True}, "ct-soft-tissue"),
+        (lambda _: 40 - 840 * np.pad(np.ones((8, 8, 8)), 16), "i2", {"hounsfield": True}, "ct-soft-tissue"),  # a bubble
         (lambda rng: cushion(rng, 200), "i2", {"modality": "CT", "hounsfield": True}, "ct-soft-tissue"),
         (lambda rng: phantom("head") + 1024, "i2", {"space": "RAS"}, None),  # stored values
         (lambda rng: phantom("chest") + 1024, "i2", {"space": "RAS"}, None),

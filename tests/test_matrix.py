@@ -222,6 +222,7 @@ class TestEitherWay:
         fit = FEWEST[:4]
         vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
         vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz")
+        assert len(vvgt_cli.read_ply(tmp_path / "x.spz")[0]) == len(vvgt_cli.read_ply(tmp_path / "x.ply")[0])
 
     def test_the_closed_form_alone_under_the_light_of_the_functions_file(self, vvgt, at, tmp_path, blocks):
         base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)

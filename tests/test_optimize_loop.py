@@ -136,6 +136,7 @@ def test_a_run_that_ends_worse_than_it_was_returns_its_best(scene):
 def test_the_best_state_is_returned_not_the_last(scene, kind):
     start, _, check = scene
     state, record = kind(start, CAMERAS), OptimizeRecord()
+    assert not Judge(state, None, record).measure(0.0)
     judge = Judge(state, check, record)
     judge.measure(0.0)
     best, last = shaken(truth(), 0.02), shaken(truth(), 0.025)

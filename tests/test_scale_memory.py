@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from tests.test_scale import FIT, bodies, sorted_rows
+from tests.test_scale import FIT, bodies, sorted_rows, store
 from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import Stored
@@ -71,7 +71,9 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
     monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 20_000)
     assert (tmp_path / "v.tif").stat().st_size < 20_000
-    assert "processed in blocks" in vvgt.ok("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1]).err
+    for source in (tmp_path / "v.tif", store("zarr3", tmp_path, values)):
+        run = vvgt.ok("init", source, "-o", tmp_path / "a.ply", *FIT[:-1], "--overwrite")
+        assert "processed in blocks" in run.err
 
 
 def test_threads_share_a_file_of_pages(tmp_path):

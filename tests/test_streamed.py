@@ -17,7 +17,7 @@ from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.view import streamed_resources
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.shards.cut import CutNode
-from vvgt_cli.conversion.shards.level_selection import CutErrors, level_errors
+from vvgt_cli.conversion.shards.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.shards.regions import StoredGaussians, save
 from vvgt_cli.conversion.shards.streamed import FilePart, WrittenFiles, divide
 from vvgt_cli.errors import DataError, UsageError
@@ -112,6 +112,7 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
             turned = gaussians_of(files[place["file"]].take(rows), "a")[0]
             cuts.append(transform(turned, up_matrix("z").T))  # they are measured before what shows is turned upright
         squares, energy, pixels = level_errors(cuts)
+        assert pixels > 0.1 * len(SEEN_FROM) * VIEW_PIXELS**2  # the node fills its views
         np.testing.assert_allclose(squares / energy, node["errors"], rtol=0.1, atol=2e-4)
         np.testing.assert_allclose(np.sqrt(squares / pixels) / 2, node["rms"], rtol=0.1, atol=2e-3)
         assert node["errors"] == sorted(node["errors"])
@@ -248,7 +249,8 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
     assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
-def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, folder: Path) -> None:
+def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(folder, tmp_path / "out")
     manifest = json.loads((folder / "lod-meta.json").read_text())
     manifest["filenames"].append("3_7/meta.json")
     (folder / "lod-meta.json").write_text(json.dumps(manifest))

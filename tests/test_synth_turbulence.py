@@ -74,6 +74,12 @@ def test_energy_changes_by_forcing_and_viscosity_alone(kind):
         assert solver.energy(state[3:]) > 1e-3
 
 
+def test_it_starts_with_the_spectrum_that_is_stated():
+    """E(k) ~ k^4 exp(-k^2 / 4) has a mean k^2 of 10."""
+    solver = Solver(replace(QUIET, size=32))
+    assert solver.dissipation(solver.start(1)) == pytest.approx(2 * QUIET.viscosity * 10, rel=0.05)
+
+
 def test_without_forcing_and_viscosity_energy_is_kept():
     solver = Solver(Flow(16, 1e-12, power=0, rotation=2.0, stratification=3.0))
     state = solver.start(2)

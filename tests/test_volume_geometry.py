@@ -189,7 +189,7 @@ def openpmd(path: Path, order: str = "C", **changes: object) -> str:
         mesh = file.create_group("data/100/meshes/E")
         mesh.attrs.update({
             "axisLabels": np.array(labels[turn], "S1"), "dataOrder": np.bytes_(order), "gridSpacing": spacing[turn],
-            "geometry": np.bytes_("cartesian"), "gridGlobalOffset": offset[turn], "gridUnitSI": 1.0, **changes,
+            "geometry": np.bytes_("cartesian"), "gridGlobalOffset": offset[turn], **changes,
         })  # fmt: skip
         mesh["x"] = ramp(X, Y, Z) / 4
         mesh["x"].attrs.update({"position": [0.0, 0.0, 1.0][turn], "unitSI": 4.0})

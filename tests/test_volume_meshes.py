@@ -127,8 +127,11 @@ def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_arrays_of_a_mesh_are_listed_with_their_options(tmp_path: Path, vvgt) -> None:
-    tetrahedra().save(tmp_path / "v.vtu")
+    mesh = tetrahedra()
+    mesh.point_data["ramp"][:] = 7
+    mesh.save(tmp_path / "v.vtu")
     rows = contents(str(tmp_path / "v.vtu"), ReadOptions())["arrays"]
+    assert rows[0]["range"] == [7, 7]
     assert [(row["array"], row["components"], row["option"]) for row in rows] == [
         ("ramp", 1, "--array ramp"),
         ("vector", 3, "--array vector"),

@@ -122,6 +122,18 @@ def test_images_of_a_lif(vvgt, tmp_path: Path) -> None:
     ]
 
 
+def test_interleaved_channels_of_a_lif_are_red_green_and_blue(tmp_path: Path) -> None:
+    pytest.importorskip("liffile")
+    values = cells(channels=3)
+    (tmp_path / "a.lif").write_bytes(microscopes.lif([("only", values)], interleaved=True))
+    for channel in range(3):
+        volume = read_volume(str(tmp_path / "a.lif"), ReadOptions(component=channel))
+        np.testing.assert_array_equal(volume.data, values[0, channel])
+    with pytest.raises(SeveralComponents) as caught:
+        read_volume(str(tmp_path / "a.lif"))
+    assert caught.value.color
+
+
 def test_scenes_and_mosaics_of_a_czi(tmp_path: Path) -> None:
     pytest.importorskip("pylibCZIrw")
     values = cells()

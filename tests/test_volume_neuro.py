@@ -1,5 +1,6 @@
 """MGH, Analyze and MINC against nibabel and the files of MINC's own tools that it brings; sequences of 3D Slicer."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -202,6 +203,9 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
     refused(UsageError, "no axis of time", read_volume, str(tmp_path / "v.nrrd"), ReadOptions(component=1, time=1))
     (tmp_path / "v.nrrd").write_bytes(sequence("time domain domain domain"))
     np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(time=1))), VALUES + 1000)
+    unsaid = re.sub(rb"(space|kinds|labels)[^\n]*\n", b"", sequence())  # as many values as slices: the first axis
+    (tmp_path / "v.nrrd").write_bytes(unsaid)
+    np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(component=1))), VALUES + 1000)
 
 
 def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt) -> None:
@@ -233,6 +237,11 @@ def test_minc_1_as_vtk_writes_it(tmp_path: Path, code: str) -> None:
     np.testing.assert_array_equal(volume.data, values)
     np.testing.assert_allclose(volume.affine, [[0.5, 0, 0, 1], [0, 1.5, 0, -2], [0, 0, 2, 3], [0, 0, 0, 1]])
     assert volume.space == "RAS"
+
+
+def test_minc_1_without_steps(tmp_path: Path) -> None:
+    (tmp_path / "v.mnc").write_bytes((MINC / "minc1_1_scale.mnc").read_bytes().replace(b"step", b"stop"))
+    assert read_volume(str(tmp_path / "v.mnc")).spacing == pytest.approx((1, 1, 1))
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [

@@ -262,6 +262,8 @@ def test_other_axes_and_palettes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, VALUES[0], metadata={"axes": "RZYX"}, photometric="minisblack")
     refused(DataError, "axes 2 R, 4 slices, 6 rows, 5 columns; expected", read_volume, str(path))
+    tifffile.imwrite(path, VALUES[0, :, :1], metadata={"axes": "IZYX"}, photometric="minisblack")
+    np.testing.assert_array_equal(read_volume(str(path)).data, VALUES[0, :, 0])
     table = np.zeros((3, 256), "u2")
     tifffile.imwrite(path, VALUES[0, 0].astype("u1"), photometric="palette", colormap=table)
     refused(DataError, "numbers of a palette's colours", read_volume, str(path))

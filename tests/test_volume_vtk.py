@@ -263,6 +263,12 @@ def test_vti_cut_short(tmp_path: Path, capfd: pytest.CaptureFixture[str], compre
     assert capfd.readouterr() == ("", "")
 
 
+def test_vti_of_fewer_voxels_than_it_stores(tmp_path: Path) -> None:
+    path = Path(write_vti(tmp_path / "v.vti", image(a=VALUES.astype("f8"))))
+    path.write_bytes(path.read_bytes().replace(b"0 4 0 3 0 2", b"0 4 0 3 0 1"))
+    refused(DataError, "stores 480 bytes, its header declares 320", read_volume, str(path))
+
+
 def slc(planes: list[bytes], dims: str = "5 4 3", bits: int = 8, coding: int = 1) -> bytes:
     return f"11111\n{dims} {bits}\n0.5 1 2\n1 6 0 {coding}\n2 2 X".encode() + bytes(12) + b"".join(planes)
 

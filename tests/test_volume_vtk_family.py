@@ -197,6 +197,9 @@ def test_hidden_cells_are_nan(tmp_path: Path) -> None:
     for array in ("cells", "ramp"):
         volume = read_volume(str(tmp_path / "v.vtm"), ReadOptions(array=array, dims=(4, 3, 2)))
         assert np.argwhere(np.isnan(volume.data)).tolist() == [[0, 0, 0], [0, 0, 2]]
+    collection = "".join(f'<DataSet timestep="{time}" file="b1.vti"/>' for time in ("0", "inf"))
+    (tmp_path / "v.pvd").write_text(f'<VTKFile type="Collection"><Collection>{collection}</Collection></VTKFile>')
+    refused(DataError, "a time step that is not finite", read_volume, str(tmp_path / "v.pvd"))
     for name in ("b0.vtu", "b1.vti"):
         dims = (2, 3, 2) if name == "b0.vtu" else None
         alone = read_volume(str(tmp_path / name), ReadOptions(array="cells", dims=dims))

@@ -74,7 +74,7 @@ def writes_streaming(request: ConvertRequest) -> bool:
                 "reads (docs/scale.md)"
             )
         return True
-    other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
+    other = request.fit.init != "vbm" or bool(request.output and format_of(request.output))
     if options is not None and options.shard is not None:
         if other:
             raise UsageError(
