@@ -11,7 +11,7 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.shards.regions import RegionNodes, VolumePart
+from vvgt_cli.conversion.shards.regions import PartDescent, RegionNodes, VolumePart
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
@@ -20,9 +20,10 @@ from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.refine import OptimizeOptions, optimize
+from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.volume import ReadOptions
 
@@ -100,13 +101,43 @@ def test_a_box_that_nothing_hides_is_shown_whole(volume: Path) -> None:
     assert (whole.shown(default_views("train", size=64)[0]) == 1).all()
 
 
-def test_errors_count_less_at_faces_that_cut_the_volume_alone(volume: Path) -> None:
-    (whole, part), _ = parts_of(volume, None, (0, 100), (40, 100))
-    for made, camera in ((whole, default_views("train", size=64)[0]), (part, default_views("train", size=64)[3])):
-        weights, width = made.weights(camera, 0.05), 0.05 / (made._frame.step * made.scale)
-        moved = np.abs(np.subtract(*(made.view(camera, SINGLE, grown=sign * width) for sign in (1, -1)))).max(axis=2)
-        np.testing.assert_allclose(weights, made.shown(camera) * (1 - moved), atol=1e-6)
-        assert (moved.max() > 0.5) == (made is part)
+def test_a_part_whose_faces_move_is_seen_as_a_part_of_that_size(volume: Path) -> None:
+    (part, larger, smaller), _ = parts_of(volume, None, (30, 60), (26, 64), (33, 57))
+    for camera in default_views("test", size=60)[:3]:
+        for other, grown in ((larger, 4.0), (smaller, -3.0)):
+            ours, theirs = (
+                made.view(moved(camera, made), SINGLE, grown=by) for made, by in ((part, grown), (other, 0.0))
+            )
+            assert theirs[..., 3].max() > 0.5
+            assert np.abs(ours - theirs).mean() < 1e-4  # bricks of the two begin elsewhere
+        assert not part.view(moved(camera, part), SINGLE, grown=-15.0).any()
+
+
+def test_errors_count_less_where_the_place_of_a_cut_face_decides(volume: Path) -> None:
+    (whole, part), _ = parts_of(volume, None, (0, 100), (30, 60))
+    camera = next(c for c in default_views("train", size=90) if abs(c.position[0]) < 0.5)  # along the faces
+    assert (whole.weights(camera, 0.1) == 1).all()
+    weights, shown = part.weights(camera, 0.05), part.shown(camera)
+    assert (weights <= shown).all()
+    decided = np.abs(part.view(camera, SINGLE, grown=1.0) - part.view(camera, SINGLE, grown=-1.0)).max(axis=2)
+    assert (weights[decided > 0.9] < 0.2).all()
+    assert (decided > 0.9).any()
+    assert (weights[decided == 0] == shown[decided == 0]).mean() > 0.9
+
+
+@pytest.mark.parametrize("way", ["train", "check"])
+def test_descent_on_a_part_weighs_both_kinds_of_views(volume: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    (part,), _ = parts_of(volume, None, (30, 60))
+    monkeypatch.setattr(VolumePart, "weights", lambda self, camera, width: np.full((camera.height,) * 2, 0.25, "f4"))
+    seen = dict[str, object]()
+
+    def spied(*args: object, check: tuple, weights: list) -> tuple:
+        seen.update(train=weights, check=check[3])
+        return args[0], OptimizeRecord()
+
+    monkeypatch.setattr("vvgt_cli.refine.optimize", spied)
+    PartDescent(4, 150, RULES["inria"])(part, part.moved_out(ball()))
+    assert all((weight == 0.25).all() for weight in seen[way])
 
 
 def ball(count: int = 200) -> Gaussians:

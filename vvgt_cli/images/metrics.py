@@ -7,7 +7,7 @@ Akenine-Möller, Oskarsson, Åström, Fairchild: "FLIP: A Difference Evaluator f
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from itertools import zip_longest
 from typing import Any
@@ -29,13 +29,11 @@ OPAQUE, SMOOTH = 0.97, 1.0  # least alpha, and largest texture of the reference 
 WORST = 0.1  # share of the blocks that count as the worst
 
 
-def psnr(
-    reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None, weights: np.ndarray | None = None
-) -> float:
+def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return ``-10 log10(mean squared error)`` in dB of images in [0, 1] (clipped), at most `CAP`.
 
-    Images are (h, w) or (h, w, c); pixels in ``mask`` (h, w) count, by default all, and differences are multiplied by
-    ``weights`` (h, w). Raise DataError where shapes differ, none counts or one is not finite.
+    Images are (h, w) or (h, w, c); pixels in ``mask`` (h, w) count, by default all. Raise DataError where shapes
+    differ, none counts or one is not finite.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape:
@@ -45,12 +43,25 @@ def psnr(
     if reference.size == 0:
         raise DataError("PSNR of no pixels; expected at least one")
     difference = np.clip(reference, 0, 1) - np.clip(ours, 0, 1)
-    if weights is not None:
-        difference = difference * weights[..., None]
     error = float(np.mean(np.square(difference, dtype=np.float64)))
     if not math.isfinite(error):
         raise DataError("PSNR of images that are not finite; expected finite values")
     return min(CAP, -10 * math.log10(error)) if error > 0 else CAP
+
+
+def mean_psnr(
+    references: Iterable[np.ndarray], ours: Iterable[np.ndarray], weights: Sequence[np.ndarray] | None = None
+) -> float:
+    """Return the mean PSNR (dB) of RGB of pictures (h, w, 4), premultiplied.
+
+    With ``weights``, (h, w) factors of the differences of each, a picture counts as much as they leave of its alpha.
+    """
+    pairs = zip(references, ours, strict=True)
+    if weights is None:
+        return float(np.mean([psnr(a[..., :3], b[..., :3]) for a, b in pairs]))
+    weighted = [(w[..., None] * a, w[..., None] * b) for (a, b), w in zip(pairs, weights, strict=True)]
+    shares = [float(a[..., 3].sum()) + 1e-6 for a, _ in weighted]
+    return float(np.average([psnr(a[..., :3], b[..., :3]) for a, b in weighted], weights=shares))
 
 
 def ssim(reference: np.ndarray, ours: np.ndarray) -> float:

@@ -38,10 +38,12 @@ def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> 
     for array in gaussians.arrays().values():
         found.update(array.tobytes())
     for part in filter(None, views):
-        found.update(repr(part[2:]).encode())
+        found.update(repr(part[2:3]).encode())
         for camera, image in zip(part[0], part[1], strict=True):
             found.update(repr(camera).encode())
             found.update(image.tobytes())
+        for weight in (*part, None, None)[3] or ():
+            found.update(weight.tobytes())
     return found.hexdigest()
 
 

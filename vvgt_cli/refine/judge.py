@@ -6,7 +6,7 @@ import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
-from vvgt_cli.images.metrics import psnr
+from vvgt_cli.images.metrics import mean_psnr
 from vvgt_cli.refine.options import Check, OptimizeRecord
 from vvgt_cli.refine.states import State
 from vvgt_cli.splat import blend
@@ -34,15 +34,14 @@ class Judge:
         record = self.record
         if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
             return False
-        scores = []
+        images = []
         cameras, views, blocks, weights = (*self.check, None, None)[:4]
-        for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
+        for i, camera in enumerate(cameras):
             part = None if blocks is None else blocks[i]
             projection = self.state.project(camera, self.rule)
             image = blend(projection, np.maximum(self.state.colors_from(camera), 0), camera.height, camera.width, part)
-            image = image if part is None else part.pick(image)
-            scores.append(psnr(view[..., :3], image[..., :3], weights=None if weights is None else weights[i]))
-        now = float(np.mean(scores))
+            images.append(image if part is None else part.pick(image))
+        now = mean_psnr(views, images, weights)
         record.checks.append((record.steps, seconds, now))
         fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
         gained = self.best is None or now > self.best + GAIN

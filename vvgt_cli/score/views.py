@@ -148,14 +148,17 @@ class Views:
     def psnr(self, gaussians: Gaussians, rule: Rule = INRIA) -> float:
         """Return the mean PSNR (dB) of RGB over black, of the views that show something, or of all if none does.
 
+        With weights, return `mean_psnr`.
+
         Raises:
             DataError: a picture is not finite.
         """
-        from vvgt_cli.images.metrics import FOREGROUND, psnr
+        from vvgt_cli.images.metrics import FOREGROUND, mean_psnr, psnr
 
-        weights = [None for _ in self.cameras] if self.weights is None else self.weights
-        pairs = zip(self.images, self.pictures(gaussians, rule), weights, strict=True)
-        found = np.array([psnr(view[..., :3], image[..., :3], weights=weight) for view, image, weight in pairs])
+        if self.weights is not None:
+            return mean_psnr(self.images, self.pictures(gaussians, rule), self.weights)
+        pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
+        found = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])
         seen = np.array([view[..., 3].max() > FOREGROUND for view in self.images])
         return float(found[seen | ~seen.any()].mean())
 

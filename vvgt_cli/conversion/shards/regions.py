@@ -75,7 +75,8 @@ class VolumePart:
             camera: camera in the part's frame.
             settings: settings of the rays.
             blocks: blocks to render, None for all.
-            grown: voxels along each axis by which the faces that cut the volume move outwards, at most `REACH`.
+            grown: voxels along each axis by which the faces that cut the volume move outwards, at most `REACH`; a box
+                without extent is transparent.
         """
         eye, basis, lens = self._arrays(camera)
         lo = np.where(self._lo > 0, self._lo - grown, 0.0)
@@ -114,13 +115,14 @@ class VolumePart:
         """Return (h, w) factors by which errors of a part's picture count in pictures of the volume.
 
         They are `shown`, and lower where the picture changes with the place of the faces that cut the volume: Gaussians
-        reach over these, and only those of both sides together show what is there.
+        reach over these, and only those of both sides together show what is there. Faces move by an eighth of the part
+        at most.
 
         Args:
             camera: camera in the part's frame.
             width: length by which Gaussians reach over a face, in the part's frame.
         """
-        grown = np.minimum(width / (self._frame.step * self.scale), REACH)
+        grown = np.minimum(width / (self._frame.step * self.scale), np.minimum((self._hi - self._lo) / 8, REACH))
         single = RenderSettings(step=LONGEST, samples=1)
         inner, outer = (self.view(camera, single, grown=by) for by in (-grown, grown))
         found: np.ndarray = self.shown(camera) * (1 - np.abs(outer - inner).max(axis=2))
@@ -327,7 +329,7 @@ class PartDescent:
         size: pixels along the edge of the screen that the file is made for.
         rule: rule by which viewers draw.
         seed: seed of the order of views.
-        target_psnr: dB on a part's own check views at which its descent ends; None for all steps.
+        target_psnr: dB on a part's own weighted check views at which its descent ends; None for all steps.
     """
 
     steps: int
