@@ -138,7 +138,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   }
   const draw = () => { if (base && !root.hidden) views.forEach(drawView); };
 
-  // {place, world, value, in, layer, label} at an index of the base: as ruler.mjs has it
+  // {world, value, in, layer, names} at an index of the base, or null outside: as ruler.mjs has it
   function found(index) {
     const place = base.toWorld(index.map(Math.round)), code = base.at(index);
     if (code < 0) return null;
