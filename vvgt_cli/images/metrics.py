@@ -54,7 +54,13 @@ def mean_psnr(
 ) -> float:
     """Return the mean PSNR (dB) of RGB of pictures (h, w, 4), premultiplied.
 
-    With ``weights``, (h, w) factors of the differences of each, a picture counts as much as they leave of its alpha.
+    Args:
+        references: pictures of the volume.
+        ours: pictures to compare.
+        weights: (h, w) factors of the differences in each picture, which then counts by the sum of its weighted alpha.
+
+    Raises:
+        DataError: shapes differ, or a picture is not finite.
     """
     pairs = zip(references, ours, strict=True)
     if weights is None:
