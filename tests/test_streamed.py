@@ -152,6 +152,22 @@ def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_
     assert errors.rms(levels[0]) == 0 < errors.rms(levels[1]) < errors.rms(levels[2])
 
 
+def test_levels_of_a_fog_begin_where_viewers_draw_it(vvgt, tmp_path: Path) -> None:
+    volume, tf = tmp_path / "v_48x48x48_uint8.raw", tmp_path / "fog.json"
+    z, y, x = np.mgrid[:48, :48, :48]
+    volume.write_bytes((100 + 99 * np.sin(x / 9) * np.sin(y / 8) * np.sin(z / 7)).astype(np.uint8).tobytes())
+    points = [{"x": 0, "rgb": [0, 0, 0], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.01}]
+    tf.write_text(json.dumps({"range": [0, 255], "points": points}))
+    line = ("init", volume, "--tf", tf, "--max-gaussians", "20000", "--size", "150", "--blocks", "32")
+    vvgt.ok(*line, "-q", "-o", tmp_path / "fog.ply")
+    notes = vvgt.ok(*line, "-o", tmp_path / "fog" / "lod-meta.json").err
+    counts = read_manifest(tmp_path / "fog" / "lod-meta.json")["counts"]
+    assert "so faint that viewers differ" in notes
+    assert counts[0] == pytest.approx(len(read_ply(tmp_path / "fog.ply")[0]), rel=0.05)
+    assert counts[0] < 11000
+    assert counts[0] > counts[1] > counts[0] / 4  # a ninth of what was asked for, not of what is left
+
+
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     vvgt.ok("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json")

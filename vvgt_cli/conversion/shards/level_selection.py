@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT
+from vvgt_cli.field.digests import digest
+
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut, Regions
     from vvgt_cli.field.blocked import Pass
@@ -79,10 +82,15 @@ class CutErrors:
         squares = self.squares[np.arange(len(choice)), choice].sum()
         return math.sqrt(squares / max(4 * self.pixels.sum(), 1))
 
-    def levels(self) -> list[np.ndarray]:
-        """Return the cuts (N,) of each level: the finest, then the best with a ninth of the Gaussians before."""
+    def levels(self, removed: int = 0) -> list[np.ndarray]:
+        """Return the cuts (N,) of each level: the finest, then the best with a ninth of the Gaussians before.
+
+        Args:
+            removed: Gaussians that the finest has fewer than the budget, since more would be faint. The next level has
+                a ninth of the budget all the same, or the finest again.
+        """
         found = [np.zeros(len(self.counts), np.int64)]
-        before = self.total(found[0])
+        before = self.total(found[0]) + removed
         while len(found) < MAX_LEVELS and before >= FEWEST * len(self.counts):
             further = self.for_count(before / FEWER)
             count = self.total(further)
@@ -123,7 +131,7 @@ class ErrorRegions:
     @property
     def kind(self) -> str:
         """Kind of the results."""
-        return f"errors-{self.cut.key}"
+        return f"errors-{digest(self.cut.key, self.values)[:16]}"
 
     def __len__(self) -> int:
         """Return the number of regions."""
@@ -134,19 +142,33 @@ class ErrorRegions:
         thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
         nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
         found = errors_of([node.levels for node in nodes])
-        self.cut.store.save(self.kind, number, ".npz", **found)
+        faint = sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)
+        self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **found)
 
 
-def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
-    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's; raise DataError if one is damaged."""
+def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]:
+    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's.
+
+    Args:
+        run_pass: runs the pass over the regions.
+        cut: pyramid to cut.
+        budget: largest number of Gaussians of the finest cut.
+
+    Returns:
+        The errors; and how many Gaussians of the finest cut are faint (`FAINT_LOGIT`).
+
+    Raises:
+        DataError: a block is damaged.
+    """
     tree, store = cut.tiled_tree, cut.store
-    finest = tree.threshold(cut.plan.budget)
+    finest = tree.threshold(budget)
     second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
     task = ErrorRegions(cut, cut.regions(finest), np.minimum(values, np.finfo(float).max))
     run_pass(task, "errors")
     parts = [store.load(task.kind, number) for number in range(len(task))]
-    return CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
+    found = CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
+    return found, sum(int(part["faint"]) for part in parts)
 
 
 def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from vvgt_cli.conversion.shards.level_selection import measure_cuts
 from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions
+from vvgt_cli.conversion.stages.closed_form import TOO_FAINT, thin
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
@@ -87,9 +88,11 @@ def write_streamed(
         raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
-        errors = measure_cuts(run_pass, cut)
-        choices = np.stack(errors.levels(), axis=1)
+        errors, removed = _thinned(run_pass, cut)
+        choices = np.stack(errors.levels(removed), axis=1)
         stage.note = f"{choices.shape[1]} levels of {len(tiled_tree.tiles)} nodes"
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
     if (refine := refiner()) is not None:
         refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
     stored = make_regions(run, run_pass, cut, errors.thresholds[choices], refine)
@@ -111,10 +114,21 @@ def write_streamed(
         total = sum(level["bytes"] for level in levels)
         stage.note = f"{output}: {len(nodes)} nodes, {len(parts)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level['gaussians']:,}" for level in levels)
-        if levels[0]["gaussians"] < cut.plan.budget // 2:
+        if not removed and levels[0]["gaussians"] < cut.plan.budget // 2:
             stage.note += f", no more: {tiled_tree.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
     remove_others(folder, before, task.names)
     run.report.gaussians, run.report.bytes = levels[0]["gaussians"], total
+
+
+def _thinned(run_pass: Pass, cut: Cut) -> tuple[CutErrors, int]:
+    """Return the errors of cuts whose finest is not faint (`thin`), and how many faint Gaussians it leaves out."""
+
+    def cut_for(budget: int) -> tuple[CutErrors, int, bool]:
+        errors, faint = measure_cuts(run_pass, cut, budget)
+        count = int(errors.counts[:, 0].sum())
+        return errors, count, 2 * faint > count
+
+    return thin(cut.plan.budget, cut_for)
 
 
 def _node(low: np.ndarray, high: np.ndarray, lods: list[dict[str, int]], spreads: np.ndarray) -> dict[str, Any]:
