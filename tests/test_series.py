@@ -169,6 +169,8 @@ def test_frames_as_folders_of_levels(vvgt, series: Path, monkeypatch: pytest.Mon
     for part in ("2/2", "1/2"):
         vvgt.ok(*line, "-o", "parts/{:02d}/lod-meta.json", "--shard", part)
     assert levels(series / "parts") == levels(series / "steps") == made
+    told = vvgt.fails(2, *line, "-o", "steps/{}/lod-meta.json")
+    assert "outputs {:02d}/lod-meta.json {:02d}.json there, {}/lod-meta.json here" in told
     (series / "run_11.npy").unlink()
     assert "another volume, frames 4 there, 3 here" in vvgt.fails(2, *line, *out)
     vvgt.ok(*line, *out, "--overwrite")

@@ -189,7 +189,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     ("options", "text"),
     [
         (("--init", "wavelet"), "cuts of moments"),
-        (("--frame", "world"), "distances in the unit frame"),
+        (("--frame", "world"), "choose levels by distances"),
         (("--for", "phone"), "are not scored"),
         (("--max-size", "5"), "known only once they are written"),
         (("--live",), "no place for values"),
