@@ -15,7 +15,9 @@ from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.view import streamed_resources
+from vvgt_cli.conversion.convert_batch import convert_files
 from vvgt_cli.conversion.index import named_files
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.shards.cut import CutNode
 from vvgt_cli.conversion.shards.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.shards.regions import StoredGaussians, save
@@ -24,6 +26,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import InProcess
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog import images_of, splats_in
@@ -49,6 +52,11 @@ def folder(volume: Path) -> Path:
     out = volume.parent / "out"
     assert run(["init", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0
     return out
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the files of a folder and its folders by their paths."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def decoded(folder: Path, manifest: dict[str, Any]) -> list[Splats]:
@@ -169,29 +177,43 @@ def test_levels_of_a_fog_begin_where_viewers_draw_it(vvgt, tmp_path: Path) -> No
 
 
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
-    whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    whole = contents(folder)
     vvgt.ok("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json")
     vvgt.ok("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts")
     vvgt.ok("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json")
     for other in (tmp_path / "whole", tmp_path / "merged"):
-        assert {p.relative_to(other): p.read_bytes() for p in other.rglob("*") if p.is_file()} == whole
+        assert contents(other) == whole
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--init", "wavelet"), "needs moments"),
-        (("--frame", "world"), "remove --frame"),
-        (("--live",), "cuts of one closed form"),
-        (("--tf", "a.json", "--tf", "b.json"), "cuts of one closed form"),
-        (("--dry-run",), "cuts of one closed form"),
-        (("--preview", "p.png"), "cuts of one closed form"),
+        (("--init", "wavelet"), "cuts of moments"),
+        (("--frame", "world"), "choose levels by distances"),
+        (("--for", "phone"), "are not scored"),
+        (("--max-size", "5"), "known only once they are written"),
+        (("--live",), "no place for values"),
+        (("--labels", "auto", "--split-labels"), "share the Gaussians of one finished cloud"),
+        (("--checkpoint", "c"), "resume by the blocks beside them"),
+        (("--preview", "p.png"), "'vvgt render' them"),
+        (("--dry-run",), "without a plan"),
+        (("--model", "small"), "made region by region"),
+        (("--rule", "playcanvas"), "measured as the rule inria draws"),
+        (("--shard", "1/2"), "'vvgt init --shard' and 'vvgt merge'"),
+        (("--tf", "a.json", "--tf", "b.json"), "one place for the function's name, as out_{}/lod-meta.json"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
-    assert text in vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
-    assert "levels are of one volume" in vvgt.fails(2, "convert", volume, *FIT, "-o", tmp_path / "{}" / "lod-meta.json")
+    told = vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
+    assert text in told
+    assert len(told.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_levels_are_not_refined_on_a_gpu(volume: Path, tmp_path: Path) -> None:
+    out, fit = tmp_path / "lod-meta.json", FitOptions(device="cuda")
+    with pytest.raises(UsageError, match="steps on a GPU do not"):
+        convert_files(ConvertRequest(SourceRequest(str(volume)), str(out), fit))
 
 
 def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
@@ -314,7 +336,8 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
 def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     assert "is missing; expected the whole folder" in vvgt.fails(1, "view", tmp_path, "--no-browser")
-    assert "are shown alone" in vvgt.fails(2, "view", tmp_path, folder, "-o", tmp_path / "a.html")
+    told = vvgt.fails(2, "view", tmp_path, folder, "-o", tmp_path / "a.html")
+    assert f"are shown alone; open one, as 'vvgt view {tmp_path}'" in told
 
 
 @pytest.mark.parametrize(
