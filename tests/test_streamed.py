@@ -108,8 +108,13 @@ def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: P
     assert np.mean(np.array(apart) < 2e-3) > 0.97
 
 
-def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
+@pytest.mark.parametrize("rule", ["inria", "playcanvas"])
+def test_errors_are_those_of_what_is_in_the_files(vvgt, volume: Path, folder: Path, tmp_path: Path, rule: str) -> None:
+    if rule != "inria":
+        folder = tmp_path / "out"
+        vvgt.ok("convert", volume, *FIT, "--steps", "0", "--rule", rule, "-o", folder / "lod-meta.json")
     manifest = read_manifest(folder / "lod-meta.json")
+    assert any(line.endswith(f"rule {rule}") for line in manifest["vvgt"]["comments"])
     files = decoded(folder, manifest)
     nodes = nodes_of(manifest, "a")
     for node in sorted(nodes, key=lambda node: -node["lods"]["0"]["count"])[:3]:
@@ -119,7 +124,7 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
             rows = np.arange(place["offset"], place["offset"] + place["count"])
             turned = gaussians_of(files[place["file"]].take(rows), "a")[0]
             cuts.append(transform(turned, up_matrix("z").T))  # they are measured before what shows is turned upright
-        squares, energy, pixels = level_errors(cuts)
+        squares, energy, pixels = level_errors(cuts, rule)
         assert pixels > 0.1 * len(SEEN_FROM) * VIEW_PIXELS**2  # the node fills its views
         np.testing.assert_allclose(squares / energy, node["errors"], rtol=0.1, atol=2e-4)
         np.testing.assert_allclose(np.sqrt(squares / pixels) / 2, node["rms"], rtol=0.1, atol=2e-3)
@@ -198,7 +203,6 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
         (("--preview", "p.png"), "'vvgt render' them"),
         (("--dry-run",), "without a plan"),
         (("--model", "small"), "made region by region"),
-        (("--rule", "playcanvas"), "measured as the rule inria draws"),
         (("--shard", "1/2"), "'vvgt init --shard' and 'vvgt merge'"),
         (("--tf", "a.json", "--tf", "b.json"), "one place for the function's name, as out_{}/lod-meta.json"),
     ],

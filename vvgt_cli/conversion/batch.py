@@ -20,7 +20,6 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import content_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.score.record import Run
 
@@ -72,7 +71,6 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--preview": "no views of levels are drawn; remove it, and 'vvgt render' them",
         "--dry-run": "each region is refined by itself, without a plan; remove it",
         "--model": "a network takes a whole cloud and its views, and levels are made region by region; remove it",
-        "--rule": "errors of levels are measured as the rule inria draws; remove it",
         "--device": "regions weight the pixels of their views, which steps on a GPU do not; remove it",
     },
     NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
@@ -197,7 +195,7 @@ def options_in(request: ConvertRequest) -> set[str]:
     used = {
         "--checkpoint": request.checkpoint, "--report": request.report, "--preview": request.preview,
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--steps": fit.steps,
-        "--model": fit.model, "--rule": fit.rule != INRIA.name, "--labels none": source.labels == NO_LABELS,
+        "--model": fit.model, "--labels none": source.labels == NO_LABELS,
         "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
         "--device": fit.device != "cpu", "--for": fit.target, "--init": fit.init != INIT,
         "--frame world": request.ply.frame != "unit",

@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT
 from vvgt_cli.field.digests import digest
+from vvgt_cli.gaussians.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut, Regions
@@ -107,9 +108,9 @@ class CutErrors:
         return {"errors": relative, "rms": [float(self.errors[row, index]) for index in choice]}
 
 
-def errors_of(nodes: Sequence[Sequence[Gaussians]]) -> dict[str, np.ndarray]:
-    """Return the fields of `CutErrors` of nodes, each with its cuts, the finest first."""
-    squares, energies, pixels = zip(*map(level_errors, nodes), strict=True)
+def errors_of(nodes: Sequence[Sequence[Gaussians]], rule: str | Rule) -> dict[str, np.ndarray]:
+    """Return the fields of `CutErrors` of nodes, each with its cuts, the finest first, drawn by ``rule``."""
+    squares, energies, pixels = zip(*(level_errors(cuts, rule) for cuts in nodes), strict=True)
     counts = [[len(gaussians) for gaussians in cuts] for cuts in nodes]
     return dict(zip(FIELDS, map(np.array, (counts, squares, energies, pixels)), strict=True))
 
@@ -141,7 +142,7 @@ class ErrorRegions:
         """Save the errors of the nodes of region ``number``."""
         thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
         nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
-        found = errors_of([node.levels for node in nodes])
+        found = errors_of([node.levels for node in nodes], self.cut.plan.ply.rule or INRIA)
         faint = sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)
         self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **found)
 
@@ -171,8 +172,8 @@ def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]
     return found, sum(int(part["faint"]) for part in parts)
 
 
-def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
-    """Measure the RGBA error of each cut of a node, coarser ones later, against the first.
+def level_errors(cuts: Sequence[Gaussians], rule: str | Rule = INRIA) -> tuple[np.ndarray, float, int]:
+    """Measure the RGBA error of each cut of a node, coarser ones later, against the first, drawn by ``rule``.
 
     Returns:
         (n,) squared differences summed over the pixels of all views, never less than those of a finer cut; the
@@ -190,7 +191,7 @@ def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
     for direction in SEEN_FROM:
         eye = middle + AWAY * radius * np.array(direction) / np.linalg.norm(direction)
         camera = look_at(eye, target=tuple(middle), width=VIEW_PIXELS, height=VIEW_PIXELS, fov=field)
-        drawn = [render(cut, camera).astype(np.float64) for cut in cuts]
+        drawn = [render(cut, camera, rule).astype(np.float64) for cut in cuts]
         covered += int((drawn[0][..., 3] > 1 / 255).sum())
         squares += float((drawn[0] ** 2).sum())
         differences += [float(((picture - drawn[0]) ** 2).sum()) for picture in drawn]
