@@ -1,15 +1,17 @@
-"""Streamed levels: what moments predict of a node's error against what was measured, and what shows along nodes' edges.
+"""Streamed levels: predicted and measured errors of nodes, texture along nodes' edges, and dB of what viewers show.
 
 vvgt convert VOLUME --tf TF -o FOLDER/lod-meta.json
 python benchmarks/levels.py FOLDER VOLUME --tf TF -o docs/levels.csv --plot docs/levels.png
 
 Errors are those of the manifest (docs/scale.md): a node's level against its finest, from three sides. Edges are where
 colours of the nodes' numbers change in a picture; the control are the middles of nodes, found in the same way. Both are
-looked at where the volume's picture is opaque and smooth.
+looked at where the volume's picture is opaque and smooth. dB are those of the levels that the engine shows at a
+distance, nearer than `RADIUS` by a longer lens, which it counts like a shorter distance.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,16 +22,21 @@ import numpy as np
 from dvr_scenes import write_rows
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import RADIUS
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.dvr import Scene, render_view
-from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.field.source import Source, SourceRequest, load
+from vvgt_cli.gaussians import Gaussians, in_unit_frame
+from vvgt_cli.gaussians.formats.levels import StreamedLevels
+from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, nodes_of, read_manifest
+from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.images.metrics import OPAQUE, SMOOTH, band
 from vvgt_cli.score.viewing import VIEWS, near_cameras
 from vvgt_cli.splat import render
 
+DISTANCES = (3.5, 2.4, 1.2, 0.6)  # unit frame
 CHANGE = 0.12  # of a channel of the nodes' colours across an edge
 NEAR, FAR = 4, 12  # pixels from an edge within which something is at it, and beyond which it is inside
 
@@ -118,12 +125,25 @@ def plot(rows: list[dict[str, Any]], target: Path) -> None:
     figure.savefig(target, metadata={"Software": None})
 
 
-def textures(
-    folder: Path, whole: tuple[Path, ...], volume: str, tf: str | None, distance: str | None, size: int
-) -> Iterator[str]:
+def shown(folder: Path, source: Source, scene: Scene, size: int) -> Iterator[str]:
+    """A line a distance: mean PSNR (dB) of what the engine shows."""
+    levels = StreamedLevels(folder / MANIFEST)
+    turned = up_matrix(gaussians_of(levels.level(None), str(folder))[1].up) @ source.volume.axes
+    for distance in DISTANCES:
+        squares = []
+        for k in VIEWS:
+            camera = default_views("test", size=size, radius=max(distance, RADIUS))[k]
+            longer = max(RADIUS / distance, 1.0)
+            camera = replace(camera, fx=longer * camera.fx, fy=longer * camera.fy)
+            field = math.degrees(2 * math.atan(camera.height / camera.fy / 2))
+            read = gaussians_of(levels.seen_from(turned @ camera.position, field), str(folder))
+            drawn = render(to_box_frame(in_unit_frame(*read), source.volume), camera)
+            squares.append(np.square(np.clip(drawn - render_view(scene, camera), -1, 1)[..., :3]).mean())
+        yield f"distance {distance}: {-10 * np.log10(np.mean(squares)):.1f} dB"
+
+
+def textures(folder: Path, whole: tuple[Path, ...], source: Source, scene: Scene, size: int) -> Iterator[str]:
     """A line a level, and a line of each file at the pixels of the level of its place."""
-    source = load(SourceRequest(volume, tf=tf, unit_distance=distance))
-    scene = source.scene()
     for level in range(read_manifest(folder / MANIFEST)["lodLevels"]):
         gaussians = to_box_frame(open_gaussians(f"{folder}#{level}")[0], source.volume)
         files = [str(file) for file in whole[level : level + 1]]
@@ -158,7 +178,9 @@ def main(
     write_rows(output, rows)
     plot(rows, target)
     print(f"{len(rows)} nodes and levels, rank correlation {rank_correlation(rows):.2f} over all")
-    for line in textures(folder, whole, volume, tf, distance, size):
+    source = load(SourceRequest(volume, tf=tf, unit_distance=distance))
+    scene = source.scene()
+    for line in (*textures(folder, whole, source, scene, size), *shown(folder, source, scene, size)):
         print(line)
 
 

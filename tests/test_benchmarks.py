@@ -37,8 +37,8 @@ def bench(monkeypatch):
     """Import a benchmark, with pictures of `SIZE` px and what else is given in place of its constants."""
     monkeypatch.syspath_prepend(str(FOLDER))
 
-    def small_views(name, count=None, size=None):
-        return default_views(name, count, size=SIZE)
+    def small_views(name, count=None, size=None, **options):
+        return default_views(name, count, size=SIZE, **options)
 
     def load(name, **constants):
         module = importlib.import_module(name)
@@ -361,6 +361,9 @@ def test_levels(bench, scenes, tmp_path):
     told = call(module.main, tmp_path / "out", f"{scenes[1]}/blob.nrrd", *look, *options)
     rows = rows_of(tmp_path / "a.csv")
     assert len({row["level"] for row in rows}) + 1 == told.count("levels of 255")
+    shown = [float(line.split()[2]) for line in told.splitlines() if line.startswith("distance")]
+    assert len(shown) == len(module.DISTANCES)
+    assert min(shown) > 15
     assert all(float(row["rms"]) > 0 and float(row["spread"]) > 0 for row in rows)
     assert (tmp_path / "a.png").stat().st_size > 5000
     shown = np.zeros((30, 30), bool)

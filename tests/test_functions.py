@@ -1,10 +1,12 @@
 """`vvgt convert` with several transfer functions: one file each, the volume read once."""
 
 import json
+import re
 
 import pytest
 
 from tests.headers import uncertified
+from tests.test_streamed import contents
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
 
@@ -28,6 +30,23 @@ def test_each_function_gets_the_file_that_it_gets_alone(vvgt, tmp_path, function
         vvgt.ok("convert", "example:blob:16", "--tf", tf, "-o", str(alone), *HOW)
         assert uncertified(tmp_path / f"blob_{name}.ply") == uncertified(alone)
     assert "blob_bone.ply" in vvgt.fails(2, "convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
+
+
+def test_each_function_gets_the_levels_that_it_gets_alone(vvgt, tmp_path, functions):
+    bone, skin = functions
+    out = ("-o", tmp_path / "heads" / "{}" / "lod-meta.json")
+    line = ("convert", "example:blob:16", *HOW, "--tf", bone)
+    told = "--report .*expected one place"
+    assert re.search(told, vvgt.fails(2, *line, "--tf", skin, *out, "--report", tmp_path / "r.json"))
+    assert not (tmp_path / "heads").exists()
+    told = vvgt.ok(*line, "--tf", skin, *out).err
+    assert (told.count("; in blocks of "), "for 2 functions" in told) == (2, False)  # never in memory as a whole
+    vvgt.ok(*line, "-o", tmp_path / "alone" / "lod-meta.json")
+    assert contents(tmp_path / "heads" / "bone") == contents(tmp_path / "alone")
+    rows = json.loads((tmp_path / "heads" / "index.json").read_text())["files"]
+    assert [row["file"] for row in rows] == ["bone/lod-meta.json", "skin/lod-meta.json"]
+    assert contents(tmp_path / "heads" / "skin") != contents(tmp_path / "alone")
+    assert "bone/lod-meta.json exists" in vvgt.fails(2, *line, "--tf", skin, *out)
 
 
 def test_reports_and_previews_have_the_name_too(vvgt, tmp_path, functions):

@@ -269,6 +269,12 @@ def test_wrong_views_and_options_are_refused(scene):
     start, images, check = scene
     refused(DataError, "5 training images for 6 cameras", optimize, start, CAMERAS, images[:5])
     refused(DataError, "check view", optimize, start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
+    ones = [np.ones(image.shape[:2], np.float32) for image in images]
+    few = (*check[:2], None, [weight[:, :40] for weight in ones[: len(CHECKS)]])
+    refused(DataError, "training views: weights", optimize, start, CAMERAS, images, weights=ones[:5])
+    refused(DataError, "check views: weights", optimize, start, CAMERAS, images, check=few)
+    device = OptimizeOptions(steps=2, device="cuda")
+    refused(UsageError, "weights of views with device", optimize, start, CAMERAS, images, device, weights=ones)
     for wrong in (
         {"method": "sgd"},
         {"steps": -1},

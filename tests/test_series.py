@@ -11,10 +11,13 @@ import tifffile
 from PIL import Image
 
 from tests.headers import uncertified
+from tests.test_streamed import contents as files_in
 from vvgt_cli.conversion.frames import merge_statistics
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
+from vvgt_cli.gaussians.formats.sog import images_of
+from vvgt_cli.gaussians.formats.streamed import read_manifest
 from vvgt_cli.score.record import ConversionReport
 from vvgt_cli.volume import Volume, statistics
 from vvgt_cli.volume.shapes import blob
@@ -123,6 +126,64 @@ def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
     assert "4 time steps; expected one: try --time N (0 to 3), or a number in the output" in error
 
 
+def test_frames_as_folders_of_levels(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(series)
+    line = ("convert", "run_*.npy", "--tf", "tf.json", *SMALL[:-1], "--steps", "2")
+    out = ("-o", "steps/{:02d}/lod-meta.json", "--report", "steps/{:02d}.json")
+    whole = [f"{k:02d}/{name}" for k in (1, 2, 3) for name in ("0_0/sh0.webp", "1_0/meta.json", "lod-meta.json")]
+    calls = [0]
+
+    def stopped(splats):
+        calls[0] += 1
+        if calls[0] == 4:  # the first file of the second frame that shows something
+            raise KeyboardInterrupt
+        return images_of(splats)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vvgt_cli.conversion.shards.streamed.images_of", stopped)
+        assert vvgt(*line, *out).code == 130
+    first = (series / "steps" / "01" / "lod-meta.json").stat().st_mtime_ns
+    told = vvgt.ok(*line, *out).err
+    assert "resuming with the blocks in steps/02/" in told.replace(f"{series}/", "")
+    assert "skipped: run_8.npy (nothing of it is visible)" in told
+    assert "2 frames converted, 1 were complete before" in told
+    assert (series / "steps" / "01" / "lod-meta.json").stat().st_mtime_ns == first
+    made = levels(series / "steps")
+    assert set(whole) < set(made)
+    files = [read_manifest(series / "steps" / f"{k:02d}" / "lod-meta.json")["vvgt"] for k in (1, 2, 3)]
+    assert len({(file["scale"], *[c for c in file["comments"] if "frame unit" in c]) for file in files}) == 1
+    index = json.loads((series / "steps" / "index.json").read_text())
+    assert index["empty"] == [0]
+    assert [(row["frame"], row["file"]) for row in index["files"]] == [(k, f"{k:02d}/lod-meta.json") for k in (1, 2, 3)]
+    assert all({"gaussians", "bytes"} < set(row) and "psnr" not in row for row in index["files"])
+    vvgt.ok("convert", "run_9.npy", *line[2:], "-o", "alone/lod-meta.json")
+    assert files_in(series / "alone") == {k[3:]: v for k, v in made.items() if k.startswith("01/")}
+    for name in ("steps/index.json", "steps/*/lod-meta.json"):
+        assert "open one, as 'vvgt view steps/01'" in vvgt.fails(2, "view", name, "--no-browser")
+    vvgt.ok("render", "steps/index.json", "--size", 24, "-o", "f_{}.png")
+    seen = [np.asarray(Image.open(f"f_{k}.png"))[..., 3].any() for k in range(4)]
+    assert seen == [False, True, True, True]
+
+    (series / "steps" / "03" / "0_0" / "sh0.webp").unlink()
+    assert "1 frames converted, 2 were complete before" in vvgt.ok(*line, *out).err
+    for part in ("2/2", "1/2"):
+        vvgt.ok(*line, "-o", "parts/{:02d}/lod-meta.json", "--shard", part)
+    assert levels(series / "parts") == levels(series / "steps") == made
+    told = vvgt.fails(2, *line, "-o", "steps/{}/lod-meta.json")
+    assert "outputs {:02d}/lod-meta.json {:02d}.json there, {}/lod-meta.json here" in told
+    (series / "run_11.npy").unlink()
+    assert "another volume, frames 4 there, 3 here" in vvgt.fails(2, *line, *out)
+    vvgt.ok(*line, *out, "--overwrite")
+    assert sorted(path.name for path in (series / "steps").iterdir()) == [
+        "01", "01.json", "02", "02.json", "index.json", "manifest.json",
+    ]  # fmt: skip
+
+
+def levels(folder: Path) -> dict[str, bytes]:
+    """Return the files of the folders below a folder."""
+    return {name: content for name, content in files_in(folder).items() if "/" in name}
+
+
 def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
     out = series / "out" / "{:02d}.ply"
     done = vvgt.fails(2, "convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
@@ -162,6 +223,8 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "r.json"), "--report .*expected one place"),
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "expected one folder"),
         ((frames, "-o", series / "{}" / "a.ply"), "expected one folder; got .*0, .*1, .*2$"),
+        ((frames, "-o", "s/{}/lod-meta.json", "--report", "{}.json"), "one folder, s, and those in it; got .$"),
+        ((frames, "-o", series / "none/a/{}/lod-meta.json"), "none/a/0 does not exist"),
         ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
         ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),

@@ -15,7 +15,9 @@ from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.view import streamed_resources
+from vvgt_cli.conversion.convert_batch import convert_files
 from vvgt_cli.conversion.index import named_files
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.shards.cut import CutNode
 from vvgt_cli.conversion.shards.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.shards.regions import StoredGaussians, save
@@ -24,6 +26,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import InProcess
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog import images_of, splats_in
@@ -49,6 +52,11 @@ def folder(volume: Path) -> Path:
     out = volume.parent / "out"
     assert run(["init", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0
     return out
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the files of a folder and its folders by their paths."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def decoded(folder: Path, manifest: dict[str, Any]) -> list[Splats]:
@@ -100,8 +108,13 @@ def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: P
     assert np.mean(np.array(apart) < 2e-3) > 0.97
 
 
-def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
+@pytest.mark.parametrize("rule", ["inria", "playcanvas"])
+def test_errors_are_those_of_what_is_in_the_files(vvgt, volume: Path, folder: Path, tmp_path: Path, rule: str) -> None:
+    if rule != "inria":
+        folder = tmp_path / "out"
+        vvgt.ok("convert", volume, *FIT, "--steps", "0", "--rule", rule, "-o", folder / "lod-meta.json")
     manifest = read_manifest(folder / "lod-meta.json")
+    assert any(line.endswith(f"rule {rule}") for line in manifest["vvgt"]["comments"])
     files = decoded(folder, manifest)
     nodes = nodes_of(manifest, "a")
     for node in sorted(nodes, key=lambda node: -node["lods"]["0"]["count"])[:3]:
@@ -111,7 +124,7 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
             rows = np.arange(place["offset"], place["offset"] + place["count"])
             turned = gaussians_of(files[place["file"]].take(rows), "a")[0]
             cuts.append(transform(turned, up_matrix("z").T))  # they are measured before what shows is turned upright
-        squares, energy, pixels = level_errors(cuts)
+        squares, energy, pixels = level_errors(cuts, rule)
         assert pixels > 0.1 * len(SEEN_FROM) * VIEW_PIXELS**2  # the node fills its views
         np.testing.assert_allclose(squares / energy, node["errors"], rtol=0.1, atol=2e-4)
         np.testing.assert_allclose(np.sqrt(squares / pixels) / 2, node["rms"], rtol=0.1, atol=2e-3)
@@ -152,30 +165,59 @@ def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_
     assert errors.rms(levels[0]) == 0 < errors.rms(levels[1]) < errors.rms(levels[2])
 
 
+def test_levels_of_a_fog_begin_where_viewers_draw_it(vvgt, tmp_path: Path) -> None:
+    volume, tf = tmp_path / "v_48x48x48_uint8.raw", tmp_path / "fog.json"
+    z, y, x = np.mgrid[:48, :48, :48]
+    volume.write_bytes((100 + 99 * np.sin(x / 9) * np.sin(y / 8) * np.sin(z / 7)).astype(np.uint8).tobytes())
+    points = [{"x": 0, "rgb": [0, 0, 0], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.01}]
+    tf.write_text(json.dumps({"range": [0, 255], "points": points}))
+    line = ("init", volume, "--tf", tf, "--max-gaussians", "20000", "--size", "150", "--blocks", "32")
+    vvgt.ok(*line, "-q", "-o", tmp_path / "fog.ply")
+    notes = vvgt.ok(*line, "-o", tmp_path / "fog" / "lod-meta.json").err
+    counts = read_manifest(tmp_path / "fog" / "lod-meta.json")["counts"]
+    assert "so faint that viewers differ" in notes
+    assert counts[0] == pytest.approx(len(read_ply(tmp_path / "fog.ply")[0]), rel=0.05)
+    assert counts[0] < 11000
+    assert counts[0] > counts[1] > counts[0] / 4  # a ninth of what was asked for, not of what is left
+
+
 def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
-    whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    whole = contents(folder)
     vvgt.ok("init", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json")
     vvgt.ok("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts")
     vvgt.ok("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json")
     for other in (tmp_path / "whole", tmp_path / "merged"):
-        assert {p.relative_to(other): p.read_bytes() for p in other.rglob("*") if p.is_file()} == whole
+        assert contents(other) == whole
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--init", "wavelet"), "needs moments"),
-        (("--frame", "world"), "remove --frame"),
-        (("--live",), "cuts of one closed form"),
-        (("--tf", "a.json", "--tf", "b.json"), "cuts of one closed form"),
-        (("--dry-run",), "cuts of one closed form"),
-        (("--preview", "p.png"), "cuts of one closed form"),
+        (("--init", "wavelet"), "cuts of moments"),
+        (("--frame", "world"), "choose levels by distances"),
+        (("--for", "phone"), "are not scored"),
+        (("--max-size", "5"), "known only once they are written"),
+        (("--live",), "no place for values"),
+        (("--labels", "auto", "--split-labels"), "share the Gaussians of one finished cloud"),
+        (("--checkpoint", "c"), "resume by the blocks beside them"),
+        (("--preview", "p.png"), "'vvgt render' them"),
+        (("--dry-run",), "without a plan"),
+        (("--model", "small"), "made region by region"),
+        (("--shard", "1/2"), "'vvgt init --shard' and 'vvgt merge'"),
+        (("--tf", "a.json", "--tf", "b.json"), "one place for the function's name, as out_{}/lod-meta.json"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
-    assert text in vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
-    assert "levels are of one volume" in vvgt.fails(2, "convert", volume, *FIT, "-o", tmp_path / "{}" / "lod-meta.json")
+    told = vvgt.fails(2, "convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
+    assert text in told
+    assert len(told.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_levels_are_not_refined_on_a_gpu(volume: Path, tmp_path: Path) -> None:
+    out, fit = tmp_path / "lod-meta.json", FitOptions(device="cuda")
+    with pytest.raises(UsageError, match="steps on a GPU do not"):
+        convert_files(ConvertRequest(SourceRequest(str(volume)), str(out), fit))
 
 
 def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
@@ -298,7 +340,8 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
 def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     assert "is missing; expected the whole folder" in vvgt.fails(1, "view", tmp_path, "--no-browser")
-    assert "are shown alone" in vvgt.fails(2, "view", tmp_path, folder, "-o", tmp_path / "a.html")
+    told = vvgt.fails(2, "view", tmp_path, folder, "-o", tmp_path / "a.html")
+    assert f"are shown alone; open one, as 'vvgt view {tmp_path}'" in told
 
 
 @pytest.mark.parametrize(

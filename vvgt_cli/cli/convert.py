@@ -88,10 +88,10 @@ def command(
     OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb, .usdc or .usdz.
     FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
-    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a placeholder for the number,
-    such as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
-    .html without a placeholder makes one page of all frames, functions or labels, one in .glb, .usdc or .usdz one file
-    with a node for each function or label.
+    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply or FOLDER has a placeholder for
+    the number, such as {:04d}. All frames share one function and value range; run the command again to resume. A name
+    ending in .html without a placeholder makes one page of all frames, functions or labels, one in .glb, .usdc or .usdz
+    one file with a node for each function or label.
 
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png

@@ -174,7 +174,8 @@ def _refuse_reading(given: SourceRequest, name: str) -> None:
 def _only_gaussians(files: Sequence[str]) -> None:
     """Refuse several files that are not all ordinary files of Gaussians."""
     if any(map(is_streamed, files)):
-        raise UsageError(f"{next(filter(is_streamed, files))}: streamed levels are shown alone; expected no other file")
+        first = next(filter(is_streamed, files))
+        raise UsageError(f"{first}: streamed levels are shown alone; open one, as 'vvgt view {Path(first).parent}'")
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(

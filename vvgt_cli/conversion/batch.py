@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS
 from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.defaults import INIT
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import content_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.score.record import Run
 
@@ -31,7 +31,10 @@ LAYERS, NODES = "labels of layers", "one file with a node for each function"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one cloud, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
-    ONE: {"--shard": "one volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
+    ONE: {
+        "--shard": "for a series give -o a place for the number, as out_{:04d}.ply; jobs share one volume by "
+        "'vvgt init --shard' and 'vvgt merge'"
+    },
     FRAMES: {
         "--checkpoint": "a series resumes from its manifest; remove it",
         "--dry-run": "a plan is for one volume; try it on one of the frames",
@@ -57,15 +60,19 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "after": "only one conversion can start from another; remove it",
     },
     LIVE: {"--dry-run": "live files need no plan; remove it", "after": "live files need no earlier one; remove it"},
-    LEVELS: {"--for": "levels are scored by rays through blocks, not by eyes; give --max-gaussians and --size"}
-    | dict.fromkeys(
-        (
-            *("several --tf", "--model", "--rule", "--max-size", "--live"),
-            *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels", "--device"),
-        ),
-        "levels are cuts of one closed form, refined on the CPU; remove it",
-    )
-    | {"a file each": "levels are of one volume; convert the frames one by one"},
+    LEVELS: {
+        "--init": "levels are cuts of moments, which other methods do not make; remove it",
+        "--frame world": "viewers choose levels by distances in the unit frame; remove it",
+        "--for": "levels are not scored, as a device shows them or otherwise; give --max-gaussians and --size",
+        "--max-size": "the bytes of levels are known only once they are written; try --max-gaussians",
+        "--live": "their format has no place for values; write another, as -o out.ply",
+        "--split-labels": "labels share the Gaussians of one finished cloud; write another format, as -o out_{}.ply",
+        "--checkpoint": "levels resume by the blocks beside them; remove it",
+        "--preview": "no views of levels are drawn; remove it, and 'vvgt render' them",
+        "--dry-run": "each region is refined by itself, without a plan; remove it",
+        "--model": "a network takes a whole cloud and its views, and levels are made region by region; remove it",
+        "--device": "regions weight the pixels of their views, which steps on a GPU do not; remove it",
+    },
     NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
     ONE_FILE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
@@ -188,9 +195,10 @@ def options_in(request: ConvertRequest) -> set[str]:
     used = {
         "--checkpoint": request.checkpoint, "--report": request.report, "--preview": request.preview,
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--steps": fit.steps,
-        "--model": fit.model, "--rule": fit.rule != INRIA.name, "--labels none": source.labels == NO_LABELS,
+        "--model": fit.model, "--labels none": source.labels == NO_LABELS,
         "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
-        "--device": fit.device != "cpu", "--for": fit.target,
+        "--device": fit.device != "cpu", "--for": fit.target, "--init": fit.init != INIT,
+        "--frame world": request.ply.frame != "unit",
     }  # fmt: skip
     return {option for option, value in used.items() if value}
 

@@ -43,19 +43,21 @@ from vvgt_cli.conversion.labels import Labels
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.shards.run import convert_in_batches
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.field.open import automatic
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
 from vvgt_cli.gaussians.formats.page_live import contents
-from vvgt_cli.gaussians.formats.streamed import is_streamed
-from vvgt_cli.gaussians.outputs import check_outputs, claimed
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
+from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
 from vvgt_cli.gaussians.targets import check_opened
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion
-    from vvgt_cli.gaussians import PlyOptions
+    from vvgt_cli.conversion.warm_start import WarmStart
+    from vvgt_cli.gaussians import Gaussians, PlyOptions
     from vvgt_cli.volume import UnitFrame
 
 WHOLE_RUN = Shard()
@@ -76,6 +78,14 @@ class Files:
         self._manifest: Manifest | None = None
         self._rows: dict[str, dict[str, Any]] = {}
         self._stack = ExitStack()
+
+    @property
+    def _index(self) -> Output:
+        return index_output(str(self._request.output))
+
+    def _key(self, name: str) -> str:
+        """Return the path of a file relative to the index, by which index and manifest have it."""
+        return Path(os.path.relpath(name, Path(self._index.path).parent)).as_posix()
 
     def names(self, kind: str, stem: str) -> list[str]:
         """Return an item's names of output, report and preview.
@@ -103,15 +113,18 @@ class Files:
         """
         if self._request.overwrite and self._shard.count > 1:
             raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
+        self.names(batch.kind, UNKNOWN)
+        folder = Path(self._index.path).parent
+        if is_streamed(self._request.output):
+            self._stack.enter_context(folder_of(folder / MANIFEST))
         self._check(batch)
         batch.prepare(run)
         rows = self._check(batch)
         if not batch.resumes:
             return
-        self._manifest = Manifest(Path(rows[0][0]).parent, batch.settings(), self._shard, what="frames")
-        self._stack.enter_context(claim(self._manifest.folder / self._shard.manifest))
-        index = index_output(str(self._request.output)).path
-        names = [Path(name).name for name in (*(n for row in rows for n in row), index)]
+        self._manifest = Manifest(folder, batch.settings(), self._shard, what="frames")
+        self._stack.enter_context(claim(folder / self._shard.manifest))
+        names = [self._key(name) for name in (*(n for row in rows for n in row), self._index.path)]
         self._manifest.open(names, self._request.overwrite)
         self._manifest.record()
 
@@ -119,15 +132,19 @@ class Files:
         """Check the outputs as far as stems are known, and return them; files of a series may exist."""
         request, stems, inputs = self._request, batch.stems, self._request.inputs()
         batch.check_names()
-        rows = [self.names(batch.kind, stem) for stem in stems or [UNKNOWN]]
-        folders = sorted({str(Path(name).parent) for row in rows for name in row})
-        if batch.resumes and len(folders) > 1:
-            stated = ", ".join(folders[:3])
-            raise UsageError(f"-o, --report and --preview of a series: expected one folder; got {stated}")
-        checked, index = rows[:1] if batch.resumes else rows, index_output(str(request.output))
+        rows, levels = [self.names(batch.kind, stem) for stem in stems or [UNKNOWN]], is_streamed(request.output)
+        names = [name for row in rows for name in row if not levels or self._key(name).startswith("..")]
+        folders = sorted({str(Path(name).parent) for name in names})
+        if batch.resumes and len(folders) > (0 if levels else 1):
+            stated, more = ", ".join(folders[:3]), f", {Path(self._index.path).parent}, and those in it" * levels
+            raise UsageError(f"-o, --report and --preview of a series: expected one folder{more}; got {stated}")
+        checked = rows[self._shard.index - 1 :][:1] if batch.resumes else rows  # shards make folders of their own
         outputs = [output for row in checked for output in self._named(request, row).outputs()]
-        check_outputs([*outputs, index], inputs, request.overwrite or batch.resumes or not stems)
-        check_outputs([index], inputs, request.overwrite or batch.resumes)
+        with ExitStack() as made:
+            for row in checked:
+                made.enter_context(folder_of(row[0]))
+            check_outputs([*outputs, self._index], inputs, request.overwrite or batch.resumes or not stems)
+        check_outputs([self._index], inputs, request.overwrite or batch.resumes)
         return rows
 
     def close(self) -> None:
@@ -138,33 +155,31 @@ class Files:
         """Return whether an item belongs to this shard and is not complete yet."""
         if self._manifest is None:
             return True
-        own = [Path(name).name for name in self.names(batch.kind, stem)]
+        own = map(self._key, self.names(batch.kind, stem))
         return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item to its files, and return the report."""
-        return convert(
-            self._named(item.request, self.names(batch.kind, item.stem)), console, item.gaussians, batch.previous
-        )
+        request = self._named(item.request, self.names(batch.kind, item.stem))
+        return _to_file(request, console, item.gaussians, batch.previous)
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Record a complete item."""
-        names = [Path(name) for name in self.names(batch.kind, item.stem)]
+        names = [self._key(name) for name in self.names(batch.kind, item.stem)]
         row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
-        folder = Path(index_output(str(self._request.output)).path).parent
-        row["file"] = Path(os.path.relpath(names[0], folder)).as_posix()
+        row["file"] = names[0]
         self._rows[item.stem] = row
         if self._manifest is not None:
-            self._manifest.record([name.name for name in names], {names[0].name: {"row": row}})
+            self._manifest.record(names, {names[0]: {"row": row}})
 
     def finish(self, batch: Batch, console: Console) -> dict[str, Any]:
         """Write and return the index; for shards, of the items recorded so far, so that the last shard lists all."""
-        path, manifest, known = index_output(str(self._request.output)).path, self._manifest, -1
+        path, manifest, known = self._index.path, self._manifest, -1
         rows = list(self._rows.values())
         while manifest is None or len(manifest.files) > known:
             if manifest is not None:
                 known = len(manifest.files)
-                files = (Path(self.names(batch.kind, stem)[0]).name for stem in batch.stems)
+                files = (self._key(self.names(batch.kind, stem)[0]) for stem in batch.stems)
                 rows = [manifest.files[file]["row"] for file in files if file in manifest.files]
             found = index_of(batch.kind, batch.volume, rows, **batch.facts)
             write_index(path, found, self._request.overwrite or manifest is not None)
@@ -267,27 +282,25 @@ def convert_files(
     """
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
-    flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "several --tf": several}
-    flags["a file each"] = numbered
+    flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "a file each": numbered}
     if is_page(output):
         flags |= {"--no-slices": not request.slices, "--no-live": not (request.editor or request.live)}
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind
-    kinds = [LEVELS] if is_streamed(output) else [named, *([LIVE] if request.live else [])]
+    kinds = [*([LEVELS] if is_streamed(output) else []), named, *([LIVE] if request.live else [])]
     together = kind != ONE and holds_several(output) and not numbered
     nodes = together and kind == FUNCTIONS and not is_page(output)
     for one in [*kinds, *([ONE_FILE] if together else []), *([NODES] if nodes else [])]:
         check_options(one, used)
     check_opened(output, request.fit.target)
     if is_streamed(output):
-        _convert_levels(request, console)
-        return None
+        request = replace(request, blocks=request.blocks or BlockOptions())
     if dry_run:
         return plan_conversion(request, console).text()
     if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
         try:
-            convert(request, console)
+            _to_file(request, console)
             return None
         except SeveralSteps:
             if not is_page(output):
@@ -306,13 +319,13 @@ def convert_files(
     return None
 
 
-def _convert_levels(request: ConvertRequest, console: Console) -> None:
-    """Convert a volume to streamed levels."""
-    from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
-
-    request = replace(request, blocks=request.blocks or automatic(request.source, console))
-    if writes_streaming(request):
-        convert_in_batches(request, console)
+def _to_file(
+    request: ConvertRequest, console: Console, finished: Gaussians | None = None, start: WarmStart | None = None
+) -> ConversionReport:  # fmt: skip
+    """Convert a volume to a file, see `convert`, or to streamed levels, which start from the closed form."""
+    if is_streamed(request.output):
+        return convert_in_batches(request, console)
+    return convert(request, console, finished, start)
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:

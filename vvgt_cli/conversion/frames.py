@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.index import FRAMES
+from vvgt_cli.conversion.index import FRAMES, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
@@ -176,7 +176,7 @@ class FrameSeries(Batch):
     def settings(self) -> dict[str, Any]:
         """Return everything that the files depend on, named as the command line names it."""
         request, survey = self.request, self._survey
-        ply, grid = asdict(request.ply), survey.grid
+        ply, grid, folder = asdict(request.ply), survey.grid, Path(index_path(str(request.output))).parent
         lighting = request.source.light.lighting(self._shown[0].lighting, grid.space)
         looks: list[Any] = []
         for tf in self._shown:
@@ -196,7 +196,7 @@ class FrameSeries(Batch):
             **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
             "up": up_axis(request.up, request.ply.frame, grid.space),
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
-            "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
+            "outputs": [os.path.relpath(p, folder) for p in (request.output, request.report, request.preview) if p],
         }
 
 

@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import read_text
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_splats
 from vvgt_cli.gaussians.formats.levels import split_name
-from vvgt_cli.gaussians.formats.streamed import MANIFEST
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, write_text
 from vvgt_cli.score.record import SCHEMA, ConversionReport, plain
 from vvgt_cli.volume.tiff.slices import matching
@@ -50,8 +50,9 @@ def put_name(option: str, pattern: str, kind: str, stem: str) -> str:
     """
     places = FIELD.findall(pattern)
     if len(places) != 1 or set(FIELD.sub("", pattern)) & set("{}") or (places[0] != "{}" and kind != FRAMES):
-        what = "frame's number, as out_{:04d}.ply" if kind == FRAMES else f"{kind[:-1]}'s name, as out_{{}}.ply"
-        raise UsageError(f"{option} {pattern}: expected one place for the {what}")
+        what = "frame's number, as out_{:04d}" if kind == FRAMES else f"{kind[:-1]}'s name, as out_{{}}"
+        end = f"/{MANIFEST}" if is_streamed(pattern) else ".ply"
+        raise UsageError(f"{option} {pattern}: expected one place for the {what}{end}")
     return pattern.replace(places[0], places[0].format(int(stem)) if stem.isdecimal() and kind == FRAMES else stem)
 
 
@@ -169,7 +170,8 @@ def movie_frames(name: str) -> tuple[str | None, ...]:
 
 def expanded(name: str) -> list[str]:
     """Return the files of a glob, sorted by their numbers, or the name; raise UsageError if a glob matches none."""
-    if not set(name) & set("*?[") or os.path.exists(name) or split_name(name) is not None or ":/" in name:
+    levels = split_name(name)
+    if not set(name) & set("*?[") or os.path.exists(name) or (levels and levels[0].is_file()) or ":/" in name:
         return [name]
     found = [str(path) for path in matching(name)]
     if not found:

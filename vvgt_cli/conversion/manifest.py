@@ -14,6 +14,7 @@ from typing import Any
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write, read_text
+from vvgt_cli.gaussians.formats.streamed import level_files, remove_files
 
 SCHEMA = 1
 COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by content of the folder
@@ -48,9 +49,12 @@ def parse_shard(text: str) -> Shard:
 
 
 def file_digest(path: Path) -> str:
-    """Return the sha256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the sha256 of a file, of levels with the files that their manifest names, hexadecimal."""
+    found = hashlib.sha256()
+    for each in (path, *level_files(path)):
+        with each.open("rb") as file:
+            hashlib.file_digest(file, lambda: found)
+    return found.hexdigest()
 
 
 @dataclass
@@ -125,7 +129,7 @@ class Manifest:
             except DataError:  # not our manifest: only this file is replaced
                 written = {}
             for name in written:
-                (self.folder / name).unlink(missing_ok=True)
+                remove_files([*level_files(self.folder / name), self.folder / name])
             path.unlink()
 
     def complete(self, name: str, content: bool = True) -> bool:

@@ -15,6 +15,7 @@ from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.formats.page_file import page_bytes
 from vvgt_cli.gaussians.formats.page_slices import SMALLEST as SMALLEST_SLICES
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output
 from vvgt_cli.gaussians.targets import target_of
 
@@ -194,7 +195,8 @@ class ConvertRequest:
 
     def outputs(self) -> list[Output]:
         """List the files that will be written."""
-        outputs = [Output("-o", self.output, SUFFIXES, splats=True)] if self.output else []
+        endings = (MANIFEST,) if is_streamed(self.output) else SUFFIXES
+        outputs = [Output("-o", self.output, endings, splats=True)] if self.output else []
         if self.report:
             outputs.append(Output("--report", self.report, (".json",), binary=False))
         if self.preview:

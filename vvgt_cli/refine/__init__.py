@@ -38,10 +38,11 @@ def optimize(
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
         free: (K,) bool, those that move, of the method "frame"; None: all.
-        weights: of each training view, (h, w) factors of differences in the loss; None: 1. Not on a device.
+        weights: of each training view, (h, w) factors of differences in the loss; None: 1.
 
     Raises:
-        DataError: no views, or images that do not fit their cameras.
+        DataError: no views, or images or weights that do not fit their cameras.
+        UsageError: weights of training views on another device than the CPU.
     """
     from vvgt_cli.refine.loop import run
 

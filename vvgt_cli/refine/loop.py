@@ -20,7 +20,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.refine.checkpoint import fingerprint, resume, save
@@ -49,9 +49,11 @@ def run(
     weights: Sequence[np.ndarray] | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Run `optimize` without its defaults."""
-    _fit("training", cameras, images)
+    _fit("training", cameras, images, None, weights)
     if check is not None:
-        _fit("check", *check[:3])
+        _fit("check", *check)
+    if weights is not None and options.device != "cpu":
+        raise UsageError(f"weights of views with device {options.device}; expected the CPU, which alone regards them")
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)
@@ -216,7 +218,11 @@ def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callab
     return "interrupted" if stop and stop() else None
 
 
-def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray, blocks: Sequence[Blocks] | None = None) -> None:
+def _fit(
+    name: str, cameras: Sequence[Camera], images: np.ndarray, blocks: Sequence[Blocks] | None = None,
+    weights: Sequence[np.ndarray] | None = None,
+) -> None:  # fmt: skip
+    """Raise DataError unless each view has an image of its size and, if there are any, weights of that size."""
     if not len(cameras) or len(cameras) != len(images):
         raise DataError(f"{len(images)} {name} images for {len(cameras)} cameras; expected as many, and at least one")
     for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
@@ -225,6 +231,8 @@ def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray, blocks: Seque
             expected = (blocks[i].numbers.size * BLOCK, BLOCK, 4)
         if image.shape != expected:
             raise DataError(f"{name} view {camera.name}: image of shape {image.shape}; expected {expected}")
+    if weights is not None and (shapes := [w.shape for w in weights]) != [image.shape[:2] for image in images]:
+        raise DataError(f"{name} views: weights of shapes {shapes[:3]}; expected {images[0].shape[:2]} for each image")
 
 
 FIRST, LAST, EVERY, RESET = 500 / 30_000, 0.5, 100 / 30_000, 3_000 / 30_000  # shares of the run

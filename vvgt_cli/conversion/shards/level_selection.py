@@ -9,6 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT
+from vvgt_cli.field.digests import digest
+from vvgt_cli.gaussians.rules import INRIA, Rule
+
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut, Regions
     from vvgt_cli.field.blocked import Pass
@@ -79,10 +83,15 @@ class CutErrors:
         squares = self.squares[np.arange(len(choice)), choice].sum()
         return math.sqrt(squares / max(4 * self.pixels.sum(), 1))
 
-    def levels(self) -> list[np.ndarray]:
-        """Return the cuts (N,) of each level: the finest, then the best with a ninth of the Gaussians before."""
+    def levels(self, removed: int = 0) -> list[np.ndarray]:
+        """Return the cuts (N,) of each level: the finest, then the best with a ninth of the Gaussians before.
+
+        Args:
+            removed: Gaussians that the finest has fewer than the budget, since more would be faint. The next level has
+                a ninth of the budget all the same, or the finest again.
+        """
         found = [np.zeros(len(self.counts), np.int64)]
-        before = self.total(found[0])
+        before = self.total(found[0]) + removed
         while len(found) < MAX_LEVELS and before >= FEWEST * len(self.counts):
             further = self.for_count(before / FEWER)
             count = self.total(further)
@@ -99,9 +108,9 @@ class CutErrors:
         return {"errors": relative, "rms": [float(self.errors[row, index]) for index in choice]}
 
 
-def errors_of(nodes: Sequence[Sequence[Gaussians]]) -> dict[str, np.ndarray]:
-    """Return the fields of `CutErrors` of nodes, each with its cuts, the finest first."""
-    squares, energies, pixels = zip(*map(level_errors, nodes), strict=True)
+def errors_of(nodes: Sequence[Sequence[Gaussians]], rule: str | Rule) -> dict[str, np.ndarray]:
+    """Return the fields of `CutErrors` of nodes, each with its cuts, the finest first, drawn by ``rule``."""
+    squares, energies, pixels = zip(*(level_errors(cuts, rule) for cuts in nodes), strict=True)
     counts = [[len(gaussians) for gaussians in cuts] for cuts in nodes]
     return dict(zip(FIELDS, map(np.array, (counts, squares, energies, pixels)), strict=True))
 
@@ -123,7 +132,7 @@ class ErrorRegions:
     @property
     def kind(self) -> str:
         """Kind of the results."""
-        return f"errors-{self.cut.key}"
+        return f"errors-{digest(self.cut.key, self.values)[:16]}"
 
     def __len__(self) -> int:
         """Return the number of regions."""
@@ -133,24 +142,38 @@ class ErrorRegions:
         """Save the errors of the nodes of region ``number``."""
         thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
         nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
-        found = errors_of([node.levels for node in nodes])
-        self.cut.store.save(self.kind, number, ".npz", **found)
+        found = errors_of([node.levels for node in nodes], self.cut.plan.ply.rule or INRIA)
+        faint = sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)
+        self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **found)
 
 
-def measure_cuts(run_pass: Pass, cut: Cut) -> CutErrors:
-    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's; raise DataError if one is damaged."""
+def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]:
+    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's.
+
+    Args:
+        run_pass: runs the pass over the regions.
+        cut: pyramid to cut.
+        budget: largest number of Gaussians of the finest cut.
+
+    Returns:
+        The errors; and how many Gaussians of the finest cut are faint (`FAINT_LOGIT`).
+
+    Raises:
+        DataError: a block is damaged.
+    """
     tree, store = cut.tiled_tree, cut.store
-    finest = tree.threshold(cut.plan.budget)
+    finest = tree.threshold(budget)
     second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
     task = ErrorRegions(cut, cut.regions(finest), np.minimum(values, np.finfo(float).max))
     run_pass(task, "errors")
     parts = [store.load(task.kind, number) for number in range(len(task))]
-    return CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
+    found = CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
+    return found, sum(int(part["faint"]) for part in parts)
 
 
-def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
-    """Measure the RGBA error of each cut of a node, coarser ones later, against the first.
+def level_errors(cuts: Sequence[Gaussians], rule: str | Rule = INRIA) -> tuple[np.ndarray, float, int]:
+    """Measure the RGBA error of each cut of a node, coarser ones later, against the first, drawn by ``rule``.
 
     Returns:
         (n,) squared differences summed over the pixels of all views, never less than those of a finer cut; the
@@ -168,7 +191,7 @@ def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
     for direction in SEEN_FROM:
         eye = middle + AWAY * radius * np.array(direction) / np.linalg.norm(direction)
         camera = look_at(eye, target=tuple(middle), width=VIEW_PIXELS, height=VIEW_PIXELS, fov=field)
-        drawn = [render(cut, camera).astype(np.float64) for cut in cuts]
+        drawn = [render(cut, camera, rule).astype(np.float64) for cut in cuts]
         covered += int((drawn[0][..., 3] > 1 / 255).sum())
         squares += float((drawn[0] ** 2).sum())
         differences += [float(((picture - drawn[0]) ** 2).sum()) for picture in drawn]

@@ -205,7 +205,8 @@ class RegionNodes:
         errors: dict[str, np.ndarray] = {}
         if self.refiner is not None:
             nodes = self._refined(nodes, number, self.refiner)
-            errors = errors_of([node.levels for node in nodes]) if self.least else {}
+            rule = self.refiner.descent.rule
+            errors = errors_of([node.levels for node in nodes], rule) if self.least else {}
         save(self.cut.store, self.kind, number, nodes, errors)
 
     def _refined(self, nodes: list[CutNode], number: int, refiner: Refiner) -> list[CutNode]:

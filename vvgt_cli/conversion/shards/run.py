@@ -24,7 +24,7 @@ from vvgt_cli.conversion.plan import most_steps, steps_in_time
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
 from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
-from vvgt_cli.conversion.shards.streamed import folder_of, write_streamed
+from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
 from vvgt_cli.errors import UsageError
@@ -41,7 +41,7 @@ from vvgt_cli.field.workload import pace
 from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.streamed import is_streamed
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
@@ -104,8 +104,8 @@ def convert_in_batches(request: ConvertRequest, console: Console | None = None) 
         _shard(run, request, options, BlockStore(Path(request.output).absolute()))
         return run.finish()
     with (
-        _written(request.output, request) as outputs,
-        claimed(outputs, request.inputs(), request.overwrite),
+        folder_of(request.output),
+        claimed(request.outputs(), request.inputs(), request.overwrite),
         store_beside(request.output) as store,
         _opened(run, request, options, store) as field,
     ):
@@ -170,9 +170,10 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     store.settings()
     plan, threads = ShardPlan.load(store), thread_count()
     workers = worker_count(BlockOptions(), math.prod(plan.grid.blocks.dims), plan.budget, threads)
+    endings = (MANIFEST,) if is_streamed(output) else (".ply",)
     with (
-        _written(output) as outputs,
-        claimed(outputs, [], overwrite),
+        folder_of(output),
+        claimed([Output("-o", output, endings, splats=True)], [], overwrite),
         runner_of(BlockOptions(workers=workers), threads) as runner,
     ):
         write_merged(run, Pass(runner, store, run.console.bar), output, overwrite)
@@ -180,19 +181,6 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
         if kind.name.startswith(DERIVED):
             shutil.rmtree(kind)
     return run.finish()
-
-
-@contextmanager
-def _written(output: str | None, request: ConvertRequest | None = None) -> Iterator[list[Output]]:
-    """Yield the files that will be written; make the folder of a streamed SOG."""
-    if output is not None and is_streamed(output):
-        more = [] if request is None else replace(request, output=None).outputs()
-        with folder_of(output):
-            yield [Output("-o", output), *more]
-    elif request is not None:
-        yield request.outputs()
-    else:
-        yield [Output("-o", output or STDOUT, (".ply",), splats=True)]
 
 
 def _check_options(request: ConvertRequest, options: BlockOptions) -> None:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,14 +18,15 @@ import numpy as np
 
 from vvgt_cli.conversion.shards.level_selection import measure_cuts
 from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.conversion.stages.closed_form import TOO_FAINT, thin
+from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
+from vvgt_cli.gaussians.formats.sog import META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order, splats_of
-from vvgt_cli.gaussians.formats.streamed import read_manifest
+from vvgt_cli.gaussians.formats.streamed import level_files, remove_files
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.header import comment_lines
 from vvgt_cli.score.record import Run, plain
@@ -43,21 +43,6 @@ if TYPE_CHECKING:
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
 NEAREST = 5 / SCALE  # distance in the unit frame up to which level 0 is shown; each further level three times as far
-
-
-@contextmanager
-def folder_of(output: str) -> Iterator[None]:
-    """Make the folder of a manifest, and remove it after the block if it is empty."""
-    folder = Path(output).absolute().parent
-    created = not folder.exists() and folder.parent.is_dir()
-    if created:
-        folder.mkdir()
-    try:
-        yield
-    finally:
-        if created:
-            with suppress(OSError):
-                folder.rmdir()
 
 
 def write_streamed(
@@ -87,16 +72,18 @@ def write_streamed(
         raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
-        errors = measure_cuts(run_pass, cut)
-        choices = np.stack(errors.levels(), axis=1)
+        errors, removed = _thinned(run_pass, cut)
+        choices = np.stack(errors.levels(removed), axis=1)
         stage.note = f"{choices.shape[1]} levels of {len(tiled_tree.tiles)} nodes"
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
     if (refine := refiner()) is not None:
         refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
     stored = make_regions(run, run_pass, cut, errors.thresholds[choices], refine)
     if refine is not None:
         errors, choices = stored.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
     target, counts = Path(output), stored.field("counts")
-    before, folder = files_of(target), target.absolute().parent
+    before, folder = level_files(target), target.absolute().parent
     parts, places = divide(counts)
     axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), comments=False)
     task = WrittenFiles(stored, parts, folder, axes, SCALE, replace(options, sh_degree=cut.plan.degree))
@@ -111,10 +98,21 @@ def write_streamed(
         total = sum(level["bytes"] for level in levels)
         stage.note = f"{output}: {len(nodes)} nodes, {len(parts)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level['gaussians']:,}" for level in levels)
-        if levels[0]["gaussians"] < cut.plan.budget // 2:
+        if not removed and levels[0]["gaussians"] < cut.plan.budget // 2:
             stage.note += f", no more: {tiled_tree.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
-    remove_others(folder, before, task.names)
+    remove_files(set(before) - set(level_files(target)))
     run.report.gaussians, run.report.bytes = levels[0]["gaussians"], total
+
+
+def _thinned(run_pass: Pass, cut: Cut) -> tuple[CutErrors, int]:
+    """Return the errors of cuts whose finest is not faint (`thin`), and how many faint Gaussians it leaves out."""
+
+    def cut_for(budget: int) -> tuple[CutErrors, int, bool]:
+        errors, faint = measure_cuts(run_pass, cut, budget)
+        count = int(errors.counts[:, 0].sum())
+        return errors, count, 2 * faint > count
+
+    return thin(cut.plan.budget, cut_for)
 
 
 def _node(low: np.ndarray, high: np.ndarray, lods: list[dict[str, int]], spreads: np.ndarray) -> dict[str, Any]:
@@ -283,24 +281,6 @@ class WrittenFiles:
             low[own] = np.minimum(low[own], found["lows"])
             high[own] = np.maximum(high[own], found["highs"])
         return low, high
-
-
-def remove_others(folder: Path, before: Sequence[str], names: Sequence[str]) -> None:
-    """Remove the files of an earlier manifest, ``before``, that this one does not name."""
-    for name in set(before) - set(names):
-        path = folder / name
-        for file in (path, *(path.with_name(f"{image}.webp") for image in IMAGES)):
-            file.unlink(missing_ok=True)
-        with suppress(OSError):  # it holds other files
-            path.parent.rmdir()
-
-
-def files_of(manifest: Path) -> list[str]:
-    """List the files of a manifest; none where it is missing or damaged."""
-    try:
-        return list(read_manifest(manifest)["filenames"])
-    except (DataError, OSError):
-        return []
 
 
 def _written(target: Path, splats: Splats) -> int:

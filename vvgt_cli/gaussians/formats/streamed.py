@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.sog import META
+from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import Splats
 
 MANIFEST = "lod-meta.json"
@@ -21,6 +22,40 @@ _MOST_LEVELS = 64
 def is_streamed(path: str | Path | None) -> bool:
     """Return whether a file name is that of a manifest."""
     return path is not None and Path(path).name == MANIFEST
+
+
+@contextmanager
+def folder_of(output: str | Path | None) -> Iterator[None]:
+    """Make the folder of a manifest, not of other files, and remove it after the block if it is empty."""
+    folder = Path(output or "").absolute().parent
+    created = is_streamed(output) and not folder.exists() and folder.parent.is_dir()
+    if created:
+        folder.mkdir(exist_ok=True)  # another shard may have made it meanwhile
+    try:
+        yield
+    finally:
+        if created:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def level_files(path: str | Path) -> list[Path]:
+    """List the files that a manifest names and that exist; none where it is missing, damaged or another file."""
+    try:
+        names = read_manifest(path)["filenames"] if is_streamed(path) else []
+    except DataError:
+        return []
+    found = [Path(path).parent / name for name in names]
+    found = [file for meta in found for file in (meta, *(meta.with_name(f"{image}.webp") for image in IMAGES))]
+    return [file for file in found if file.is_file()]
+
+
+def remove_files(files: Iterable[Path]) -> None:
+    """Remove files, and folders that they leave empty."""
+    for file in files:
+        file.unlink(missing_ok=True)
+        with suppress(OSError):  # it holds other files
+            file.parent.rmdir()
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:

@@ -29,8 +29,9 @@ MAX_FILES = 100_000  # files
 
 
 def matching(pattern: str) -> list[Path]:
-    """List the files of a glob, sorted by the numbers in their names."""
-    return sorted((path for path in map(Path, glob.glob(pattern)) if path.is_file()), key=by_number)
+    """List the files of a glob, sorted by the numbers in their names, those of one name by their folders'."""
+    found = [path for path in map(Path, glob.glob(pattern)) if path.is_file()]
+    return sorted(found, key=lambda path: [by_number(part) for part in (path, *path.parents)])
 
 
 def slices_of(folder: Path) -> list[Path]:
