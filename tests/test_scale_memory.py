@@ -1,16 +1,21 @@
 """What blocks read and keep: slices of TIFF page by page, every voxel once, no more than a worker's memory."""
 
 import gc
+import mmap
+import os
 import weakref
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.test_scale import FIT, bodies, sorted_rows, store
-from vvgt_cli.field.settings import BlockOptions, block_edge
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
 from vvgt_cli.volume import ReadOptions, Volume
-from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume import stored as stored_module
+from vvgt_cli.volume.stored import Stored, read_block
 from vvgt_cli.volume.tiff.reader import read_tiff
 
 
@@ -124,7 +129,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
 
 
 def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 800 << 20)
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 4 << 30)
     volume = stored((1536, 1536, 1536), np.float32)
     edges = {
         (who, n): block_edge(volume, BlockOptions(workers=n, scheduler=who))
@@ -134,7 +139,46 @@ def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
     assert {edges[who, 1] for who in (None, "local", "slurm")} == {256}
     assert edges["local", 8] == edges[None, 8] == 128  # processes of one machine share it
     assert edges["slurm", 8] == 256  # each job has its own
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 800 << 20)
+    assert block_edge(volume, BlockOptions()) == 256
     assert block_edge(stored((1536, 1536, 1536), np.float64), BlockOptions()) == 128
+    with pytest.raises(UsageError, match=r"2 workers .* take fewer --workers"):  # what each process keeps does not fit
+        block_edge(volume, BlockOptions(workers=2))
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 8 << 30)
+    assert worker_count(BlockOptions(), 1 << 30, 0, 8, 1 << 30) == 5  # by default as many as fit
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/smaps"), reason="no /proc/self/smaps")
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_a_mapped_file_no_more_than_a_little_is_held(tmp_path, monkeypatch, turned):
+    path, most, most_held = tmp_path / "v.raw", 8 << 20, []
+    with open(path, "wb") as file:
+        file.truncate(64 << 22)  # a hole
+        for z in range(64):
+            file.seek((z << 22) + 17 * 2048 + z)
+            file.write(bytes([z + 1]) * 30)
+    data = np.memmap(path, np.uint8, "r", shape=(64, 2048, 2048))
+    expected, mapped = data[3:60, 5:100, 7:90].copy(), stored_module._mapping_of(data)
+    mapped.madvise(mmap.MADV_DONTNEED)
+
+    class Counted:
+        """Gives pages back, and says how many bytes of the file were held until then."""
+
+        def madvise(self, advice):
+            text = Path("/proc/self/smaps").read_text().partition(str(path))[2]
+            most_held.append(int(text.partition("Rss:")[2].split()[0]) << 10)
+            mapped.madvise(advice)
+
+    monkeypatch.setattr(stored_module, "_mapping_of", lambda data: Counted())
+    monkeypatch.setattr(stored_module, "MAPPED", most)
+    if turned:
+        volume, lo, hi = Volume(data.T, (1.0,) * 3), (3, 5, 7), (60, 100, 90)
+        assert np.array_equal(read_block(volume, np.array(lo), np.array(hi)), expected.T)
+    else:
+        volume, lo, hi = Volume(data, (1.0,) * 3), (7, 5, 3), (90, 100, 60)
+        assert np.array_equal(read_block(volume, np.array(lo), np.array(hi)), expected)
+    assert 0 < max(most_held) <= most
+    assert len(most_held) < 57  # not slice by slice
 
 
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):

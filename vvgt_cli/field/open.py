@@ -17,9 +17,10 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
+from vvgt_cli.field.grid import TILE_VOXELS
 from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.runners import InProcess, Processes, Runner
-from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
+from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -119,7 +120,8 @@ def blocked(
     volume, voxel = _measured(request)
     threads = thread_count()
     most = threads if isinstance(request.volume, str) else 1  # values in memory would be copied to each worker
-    options = replace(options, workers=worker_count(options, volume.data.size, needs.gaussians, most))
+    least = block_bytes(volume, 1 << TILE_VOXELS, voxel)
+    options = replace(options, workers=worker_count(options, volume.data.size, needs.gaussians, most, least))
     edge = edge or block_edge(volume, options, voxel)
     with runner_of(options, threads) as runner:
         run_pass = Pass(runner, store, run.console.bar, options.shard)

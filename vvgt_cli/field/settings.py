@@ -21,8 +21,9 @@ MUCH = 1 << 27  # voxels from which several processes are quicker than one
 MANY = 3_000_000  # Gaussians above which they are refined region by region: fewer fit in memory with their cells
 A_WORKER = 1 << 30  # bytes of memory of a worker
 EACH = 4  # blocks for each worker, so that none waits long for the last
+HALOS = 4  # voxels along an edge that are read with a block, two on each side under light
 COUNTED = 3  # extra bytes per voxel of types whose values are counted
-ALWAYS = 300 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
+ALWAYS = 300 << 20  # bytes of each process: libraries, coarse grids, a tile's tree, a batch of Gaussians
 
 
 @dataclass(frozen=True)
@@ -49,17 +50,20 @@ class BlockOptions:
             raise UsageError(f"--blocks {self.size}: expected auto, or a power of two of at least {SMALLEST}")
 
 
-def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: int) -> int:
+def worker_count(options: BlockOptions, voxels: int, gaussians: int, threads: int, block: int = 0) -> int:
     """Return the number of processes: as many as threads where there is much to do and memory for each.
 
-    Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md).
+    Processes on blocks of their own are quicker than threads within each kernel (docs/scale.md). ``block`` is the
+    number of bytes of the smallest block.
     """
     if options.workers is not None or options.scheduler is not None or options.shard is not None:
         return options.workers or 1
     if voxels < MUCH and gaussians <= MANY:
         return 1
     free = free_memory()
-    return max(threads if free is None else min(threads, int(free // A_WORKER)), 1)
+    if free is None:
+        return max(threads, 1)
+    return max(min(threads, int(free // A_WORKER), int((free - ALWAYS) // (ALWAYS + block))), 1)
 
 
 def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) -> int:
@@ -74,25 +78,27 @@ def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) 
     if options.size is not None or free is None or options.shard is not None:
         return options.size or SHARED
     workers = (options.workers or 1) if options.scheduler in (None, "local") else 1
-    room = BLOCK_SHARE * max(free - ALWAYS, 0) / workers
+    always = ALWAYS * (workers + (workers > 1))  # this process keeps as much as a worker
+    room = BLOCK_SHARE * max(free - always, 0) / workers
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge, voxel) > room:
         edge //= 2
     while edge > 1 << TILE_VOXELS and workers > 1 and len(Boxes(volume.dims, shape_of(volume, edge))) < EACH * workers:
         edge //= 2
     whole = max(edge, 1 << TILE_VOXELS)  # whole tiles are integrated at a time
-    if block_bytes(volume, whole, voxel) > max(free - ALWAYS, 0):
-        need = block_bytes(volume, whole, voxel) + ALWAYS
+    need = workers * block_bytes(volume, whole, voxel) + always
+    if need > free:
+        each, fewer = (f" in {workers} workers", "; or take fewer --workers") if workers > 1 else ("", "")
         raise UsageError(
-            f"blocks of {whole} voxels and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} MiB "
-            f"are free; give the job {(need - free >> 20) + 1} MiB more"
+            f"blocks of {whole} voxels{each} and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} "
+            f"MiB are free; give the job {(need - free >> 20) + 1} MiB more{fewer}"
         )
     return edge
 
 
 def block_bytes(volume: Volume, edge: int, voxel: int | None = None) -> int:
     """Return the bytes that a block takes during integration; ``voxel`` as in `block_edge`."""
-    sizes = [min(e + 2, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
+    sizes = [min(e + HALOS, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
     one = volume.data.dtype.itemsize
     beside = 0 if volume.data.dtype == np.float32 else 4 if one > 2 else COUNTED
     return math.prod(sizes) * (voxel or one + beside)

@@ -21,6 +21,7 @@ from vvgt_cli.volume.types import Volume
 Slices = tuple[slice, ...]
 POINTS_BOX = 64  # voxels along the edge of what is read for the values of some
 MAPPED = 32 << 20  # bytes of a mapped file that are held at once
+PAGE = 2 << 20  # bytes that one access to a mapped file may hold: Linux maps the large pages of its cache as a whole
 
 
 class Stored:
@@ -175,9 +176,13 @@ def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
     if mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
         out[...] = data[z0:z1][:, y0:y1, x0:x1]  # bricks are laid out slab by slab
         return
-    slab = max(MAPPED // max(out[0].nbytes, 1), 1)
-    for z in range(0, len(out), slab):
-        out[z : z + slab] = data[z0 + z : min(z0 + z + slab, z1), y0:y1, x0:x1]
+    box = data[z0:z1, y0:y1, x0:x1]
+    far = [(n - 1) * abs(stride) for n, stride in zip(box.shape, box.strides, strict=True)]
+    axis = int(np.argmax(far))  # along which slices lie one behind the other in the file
+    slab = max(MAPPED // max(min(abs(box.strides[axis]), sum(far) - far[axis] + 2 * PAGE), 1), 1)
+    source, target = np.moveaxis(box, axis, 0), np.moveaxis(out, axis, 0)
+    for k in range(0, len(target), slab):
+        target[k : k + slab] = source[k : k + slab]
         mapped.madvise(mmap.MADV_DONTNEED)
 
 

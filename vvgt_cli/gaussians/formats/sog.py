@@ -241,7 +241,7 @@ def _quarters() -> tuple[np.ndarray, np.ndarray]:
 
 
 QUARTERS, ORDERS = _quarters()
-_AT_ONCE = 1 << 16  # Gaussians
+_AT_ONCE = 1 << 13  # Gaussians
 
 
 def nearest_turn(quaternions: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
