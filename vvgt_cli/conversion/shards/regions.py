@@ -116,17 +116,18 @@ class VolumePart:
 
         They are `shown`, and lower where the picture changes with the place of the faces that cut the volume: Gaussians
         reach over these, and only those of both sides together show what is there. Faces move by an eighth of the part
-        at most.
+        at most. Two by two pixels have a factor in common.
 
         Args:
-            camera: camera in the part's frame.
+            camera: camera in the part's frame, with an even number of pixels along each edge.
             width: length by which Gaussians reach over a face, in the part's frame.
         """
         grown = np.minimum(width / (self._frame.step * self.scale), np.minimum((self._hi - self._lo) / 8, REACH))
         single = RenderSettings(step=LONGEST, samples=1)
-        inner, outer = (self.view(camera, single, grown=by) for by in (-grown, grown))
-        found: np.ndarray = self.shown(camera) * (1 - np.abs(outer - inner).max(axis=2))
-        return found
+        half = camera.resized(0.5)
+        inner, outer = (self.view(half, single, grown=by) for by in (-grown, grown))
+        found: np.ndarray = self.shown(half) * (1 - np.abs(outer - inner).max(axis=2))
+        return found.repeat(2, axis=0).repeat(2, axis=1)
 
     def _before(self, eye: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield boxes of voxels (first, end) that rays from an eye, in voxels, may pass before they enter the part.
@@ -315,7 +316,7 @@ def make_regions(
     return StoredGaussians(cut.store, kind, regions.ends)
 
 
-PIXEL = 3.0  # width of a pixel of the training views, in median standard deviations of the middle axis
+PIXEL = 2.0  # width of a pixel of the training views, in median standard deviations of the middle axis
 SMALLEST, LARGEST, MULTIPLE = 64, 384, 16  # pixels along the edge of a view
 FACES = 2.0  # median standard deviations of the middle axis by which Gaussians reach over a face
 SPREAD = 0.5  # share of a screen pixel's width in a training pixel from which rays cover all of the latter
