@@ -138,7 +138,7 @@ def shown(folder: Path, source: Source, scene: Scene, size: int) -> Iterator[str
             field = math.degrees(2 * math.atan(camera.height / camera.fy / 2))
             read = gaussians_of(levels.seen_from(turned @ camera.position, field), str(folder))
             drawn = render(to_box_frame(in_unit_frame(*read), source.volume), camera)
-            squares.append(np.square(np.clip(drawn - render_view(scene, camera), -1, 1)[..., :3]).mean())
+            squares.append(np.square(np.clip(drawn, 0, 1) - np.clip(render_view(scene, camera), 0, 1))[..., :3].mean())
         yield f"distance {distance}: {-10 * np.log10(np.mean(squares)):.1f} dB"
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.test_scale import FIT, bodies, sorted_rows, store
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.settings import BlockOptions, block_edge, worker_count
+from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume import stored as stored_module
 from vvgt_cli.volume.stored import Stored, read_block
@@ -142,6 +142,10 @@ def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 800 << 20)
     assert block_edge(volume, BlockOptions()) == 256
     assert block_edge(stored((1536, 1536, 1536), np.float64), BlockOptions()) == 128
+    small = stored((48, 48, 48), np.uint8)
+    assert block_edge(small, BlockOptions(workers=8)) == block_edge(small, BlockOptions())  # one block is one worker's
+    assert block_bytes(stored((512, 512, 512), np.float32), 64) == 4 * 68**3  # with two voxels around it under light
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 700 << 20)
     with pytest.raises(UsageError, match=r"2 workers .* take fewer --workers"):  # what each process keeps does not fit
         block_edge(volume, BlockOptions(workers=2))
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 8 << 30)

@@ -225,6 +225,7 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((frames, "-o", series / "{}" / "a.ply"), "expected one folder; got .*0, .*1, .*2$"),
         ((frames, "-o", "s/{}/lod-meta.json", "--report", "{}.json"), "one folder, s, and those in it; got .$"),
         ((frames, "-o", series / "none/a/{}/lod-meta.json"), "none/a/0 does not exist"),
+        ((frames, "-o", series / "out" / "{}" / "b" / "lod-meta.json"), "place in the last folder's name"),
         ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
         ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),

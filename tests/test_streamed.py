@@ -108,11 +108,11 @@ def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: P
     assert np.mean(np.array(apart) < 2e-3) > 0.97
 
 
-@pytest.mark.parametrize("rule", ["inria", "playcanvas"])
-def test_errors_are_those_of_what_is_in_the_files(vvgt, volume: Path, folder: Path, tmp_path: Path, rule: str) -> None:
+@pytest.mark.parametrize(("rule", "steps"), [("inria", "0"), ("playcanvas", "0"), ("playcanvas", "8")])
+def test_errors_are_those_of_what_is_in_the_files(vvgt, volume, folder: Path, tmp_path: Path, rule, steps) -> None:
     if rule != "inria":
         folder = tmp_path / "out"
-        vvgt.ok("convert", volume, *FIT, "--steps", "0", "--rule", rule, "-o", folder / "lod-meta.json")
+        vvgt.ok("convert", volume, *FIT, "--steps", steps, "--rule", rule, "-o", folder / "lod-meta.json")
     manifest = read_manifest(folder / "lod-meta.json")
     assert any(line.endswith(f"rule {rule}") for line in manifest["vvgt"]["comments"])
     files = decoded(folder, manifest)
@@ -300,9 +300,11 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
     for path in (stale / "meta.json", stale / "sh0.webp", other / "notes.txt"):
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"x")
+    (folder / "0_0" / "shN_labels.webp").write_bytes(b"x")  # of levels with harmonics
     assert vvgt("init", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
     vvgt.ok("init", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json")
     assert not stale.exists()
+    assert not list(folder.glob("*/shN*"))
     assert (other / "notes.txt").is_file()  # not of the manifest
 
 

@@ -63,7 +63,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
     LEVELS: {
         "--init": "levels are cuts of moments, which other methods do not make; remove it",
         "--frame world": "viewers choose levels by distances in the unit frame; remove it",
-        "--for": "levels are not scored, as a device shows them or otherwise; give --max-gaussians and --size",
+        "--for": "levels are not scored; give --max-gaussians and --size",
         "--max-size": "the bytes of levels are known only once they are written; try --max-gaussians",
         "--live": "their format has no place for values; write another, as -o out.ply",
         "--split-labels": "labels share the Gaussians of one finished cloud; write another format, as -o out_{}.ply",

@@ -138,6 +138,10 @@ class Files:
         if batch.resumes and len(folders) > (0 if levels else 1):
             stated, more = ", ".join(folders[:3]), f", {Path(self._index.path).parent}, and those in it" * levels
             raise UsageError(f"-o, --report and --preview of a series: expected one folder{more}; got {stated}")
+        if levels and not is_pattern(Path(str(request.output)).parent.name):
+            raise UsageError(
+                f"-o {request.output}: expected the place in the last folder's name, as out_{{}}/{MANIFEST}"
+            )
         checked = rows[self._shard.index - 1 :][:1] if batch.resumes else rows  # shards make folders of their own
         outputs = [output for row in checked for output in self._named(request, row).outputs()]
         with ExitStack() as made:

@@ -77,16 +77,17 @@ def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) 
     free = free_memory()
     if options.size is not None or free is None or options.shard is not None:
         return options.size or SHARED
-    workers = (options.workers or 1) if options.scheduler in (None, "local") else 1
-    always = ALWAYS * (workers + (workers > 1))  # this process keeps as much as a worker
-    room = BLOCK_SHARE * max(free - always, 0) / workers
+    tiles = len(Boxes(volume.dims, shape_of(volume, 1 << TILE_VOXELS)))  # a block has one or more
+    workers = min(options.workers or 1, tiles) if options.scheduler in (None, "local") else 1
+    beside = ALWAYS // 2 if workers > 1 else 0  # what this process keeps, whose libraries are in memory already
+    room = BLOCK_SHARE * max(free - ALWAYS * workers - beside, 0) / workers
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge, voxel) > room:
         edge //= 2
     while edge > 1 << TILE_VOXELS and workers > 1 and len(Boxes(volume.dims, shape_of(volume, edge))) < EACH * workers:
         edge //= 2
     whole = max(edge, 1 << TILE_VOXELS)  # whole tiles are integrated at a time
-    need = workers * block_bytes(volume, whole, voxel) + always
+    need = workers * (block_bytes(volume, whole, voxel) + ALWAYS) + beside
     if need > free:
         each, fewer = (f" in {workers} workers", "; or take fewer --workers") if workers > 1 else ("", "")
         raise UsageError(

@@ -53,7 +53,7 @@ def run(
     if check is not None:
         _fit("check", *check)
     if weights is not None and options.device != "cpu":
-        raise UsageError(f"weights of views with device {options.device}; expected the CPU, which alone regards them")
+        raise UsageError(f"weights of views with device {options.device}; expected the CPU, which alone uses them")
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)

@@ -24,7 +24,7 @@ from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.sog import META, images_of, webp
+from vvgt_cli.gaussians.formats.sog import IMAGES, META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order, splats_of
 from vvgt_cli.gaussians.formats.streamed import level_files, remove_files
 from vvgt_cli.gaussians.frames import transform
@@ -287,6 +287,9 @@ def _written(target: Path, splats: Splats) -> int:
     """Write the images and then `meta.json`, and return their bytes."""
     images, meta = images_of(splats)
     target.parent.mkdir(exist_ok=True)
+    for name in IMAGES:
+        if f"{name}.webp" not in images:  # of earlier levels, which had harmonics
+            target.with_name(f"{name}.webp").unlink(missing_ok=True)
     size = sum(_put(target.with_name(name), webp(image)) for name, image in images.items())
     return size + _put(target, json.dumps(meta, separators=(",", ":")).encode())
 

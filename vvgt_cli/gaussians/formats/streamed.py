@@ -26,7 +26,7 @@ def is_streamed(path: str | Path | None) -> bool:
 
 @contextmanager
 def folder_of(output: str | Path | None) -> Iterator[None]:
-    """Make the folder of a manifest, not of other files, and remove it after the block if it is empty."""
+    """Make the folder of a manifest, not of other files; if the block leaves it empty, remove it again."""
     folder = Path(output or "").absolute().parent
     created = is_streamed(output) and not folder.exists() and folder.parent.is_dir()
     if created:
