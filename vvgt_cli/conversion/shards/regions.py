@@ -318,7 +318,7 @@ def make_regions(
 
 PIXEL = 2.0  # width of a pixel of the training views, in median standard deviations of the middle axis
 SMALLEST, LARGEST, MULTIPLE = 64, 384, 16  # pixels along the edge of a view
-FACES = 2.0  # median standard deviations of the middle axis by which Gaussians reach over a face
+FACES = 3.0  # median standard deviations of the middle axis by which Gaussians reach over a face
 SPREAD = 0.5  # share of a screen pixel's width in a training pixel from which rays cover all of the latter
 
 
