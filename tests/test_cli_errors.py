@@ -84,7 +84,7 @@ CASES = {
     "suffix": (("convert", "v.raw", *RAW, "-o", "out.splat"), 2, ".ply"),
     "a directory": (("convert", "v.raw", *RAW, "-o", "."), 2, "."),
     "preview suffix": ((*CONVERT, "--preview", "p.jpg"), 2, ".png"),
-    "same place": ((*CONVERT, "--report", "-", "-o", "-"), 2, "both"),
+    "same place": ((*CONVERT[:-1], "-", "--report", "-"), 2, "both"),
     "over an input": (("convert", "v.ply", *RAW, "-o", "v.ply", "--overwrite"), 2, "input"),
     "ply": (("info", "not.ply"), None, "not.ply"),
     "render no ply": (("render", "not.ply", "--orbit", 2, "-o", "d"), 1, "not.ply"),

@@ -11,6 +11,7 @@ import tifffile
 from PIL import Image
 
 from tests.headers import uncertified
+from tests.processes import replaced
 from tests.test_streamed import contents as files_in
 from vvgt_cli.conversion.frames import merge_statistics
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
@@ -205,7 +206,8 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
 def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path, stand_in: list) -> None:
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     vvgt.ok(*run)
-    assert "holds frames of another run: max gaussians 60 there, 50 here" in vvgt(*run, "--max-gaussians", "50").error
+    other = vvgt(*replaced(run, "--max-gaussians", "50")).error
+    assert "holds frames of another run: max gaussians 60 there, 50 here" in other
     np.save(series / "run_12.npy", np.zeros((8, 10, 12), np.float32))
     assert "another volume, frames 4 there, 5 here" in vvgt(*run).error
     vvgt.ok(*run, "--overwrite")
@@ -293,12 +295,14 @@ def test_frames_of_colours(vvgt, series: Path) -> None:
     assert "components 4; expected the 3 of rgb_0.tif" in vvgt("convert", series / "rgb_*.tif", "-o", out, *SMALL).error
 
 
-def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand_in: list) -> None:
+@pytest.mark.parametrize("channels", ["all", "A,B", "1,A"])
+def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand_in: list, channels: str) -> None:
     """The ramp of a channel follows from all frames: the brightest one is not as bright in the first."""
     rng = np.random.default_rng(0)
     values = rng.random((3, 6, 2, 8, 10)) * np.array([1, 2, 4])[:, None, None, None, None] * 1000
-    tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata={"axes": "TZCYX"})
-    run = ("convert", series / "t.ome.tif", "--channel", "all", "-o", series / "out" / "{}.ply", *SMALL[:-1])
+    meta = {"axes": "TZCYX", "Channel": {"Name": ["A", "B"]}}
+    tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata=meta)
+    run = ("convert", series / "t.ome.tif", "--channel", channels, "-o", series / "out" / "{}.ply", *SMALL[:-1])
     assert "3 of 10 x 8 x 6" in vvgt.ok(*run).err
     layers = [load(request.source).layers for request in stand_in]
     nodes = [[layer.tf.node_range() for layer in frame] for frame in layers]

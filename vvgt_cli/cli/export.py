@@ -5,10 +5,11 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("export", short_help="Export a trained network as a model for infer.")
+@click.command("export", cls=SectionedCommand, short_help="Export a trained network as a model for infer.")
 @click.argument("checkpoint", metavar="CHECKPOINT")
 @click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create; its name becomes the model's.")
 @click.option(

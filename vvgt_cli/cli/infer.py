@@ -5,10 +5,11 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("infer", short_help="Improve a .ply with an exported network.")
+@click.command("infer", cls=SectionedCommand, short_help="Improve a .ply with an exported network.")
 @click.argument("ply", metavar="IN.ply")
 @click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
 @click.option(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("merge", short_help="Merge the blocks of 'init --shard' into a .ply.")
+@click.command("merge", cls=SectionedCommand, short_help="Merge the blocks of 'init --shard' into a .ply.")
 @click.argument("folder")
 @click.option(
     "-o", "--output", required=True, metavar="OUT.ply",

@@ -8,10 +8,11 @@ import click
 
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import SECONDS, Measure, common_options, device_option, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("optimize", short_help="Refine a .ply by gradient descent on views.")
+@click.command("optimize", cls=SectionedCommand, short_help="Refine a .ply by gradient descent on views.")
 @click.argument("ply", metavar="IN.ply")
 @click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
 @click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")

@@ -68,9 +68,9 @@ _READ = dict(
         "several.",
     ),
     component=click.option(
-        "--component", "--channel", "component", metavar="N|NAME|magnitude|color|all", callback=_component,
+        "--component", "--channel", "component", metavar="N|NAME|A,B|magnitude|color|all", callback=_component,
         help="Vector component or channel to read, by number (from 0) or name; 'color' reads the components as RGB or "
-        "RGBA, 'all' shows every channel in its own colour.",
+        "RGBA, 'DAPI,GFP' shows these channels together, each in its own colour, and 'all' every channel.",
     ),
     time=click.option(
         "--time", type=click.IntRange(0), metavar="N", help="Time step, or volume of a DICOM series, to read, from 0."

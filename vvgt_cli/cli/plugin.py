@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import click
 
+from vvgt_cli.cli.sections import SectionedCommand
 
-@click.command("plugin", short_help="List the adapters for other programs, or say how one is enabled.")
+
+@click.command(
+    "plugin", cls=SectionedCommand, short_help="List the adapters for other programs, or say how one is enabled."
+)
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
     """List the adapters for the programs that volumes are open in; with NAME, print its file and how it is enabled.

@@ -15,10 +15,11 @@ from vvgt_cli.cli.options import (
     tf_range_option,
     unit_distance_option,
 )
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("recolor", short_help="Show a live .ply under another function or light.")
+@click.command("recolor", cls=SectionedCommand, short_help="Show a live .ply under another function or light.")
 @click.argument("ply", metavar="LIVE.ply")
 @click.option(
     "--tf", metavar="TF",

@@ -5,12 +5,15 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells", "bodies")
 
 
-@click.command("synth", short_help="Make a synthetic volume: turbulence, or shapes like those in CT and MR.")
+@click.command(
+    "synth", cls=SectionedCommand, short_help="Make a synthetic volume: turbulence, or shapes like those in CT and MR."
+)
 @click.argument("kind", metavar="KIND", type=click.Choice(KINDS))
 @click.option("-o", "--output", required=True, metavar="FILE.nrrd", help="Output file: NRRD, float32.")
 @click.option(

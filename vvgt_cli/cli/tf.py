@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_range_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
@@ -15,7 +16,7 @@ def command() -> None:
     """Show, convert and suggest transfer functions."""
 
 
-@command.command("show", short_help="Draw a transfer function over a histogram.")
+@command.command("show", cls=SectionedCommand, short_help="Draw a transfer function over a histogram.")
 @click.argument("tf")
 @click.option("-o", "--output", required=True, metavar="OUT.png", help="Output file.")
 @click.option("--volume", metavar="VOLUME", help="Volume whose histogram is drawn behind the function.")
@@ -37,7 +38,7 @@ def show(
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
 
 
-@command.command("convert", short_help="Write a transfer function in another format.")
+@command.command("convert", cls=SectionedCommand, short_help="Write a transfer function in another format.")
 @click.argument("tf", metavar="IN")
 @click.argument("output", metavar="OUT")
 @click.option(
@@ -61,7 +62,7 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
     convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
 
-@command.command("list", short_help="List the named functions.")
+@command.command("list", cls=SectionedCommand, short_help="List the named functions.")
 @common_options
 def list_named(console: Console) -> None:
     """Print the names of the built-in functions, which --tf and 'vvgt tf' accept, and what each shows.
@@ -77,7 +78,7 @@ def list_named(console: Console) -> None:
         click.echo(f"{name:<{max(map(len, found)) + 2}}{shows}")
 
 
-@command.command("suggest", short_help="Suggest functions that each show one range of values.")
+@command.command("suggest", cls=SectionedCommand, short_help="Suggest functions that each show one range of values.")
 @click.argument("volume")
 @click.option(
     "-n", "--number", type=click.IntRange(1, 100), default=10, show_default=True, metavar="N",

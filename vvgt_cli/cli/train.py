@@ -5,10 +5,11 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.options import common_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("train", short_help="Train the network on volumes.")
+@click.command("train", cls=SectionedCommand, short_help="Train the network on volumes.")
 @click.option(
     "--data", required=True, metavar="DIR",
     help="Folder with volumes in DIR/train and DIR/held; scenes are cached in DIR/scenes.",

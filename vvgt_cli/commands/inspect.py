@@ -219,13 +219,13 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
 
 def _channels(content: Content) -> list[dict[str, Any]]:
     """Describe each channel of a volume: the option that selects it, its name, colour and range."""
-    from vvgt_cli.field.layered import channel_color
     from vvgt_cli.volume import statistics
 
     rows = []
-    for k, volume in enumerate(content.volumes):
-        row: dict[str, Any] = {"choice": f"--channel {k}", "name": content.names[k] if content.names else ""}
-        row |= {"color": [round(v, 4) for v in channel_color(k, content.colors[k])]}
+    names = content.names or [""] * len(content.volumes)
+    for k, name, color, volume in zip(content.numbers, names, content.colors, content.volumes, strict=True):
+        shown = [round(v, 4) for v in color]
+        row: dict[str, Any] = {"choice": f"--channel {k}", "name": name, "color": shown}
         if volume.data.nbytes <= CHEAP:
             stats = statistics(volume)
             row["range"] = [stats.lo, stats.hi]

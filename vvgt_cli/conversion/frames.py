@@ -17,7 +17,7 @@ from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, COLOR, Content, functions_of, open_content
+from vvgt_cli.field.layered import ALL, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
@@ -365,7 +365,7 @@ def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
     from vvgt_cli.volume.registry import time_steps
 
     read = replace(read, stored=True, packed=True)
-    if read.component in (COLOR, ALL):
+    if isinstance(read.component, str):
         read = replace(read, component=0)
     try:
         return time_steps(volume, read)

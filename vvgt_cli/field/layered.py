@@ -25,6 +25,7 @@ from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.label_files import holds_table, segments_of, table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct, hex_color
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
+from vvgt_cli.volume.components import channel_numbers
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
@@ -45,23 +46,25 @@ class Content:
     Attributes:
         volumes: the scalar field; or red, green, blue and optionally opacity; or one volume per channel; or label maps.
         color: the volumes are colours.
-        colors: RGB of each channel, None where the file gives none.
+        colors: RGB of each channel, that of the file or a default.
         path: path of the file, None for content in memory.
         overlapping: the volumes are layers of a segmentation with overlapping segments.
         layer: number of the requested component, None for all.
         stored: values stay in the file, and derived volumes are computed block by block.
         names: names of the channels, where they have any.
+        numbers: numbers of the channels in the file, where they are several.
         components_message: the reader's message about several components if all are shown by default, else None.
     """
 
     volumes: tuple[Volume, ...]
     color: bool = False
-    colors: Sequence[tuple[float, float, float] | None] = ()
+    colors: Sequence[tuple[float, float, float]] = ()
     path: str | None = None
     overlapping: bool = False
     layer: int | None = None
     stored: bool = False
     names: Sequence[str] = ()
+    numbers: Sequence[int] = ()
     components_message: str | None = None
 
     @property
@@ -142,13 +145,16 @@ def content_of(source: Volume | Content) -> Content:
 def open_content(source: str, read: ReadOptions) -> Content:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    Components are returned for "color" and "all", for a file of colours, and by default for up to `MAX_CHANNELS`
-    channels of a microscope.
+    Components are returned for "color", "all" and several names or numbers, for a file of colours, and by default for
+    up to `MAX_CHANNELS` channels of a microscope.
 
     Raises:
-        DataError, UsageError: see `read_volume`; also for components that are not colours.
+        DataError, UsageError: see `read_volume`; also for components that are not colours, and channels that are not
+            there.
     """
-    asked = read.component if read.component in (COLOR, ALL) else None
+    word = read.component if isinstance(read.component, str) else ""
+    several = "," in word
+    asked = word if several or word in (COLOR, ALL) else None
     try:
         volume = read_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
@@ -161,11 +167,17 @@ def open_content(source: str, read: ReadOptions) -> Content:
         color = asked == COLOR or (error.color and not asked and not overlapping)
         if color and read.keep_largest is not None:
             raise UsageError(f"--keep-largest: {source} has colours; expected scalars: give a --mask") from None
-        parts = tuple(read_volume(source, replace(read, component=k)) for k in range(error.count))
+        numbers: Sequence[int] = range(error.count)
+        if several:
+            numbers = channel_numbers(word.split(","), error.count, error.names, source)
+            if len(numbers) == 1:
+                return open_content(source, replace(read, component=numbers[0]))
+        parts = tuple(read_volume(source, replace(read, component=k)) for k in numbers)
         if color:
             return Content(parts, True, stored=read.stored)
-        colors = error.colors or [None] * error.count
-        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
+        colors = [(error.colors and error.colors[k]) or CHANNEL_COLORS[k % len(CHANNEL_COLORS)] for k in numbers]
+        names = [error.names[k] for k in numbers] if error.names else []
+        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in zip(numbers, parts, strict=True))
         return Content(
             named,
             False,
@@ -174,10 +186,13 @@ def open_content(source: str, read: ReadOptions) -> Content:
             overlapping,
             None,
             read.stored,
-            error.names,
+            names,
+            numbers,
             str(error) if by_default else None,
         )
-    if asked:
+    if several:
+        volume = read_volume(source, read)  # the name of its one channel, or an error
+    elif asked:
         raise UsageError(f"{source}: one component; expected several: omit --component {asked}")
     layer = read.component if isinstance(read.component, int) else None
     return Content((volume,), path=source, layer=layer, stored=read.stored)
@@ -286,7 +301,8 @@ def functions_of(
     if opened.components_message:
         _warn_all_channels(opened, tf)
     names = opened.names or [""] * len(stats)
-    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(stats)]
+    rows = zip(opened.numbers, names, opened.colors, stats, strict=True)
+    return [_channel(k, name, color, its, tf, tf_range) for k, name, color, its in rows]
 
 
 def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
@@ -295,17 +311,12 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
         raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
-        f"{k}{f' {name!r}' if name else ''} #{hex_color(channel_color(k, color))}"
-        for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
+        f"{k}{f' {name!r}' if name else ''} #{hex_color(color)}"
+        for k, name, color in zip(opened.numbers, known, opened.colors, strict=True)
     ]
     warnings.warn(
         f"{opened.path}: {len(shown)} channels, all shown: {', '.join(shown)} (try --channel N for one)", stacklevel=4
     )
-
-
-def channel_color(number: int, color: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """Return the colour of a channel, RGB in [0, 1]: the file's, else the default for its number."""
-    return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
 
 
 def _white(opened: Content) -> float:
@@ -364,7 +375,7 @@ def _luminance(stored: bool, *bands: Volume) -> Volume:
 def _channel(
     number: int,
     name: str,
-    color: tuple[float, float, float] | None,
+    rgb: tuple[float, float, float],
     stats: Statistics,
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
@@ -372,7 +383,6 @@ def _channel(
     """Return the function of a channel: its colour with the given function's opacity, or a ramp over bright voxels."""
     from vvgt_cli.look.resolve import percentiles
 
-    rgb = channel_color(number, color)
     if tf is not None:
         shown = resolve(tf, stats, tf_range)
         lo, hi = shown.node_range()

@@ -185,7 +185,7 @@ class Reading(TypedDict, total=False):
     header_bytes: int
     spacing: Sequence[float]
     array: str
-    component: int | str
+    component: int | str | Sequence[int | str]
     time: int
     space: str
     crop: str
@@ -252,6 +252,8 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
+    if isinstance(parts := given.get("component"), list | tuple):
+        given["component"] = parts[0] if len(parts) == 1 else ",".join(map(str, parts))
     if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
         mask = given["mask"]
         if isinstance(mask, os.PathLike):

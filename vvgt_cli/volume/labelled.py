@@ -16,7 +16,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.components import contiguous, select_component
+from vvgt_cli.volume.components import contiguous, listed, select_component
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import metres, unit_name
@@ -158,7 +158,9 @@ def labelled_volume(
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
         if k is not None:
             if value is not None and value not in range(axes[k].size):
-                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
+                named = f" ({listed([f'{n} {name!r}' for n, name in enumerate(axes[k].labels)], ', ')})"
+                expected = f"expected 0 to {axes[k].size - 1}{named if axes[k].labels else ''}"
+                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; {expected}")
             index[k] = slice(None) if value is None else value
     if callable(stored) and options.stored and chunks is not None and len(space) == 3:
         return _left(stored, dtype, axes, index, zyx, attributes, options, source, name, chunks)

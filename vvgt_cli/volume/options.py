@@ -28,7 +28,7 @@ class ReadOptions:
             voxel and the directions stay. Not of values that stand at points (meshes).
         array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
         component: index of a component or channel, the name of a channel, or ``magnitude``, for arrays that have
-            several.
+            several; names and indices of several, as ``A,B``, are for `vvgt_cli.field.layered.open_content`.
         time: index of the time step, for files that hold several.
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
         crop: ``x0:x1,y0:y1,z0:z1``, the voxels to keep, as `parse_crop` has it.
