@@ -7,14 +7,17 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+import pyvista
 import tifffile
+import xarray
 from PIL import Image
 
+import vvgt_cli as library
 from tests.headers import uncertified
 from tests.processes import replaced
 from tests.test_streamed import contents as files_in
 from vvgt_cli.conversion.frames import merge_statistics
-from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, frame_facts, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.gaussians.formats.sog import images_of
@@ -251,11 +254,81 @@ def test_names_of_frames() -> None:
     assert put_name("-o", "a_{:04d}.ply", FRAMES, "7") == "a_0007.ply"
     assert put_name("-o", "a_{}.ply", FUNCTIONS, "7") == "a_7.ply"
     assert [is_pattern(name) for name in ("a.ply", "{}.ply", "{:3d}.ply", "{x}.ply", "{0.__class__}.ply")] == [
-        False, True, True, False, False
+        False, True, True, True, True
     ]  # fmt: skip
-    for pattern, kind in (("{}/{:d}.ply", FRAMES), ("a{x}_{}.ply", FUNCTIONS), ("{:d}.ply", FUNCTIONS)):
+    facts = {"step": "0100", "time": 0.05, "stem": "run_0100"}
+    for pattern, name in (
+        *(("{step}.ply", "0100.ply"), ("{step:d}_{}.ply", "100_7.ply"), ("{stem}.ply", "run_0100.ply")),
+        *(("{time}/{:03d}.ply", "0.05/007.ply"), ("{time:.3f}.ply", "0.050.ply")),
+    ):
+        assert put_name("-o", pattern, FRAMES, "7", facts) == name
+    with pytest.raises(UsageError, match="the input of frame 7 states no time; expected another place"):
+        put_name("-o", "{time}.ply", FRAMES, "7", {"step": "1"})
+    wrong = ("{x}_{}.ply", "{0.__class__}.ply", "{stem:d}.ply", "{step}{step}.ply", "{{}.ply")
+    for pattern, kind in (
+        *(
+            *((name, FRAMES) for name in wrong),
+            ("{}/{:d}.ply", FRAMES),
+            ("a{x}_{}.ply", FUNCTIONS),
+            ("{:d}.ply", FUNCTIONS),
+        ),
+        *(("{step}.ply", FUNCTIONS), ("{stem}.ply", LABELS)),
+    ):
         with pytest.raises(UsageError, match="expected one place for the"):
             put_name("-o", pattern, kind, "1")
+
+
+@pytest.mark.parametrize(
+    ("names", "steps"),
+    [
+        (["run_0050.vti", "run_0100.vti"], ["0050", "0100"]),
+        (["a/t1_c2.nii.gz", "a/t5_c2.nii.gz"], ["1", "5"]),  # the number that differs
+        (["v2/0010/f3.npy", "v2/0020/f3.npy"], ["0010", "0020"]),
+        (["x_9.h5", "x_10_b.h5"], ["9", "10"]),
+        (["a_1.compressed.ply", None], ["1", None]),
+        (["one_7.vti"], ["7"]),
+        (["a.vti", "b.vti"], [None, None]),
+    ],
+)
+def test_the_step_is_the_number_in_a_name(names: list, steps: list) -> None:
+    assert [row.get("step") for row in frame_facts(names)] == steps
+
+
+def test_outputs_keep_step_time_and_stem_of_their_inputs(vvgt, series: Path, stand_in: list, monkeypatch) -> None:
+    monkeypatch.chdir(series)
+    for k, time in ((50, 0.05), (100, 0.1), (200, 0.2)):
+        image = pyvista.ImageData(dimensions=(9, 8, 7))
+        image["v"], image.field_data["TimeValue"] = np.random.default_rng(k).random(504), [time]
+        image.save(f"vtk_{k:04d}.vti")
+    axes = {"time": ("time", [0.0, 1.5], {"units": "seconds since 2000-01-01"})}
+    xarray.Dataset({"v": (("time", "z", "y", "x"), np.ones((2, 3, 4, 5), "f4"))}, coords=axes).to_netcdf("t.nc")
+    for volume, pattern, names in (
+        ("vtk_*.vti", "a/{step}.ply", ("0050", "0100", "0200")),
+        ("vtk_*.vti", "b/{time}.ply", ("0.05", "0.1", "0.2")),
+        ("vtk_*.vti", "c/{stem}.ply", ("vtk_0050", "vtk_0100", "vtk_0200")),
+        ("t.nc", "d/{time}.ply", ("0", "1.5")),
+        ("t.nc", "e/{step}.ply", ("0", "1")),
+    ):
+        folder = Path(pattern).parent
+        folder.mkdir()
+        run = ("convert", volume, "--tf", "gray", "-o", pattern, "--report", folder / "r_{stem}_{}.json", *SMALL[:-1])
+        vvgt.ok(*run)
+        assert {path.stem for path in folder.glob("*.ply")} == set(names)
+        rows = json.loads((folder / "index.json").read_text())["files"]
+        assert [row["file"] for row in rows] == [f"{name}.ply" for name in names]
+        assert f"0 frames converted, {len(names)} were complete before" in vvgt.ok(*run).err
+        if volume != "t.nc":
+            vvgt.ok("render", volume, "--size", 16, "-o", pattern.replace(".ply", ".png"))
+            assert {path.stem for path in folder.glob("*.png")} == set(names)
+    before = len(stand_in)
+    assert "f/t.ply would hold several frames" in vvgt("convert", "t.nc", "-o", "f/{stem}.ply").error
+    assert "frame 0 states no time" in vvgt("convert", "run_*.npy", "-o", "{time}.ply").error
+    assert "{step} or {time} that its input states" in vvgt("convert", "t.nc", "-o", "{when}.ply").error
+    assert len(stand_in) == before
+    clouds = library.convert("vtk_*.vti", "gray", {"max_gaussians": 50, "size": 32, "steps": 0})
+    assert isinstance(clouds, library.Clouds)
+    clouds.save("lib_{step}_{time}.ply")
+    assert sorted(path.name for path in series.glob("lib*.ply"))[0] == "lib_0050_0.05.ply"
 
 
 def test_statistics_together() -> None:

@@ -88,8 +88,9 @@ def command(
     OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb, .usdc or .usdz.
     FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
-    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply or FOLDER has a placeholder for
-    the number, such as {:04d}. All frames share one function and value range; run the command again to resume. A name
+    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply or FOLDER has a placeholder: {}
+    or {:04d} for the frame's number, {step} for the number in its file's name or of its time step, {time} for the time
+    that the file states, {stem} for the file's name. All frames share one function and value range; run the command again to resume. A name
     ending in .html without a placeholder makes one page of all frames, functions or labels, one in .glb, .usdc or .usdz
     one file with a node for each function or label.
 
@@ -101,9 +102,10 @@ def command(
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
+      vvgt convert flow.nc -o 'flow_{time}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert four.nii -o four.html
-      vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
+      vvgt convert cells.ome.tif --channel DAPI,GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
       vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", required=True, metavar="DIR|FILE",
     help="One picture such as out.png, a directory for several, created if missing, numbered ones such as "
-    "'out_{:04d}.png', or a movie such as turn.gif or turn.mp4.",
+    "'out_{:04d}.png' (of a series also {step}, {time} or {stem}), or a movie such as turn.gif or turn.mp4.",
 )  # fmt: skip
 @click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
 @click.option(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
@@ -20,7 +20,7 @@ from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
 from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
-from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
+from vvgt_cli.conversion.index import FRAMES, frame_facts, is_pattern, put_name
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.conversion.request import ConvertRequest
@@ -75,6 +75,7 @@ class RenderRequest:
         overwrite: replace images that exist.
         function: look to show live Gaussians under; None: the look of the file.
         blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
+        facts: step, time and stem of each frame, for places in the output's name, as far as its input states them.
     """
 
     source: tuple[str | None, ...] | SourceRequest
@@ -88,6 +89,7 @@ class RenderRequest:
     overwrite: bool = False
     function: FunctionRequest | None = None
     blocks: BlockOptions | None = None
+    facts: Sequence[Mapping[str, Any]] = ({},)
 
     @property
     def png(self) -> bool:
@@ -134,8 +136,10 @@ class RenderRequest:
             return [self.output]
         if not self.png:
             return [str(Path(self.output, f"{camera.name}{PICTURE}")) for camera in cameras]
-        named = is_pattern(self.output)
-        return [put_name("-o", self.output, FRAMES, str(k)) if named else self.output for k in range(len(cameras))]
+        if not is_pattern(self.output):
+            return [self.output] * len(cameras)
+        frames = [((k + 1) * len(self.facts) - 1) // len(cameras) for k in range(len(cameras))]  # as of `views`
+        return [put_name("-o", self.output, FRAMES, str(k), self.facts[frame]) for k, frame in enumerate(frames)]
 
     def check(self, frames: int) -> list[list[Camera]]:
         """Return the views of frames yet to be read; raise UsageError or DataError for bad options or outputs."""
@@ -176,15 +180,16 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     """
     run, given = Run(console or Console(), ConversionReport("render")), request.source
     if not isinstance(given, SourceRequest):
-        return _render(run, request, given)
+        return _render(run, replace(request, facts=frame_facts(given)), given)
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
     if not over_time and not is_glob_of_volumes(given.path):
         try:
-            return _render(run, request, [given])
+            return _render(run, replace(request, facts=frame_facts([given.path])), [given])
         except SeveralSteps:  # which are the frames
             pass
-    series = FrameSeries(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
-    return _render(run, request, series.sources(), series)
+    series = FrameSeries(ConvertRequest(given, request.output, blocks=request.blocks), Shard(), page=False)
+    facts = [series.places(stem) for stem in series.stems]
+    return _render(run, replace(request, facts=facts), series.sources(), series)
 
 
 def _render(

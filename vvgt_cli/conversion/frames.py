@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.index import FRAMES, index_path
+from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
@@ -47,12 +47,14 @@ class Step:
         volume: see `SourceRequest.volume`.
         read: how to read it.
         time: time of the step and its unit, which may be ""; None where the file has none.
+        named: "step" and "stem" of its input (`frame_facts`).
     """
 
     name: str
     volume: str
     read: ReadOptions
     time: tuple[float, str] | None = None
+    named: Mapping[str, str] = field(default_factory=dict)
 
     def label(self) -> str:
         """Return name and time for a message."""
@@ -61,11 +63,11 @@ class Step:
         return f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
 
     def facts(self) -> dict[str, Any]:
-        """Return its time as entries of an index."""
+        """Return step, stem and time as entries of an index."""
         if self.time is None:
-            return {}
+            return {**self.named}
         value, unit = self.time
-        return {"time": value, **({"time_unit": unit} if unit else {})}
+        return {**self.named, "time": value, **({"time_unit": unit} if unit else {})}
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,9 @@ class FrameSeries(Batch):
         """List the frames; ``page`` limits the Gaussians of live frames."""
         from vvgt_cli.conversion.previous_frame import previous_frame
 
-        self._steps: Sequence[Step] = list_steps(request.source)
+        outputs = (request.output, request.report, request.preview)
+        timed = request.output is None or any("{time" in (name or "") for name in outputs)
+        self._steps: Sequence[Step] = list_steps(request.source, timed)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
@@ -153,6 +157,10 @@ class FrameSeries(Batch):
         self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
         self.request = replace(request, source=source)
         self.facts = {"empty": [k for k, dark in enumerate(self._dark) if dark]}
+
+    def places(self, stem: str) -> dict[str, Any]:
+        """Return step, time and stem of a frame, as far as its input states them."""
+        return self._steps[int(stem)].facts()
 
     def sources(self) -> list[SourceRequest]:
         """Return the request of each frame, with what all share once that is prepared."""
@@ -337,8 +345,8 @@ def _functions(
     return shown, unit_distance(source.unit_distance, frames.grid, given)
 
 
-def list_steps(source: SourceRequest) -> list[Step]:
-    """List the files of a glob, or the time steps of a single file.
+def list_steps(source: SourceRequest, timed: bool = False) -> list[Step]:
+    """List the files of a glob, whose times are looked for if ``timed``, or the time steps of a single file.
 
     Raises:
         UsageError: the glob matches nothing.
@@ -351,13 +359,29 @@ def list_steps(source: SourceRequest) -> list[Step]:
             "a file with several time steps"
         )
     if len(files) > 1:
-        return [Step(file.name, str(file), source.read) for file in files]
+        named = frame_facts(list(map(str, files)))
+        times = [_stated_time(str(file), source.read) if timed else None for file in files]
+        return [Step(f.name, str(f), source.read, t, n) for f, t, n in zip(files, times, named, strict=True)]
     volume = str(files[0]) if files else source.path
     name = Path(volume).name
-    times = _times(volume, source.read)
+    times, facts = _times(volume, source.read), frame_facts([volume])[0]
     if len(times) == 1:
-        return [Step(name, volume, source.read)]
-    return [Step(f"{name} time {k}", volume, replace(source.read, time=k), time) for k, time in enumerate(times)]
+        time = _stated_time(volume, source.read) if timed else None
+        return [Step(name, volume, source.read, time, facts)]
+    return [
+        Step(f"{name} time {k}", volume, replace(source.read, time=k), time, {**facts, "step": str(k)})
+        for k, time in enumerate(times)
+    ]
+
+
+def _stated_time(volume: str, read: ReadOptions) -> tuple[float, str] | None:
+    """Return the time of a file of one step and its unit, None where it states none."""
+    from vvgt_cli.volume.vtk.xml import time_value
+
+    if os.path.isfile(volume) and (value := time_value(Path(volume))) is not None:
+        return value, ""
+    times = _times(volume, read)
+    return times[0] if len(times) == 1 else None
 
 
 def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:

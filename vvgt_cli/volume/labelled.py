@@ -180,7 +180,7 @@ def labelled_volume(
         field = np.transpose(values, order)
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
-    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes)
+    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes, _time(axes, options))
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -309,11 +309,17 @@ def _stored(value: Any) -> list[Any]:
     return [] if found.dtype.kind not in "iuf" else found.tolist()
 
 
-def _named(volume: Volume, attributes: Mapping[str, Any]) -> Volume:
-    """Return the volume with the name and unit that the attributes give its values, as CF has them."""
+def _time(axes: Sequence[Axis], options: ReadOptions) -> tuple[float, str] | None:
+    """Return the coordinate along the axis of time, and its unit, None where there is none."""
+    stated = (a for a in axes if a.role == "t" and a.centres is not None and (options.time or 0) < a.size)
+    return next(((float(a.centres[options.time or 0]), a.units) for a in stated if a.centres is not None), None)
+
+
+def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str] | None) -> Volume:
+    """Return the volume with its time, and the name and unit that attributes give its values, as CF has them."""
     long, standard, unit = (_text(attributes.get(key, "")) for key in NAMING)
     bare = unit in ("1", "none", "unitless", "dimensionless")
-    return replace(volume, quantity=long or standard, value_unit="" if bare else unit)
+    return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time)
 
 
 def _text(value: Any) -> str:
@@ -398,7 +404,7 @@ def _left(
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
-    return _named(volume, attributes)
+    return _named(volume, attributes, _time(axes, options))
 
 
 def _descends(a: Axis, source: str) -> bool:

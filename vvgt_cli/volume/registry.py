@@ -108,12 +108,12 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
 def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | None]:
     """List time and unit of each step where ``options`` choose none, None without times; errors are `read_volume`'s."""
     try:
-        read_volume(source, options)
+        volume = read_volume(source, options)
     except SeveralSteps as error:
         if not error.times:
             return [None] * error.steps
         return [(float(time), error.unit) for time in error.times]
-    return [None]
+    return [volume.time]
 
 
 def contents(source: str, options: ReadOptions) -> dict[str, Any]:

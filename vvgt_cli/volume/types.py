@@ -70,6 +70,7 @@ class Volume:
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
         value_unit: unit of the values; "" unknown.
+        time: time that the values are of, and its unit, which may be ""; None unknown.
         unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
 
     Raises:
@@ -91,6 +92,7 @@ class Volume:
     modality: str = ""
     quantity: str = ""
     value_unit: str = ""
+    time: tuple[float, str] | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""

@@ -24,10 +24,11 @@ from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array, selected_dtype
 from vvgt_cli.volume.headers import printable, type_of
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
+from vvgt_cli.volume.vtk import xml_kind
 from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
@@ -193,6 +194,22 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     values = image_values(found, info, grid, options, path)
     place = options.spacing_or(grid.spacing), grid.origin, grid.direction
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
+
+
+def time_value(path: Path) -> float | None:
+    """Return the time that a VTK XML file of one dataset states (TimeValue), None of any other file."""
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+    from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
+
+    with open(path, "rb") as file:
+        if xml_kind(file.read(HEAD_BYTES)) is None:
+            return None
+    with quiet_vtk():
+        reader = vtkXMLGenericDataObjectReader()
+        reader.SetFileName(str(path))
+        reader.UpdateInformation()
+    times = list(reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or [])
+    return float(times[0]) if len(times) == 1 else None
 
 
 def image_values(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
