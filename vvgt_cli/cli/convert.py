@@ -89,10 +89,9 @@ def command(
     FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
     For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply or FOLDER has a placeholder: {}
-    or {:04d} for the frame's number, {step} for the number in its file's name or of its time step, {time} for the time
-    that the file states, {stem} for the file's name. All frames share one function and value range; run the command again to resume. A name
-    ending in .html without a placeholder makes one page of all frames, functions or labels, one in .glb, .usdc or .usdz
-    one file with a node for each function or label.
+    or {:04d} for the frame's number, {step}, {time} or {stem} (name) of its input. All frames share one function and
+    value range; run the command again to resume. A name ending in .html without a placeholder makes one page of all
+    frames, functions or labels, one in .glb, .usdc or .usdz one file with a node for each function or label.
 
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
@@ -101,8 +100,7 @@ def command(
       vvgt convert huge.zarr -o huge/lod-meta.json --max-gaussians 10000000
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
-      vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
-      vvgt convert flow.nc -o 'flow_{time}.ply'
+      vvgt convert 'run_*.vti' --tf tf.json -o 'out_{step}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert four.nii -o four.html
       vvgt convert cells.ome.tif --channel DAPI,GFP --time 0 -o cells.ply
