@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from pathlib import Path
 
 import nibabel as nib
@@ -16,6 +17,7 @@ import vvgt_cli as library
 from tests.headers import uncertified
 from tests.processes import replaced
 from tests.test_streamed import contents as files_in
+from vvgt_cli.cli import main
 from vvgt_cli.conversion.frames import merge_statistics
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, frame_facts, is_pattern, put_name
 from vvgt_cli.errors import UsageError
@@ -329,6 +331,51 @@ def test_outputs_keep_step_time_and_stem_of_their_inputs(vvgt, series: Path, sta
     assert isinstance(clouds, library.Clouds)
     clouds.save("lib_{step}_{time}.ply")
     assert sorted(path.name for path in series.glob("lib*.ply"))[0] == "lib_0050_0.05.ply"
+
+
+def test_a_note_of_all_frames_is_printed_once(vvgt, series: Path, monkeypatch) -> None:
+    """Whether it is a warning of a reader or a message of a conversion, and of functions and layers too."""
+    monkeypatch.chdir(series)
+    monkeypatch.setattr(warnings, "showwarning", main._note)  # as `main.main` does
+    sheared, loud = np.eye(4), SMALL[:-1]
+    sheared[0, 1] = 0.3
+    for k in (1, 2, 3):
+        image = pyvista.ImageData(dimensions=(9, 8, 7))
+        image["v"], image["w"] = np.random.default_rng(k).random((2, 504))
+        image.set_active_scalars("v")
+        image.save(f"two_{k}.vti")
+        nib.save(nib.Nifti1Image(np.random.default_rng(k).random((9, 8, 7)).astype("f4"), sheared), f"s_{k}.nii")
+    how = ("--tf", "gray", "--steps", 0, *loud)
+    for call, text, first in (
+        (("two_*.vti", "-o", "out/{}.ply"), "--array takes another: w", "two_1.vti"),
+        (("two_*.vti", "-o", "a.html"), "--array takes another: w", "two_1.vti"),
+        (("two_1.vti", "--layer", "two_2.vti", "--layer", "two_3.vti", "-o", "b.ply"), "--array takes", "two_1.vti"),
+        (("s_*.nii", "-o", "out/s{}.ply", "--overwrite"), "index axes 73.3 degrees apart", "s_1"),
+        (("s_1.nii", "--tf", "hot", "--tf", "bone", "-o", "f_{}.ply"), "index axes 73.3 degrees apart", "s_1"),
+    ):
+        told = vvgt.ok("convert", *call, *how).err
+        assert (told.count(text), told.count(f"{first}: the same holds 3 times")) == (1, 1), told
+        for k in (1, 2, 3) if "{}.ply" in call[-1] and call[0] == "two_*.vti" else ():
+            assert f"frame {k} of 3" in told
+    assert "the same holds" not in vvgt.ok("convert", "s_1.nii", "-o", "c.ply", *how).err
+
+
+def test_a_function_that_fits_is_named_where_none_is_given(vvgt, series: Path, monkeypatch) -> None:
+    monkeypatch.chdir(series)
+    values = np.full((30, 30, 30), -1000, np.int16)
+    values[3:27, 3:27, 3:27], values[8:16, 8:16, 8:16] = 40, 900
+    for k in (1, 2):
+        noise = np.random.default_rng(k).integers(-9, 9, values.shape)
+        nib.save(nib.Nifti1Image((values + noise).astype(np.int16), np.diag([4, 4, 4, 1])), f"ct_{k}.nii")
+    small = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--overwrite")
+    said = "no look is given; --tf ct-bone is made for such data"
+    for call, count in (
+        *((("ct_1.nii",), 1), (("ct_1.nii", "--blocks", 16), 1), (("ct_*.nii",), 1)),
+        *((("ct_1.nii", "--tf", "gray"), 0), (("ct_1.nii", "--labels", "auto"), 0), (("ct_1.nii", "-q"), 0)),
+    ):
+        output = "out/{}.ply" if call[0] == "ct_*.nii" else "a.ply"
+        assert vvgt.ok("convert", *call, *small, "-o", output).err.count(said) == count, call
+    assert "tf             ct-bone" in vvgt("info", "ct_1.nii").out.decode()
 
 
 def test_statistics_together() -> None:

@@ -20,7 +20,7 @@ from vvgt_cli.cli.numbers import expand
 from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, leave, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, Once
 from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
 
@@ -33,6 +33,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE
 ALONE = 2.0  # seconds after which a process of a group of them tells of an error of its own
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DEBUG = "VVGT_TRACEBACK"
+noted = [Once()]  # warnings of the current run
 
 
 class LazyGroup(click.Group):
@@ -92,8 +93,10 @@ def _fail(message: str, code: int) -> int:
 
 
 def _note(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning as one line (replaces `warnings.showwarning`)."""
-    print(f"vvgt: note: {' '.join(str(message).split())}", file=sys.stderr)
+    """Print a warning as one line, once of all files of a command (replaces `warnings.showwarning`)."""
+    line = " ".join(str(message).split())
+    if noted[-1].first(line):
+        print(f"vvgt: note: {line}", file=sys.stderr)
 
 
 def _os_error(error: OSError) -> str:
@@ -118,6 +121,7 @@ def _stdout_fails() -> bool:
 def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
     received.clear()
+    noted[:] = [Once()]
     try:
         words, console = list(sys.argv[1:] if args is None else args), Console
         if words[:1] == ["--slicer"]:
@@ -127,6 +131,8 @@ def run(args: Sequence[str] | None = None) -> int:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
         with cli.make_context("vvgt", expand(words), obj=console) as context:
             cli.invoke(context)
+        for line in noted[-1].repeated():
+            print(f"vvgt: note: {line}", file=sys.stderr)
         sys.stdout.flush()
         return 0
     except BaseException as error:

@@ -52,7 +52,7 @@ from vvgt_cli.gaussians.formats.page_live import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
 from vvgt_cli.gaussians.targets import check_opened
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, Once
 from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
@@ -253,6 +253,8 @@ def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
     Raises:
         KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command converts it again.
     """
+    once, outer = Once(), console
+    console = replace(console, once=once)
     run = Run(console, ConversionReport("convert"))
     try:
         sink.open(batch, run)
@@ -261,6 +263,8 @@ def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
             if report.interrupted:
                 raise KeyboardInterrupt
             sink.take(batch, item, report, batch.previous.facts() if batch.previous else {})
+        for line in once.repeated():
+            outer.message(line)
         return sink.finish(batch, console)
     finally:
         sink.close()
