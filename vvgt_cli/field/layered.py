@@ -178,18 +178,8 @@ def open_content(source: str, read: ReadOptions) -> Content:
         colors = [(error.colors and error.colors[k]) or CHANNEL_COLORS[k % len(CHANNEL_COLORS)] for k in numbers]
         names = [error.names[k] for k in numbers] if error.names else []
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in zip(numbers, parts, strict=True))
-        return Content(
-            named,
-            False,
-            colors,
-            source,
-            overlapping,
-            None,
-            read.stored,
-            names,
-            numbers,
-            str(error) if by_default else None,
-        )
+        message = str(error) if by_default else None
+        return Content(named, False, colors, source, overlapping, None, read.stored, names, numbers, message)
     if several:
         volume = read_volume(source, read)  # the name of its one channel, or an error
     elif asked:
