@@ -269,10 +269,13 @@ def _dose_offset(source: Source, header: Any, k: int, normal: np.ndarray) -> np.
 
 
 def _tiles(mosaic: _Slice, n: int, stated: np.ndarray | None) -> Iterator[_Slice]:
-    """Yield the ``n`` slices of a mosaic; its position is that of a slice of its own size around the same centre."""
+    """Yield the ``n`` slices of a mosaic; its position is that of a slice of its own size around the same centre.
+
+    Tiles have whole pixels; what they do not fill on the right and below is padding (as nibabel and dcm2niix have it).
+    """
     header, edge = mosaic.header, math.ceil(math.sqrt(n))
     rows, columns = int(header.Rows), int(header.Columns)
-    if rows % edge or columns % edge:
+    if min(rows, columns) < edge:
         raise DataError(
             f"{mosaic.source}: a mosaic of {columns} x {rows} pixels with {n} slices; expected {edge} tiles a side"
         )
@@ -282,7 +285,7 @@ def _tiles(mosaic: _Slice, n: int, stated: np.ndarray | None) -> Iterator[_Slice
     step = float(header.get("SpacingBetweenSlices") or header.get("SliceThickness") or 0)
     if step <= 0:
         raise DataError(f"{mosaic.source}: a mosaic without SpacingBetweenSlices; expected it, or --spacing X Y Z")
-    shift = (columns - columns // edge) / 2 * mosaic.spacing[0], (rows - rows // edge) / 2 * mosaic.spacing[1]
+    shift = (columns - columns / edge) / 2 * mosaic.spacing[0], (rows - rows / edge) / 2 * mosaic.spacing[1]
     first = mosaic.position + np.array(shift) @ mosaic.rows
     for k in range(n):
         yield replace(mosaic, frame=k, position=first + k * step * normal, tiles=edge)
@@ -398,5 +401,6 @@ def _decoded(one: _Slice) -> np.ndarray:
         values = apply_modality_lut(values, dataset)
     if one.tiles > 1:
         rows, columns = (n // one.tiles for n in values.shape[:2])
+        values = values[: rows * one.tiles, : columns * one.tiles]
         values = values.reshape(one.tiles, rows, one.tiles, columns).swapaxes(1, 2)
     return values
