@@ -291,6 +291,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "scaling": [volume.slope, volume.intercept],
         **({"modality": volume.modality} if volume.modality else {}),
         "range": [stats.lo, stats.hi],
+        **({"value_unit": volume.values_in} if volume.values_in else {}),
         "nan": stats.nan_count,
         "inf": stats.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},

@@ -46,8 +46,11 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
+    scheme = "-" if source == "-" else source.partition(":")[0]
+    if options.time is not None and scheme in {"-", *SCHEMES} - STEPPED:
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
+    if options.suv is not None and scheme in {"-", *SCHEMES}:
+        raise UsageError(f"{source}: no DICOM PET; leave out --suv {options.suv}")
     if (options.crop, options.mask, options.keep_largest) != (None, None, None):
         options = replace(options, packed=False)
     return cut(in_space(_read(source, options), options.space), options)
@@ -267,6 +270,8 @@ def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
             f"{source}: a {reader.name} file, which has no known time steps; leave out --time {options.time} (along a "
             "fourth axis of any kind --component N chooses)"
         )
+    if options.suv is not None and "suv" not in reader.takes:
+        raise UsageError(f"{source}: a {reader.name} file, no DICOM PET; leave out --suv {options.suv}")
     if options.array is not None and "array" not in reader.takes:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"
