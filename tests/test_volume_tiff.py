@@ -270,8 +270,23 @@ def test_a_copy_is_read_itself_and_a_foreign_name_is_said(tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_volume(str(tmp_path / "new.ome.tif")).data, VALUES[0, 0])
     (tmp_path / "old.ome.tif").unlink()
     xml_of(tmp_path / "new.ome.tif", '<OME UUID="urn:uuid:0"', '<OME UUID="urn:uuid:8"')
-    with pytest.warns(UserWarning, match="names old.ome.tif, which is not beside it; its own pages are read"):
+    with pytest.warns(UserWarning, match="names old.ome.tif, which is not here; its own pages are read"):
         np.testing.assert_array_equal(read_volume(str(tmp_path / "new.ome.tif")).data, VALUES[0, 0])
+
+
+def test_images_of_the_xml_without_pages_leave_the_others_their_sizes(tmp_path: Path) -> None:
+    pixels = f'<Pixels DimensionOrder="XYZCT" Type="uint16" SizeX="{X}" SizeY="{Y}" SizeZ="{Z}" SizeC="1" SizeT="1" '
+    images = [
+        f'<Image Name="{name}">{pixels}PhysicalSizeX="{size}" PhysicalSizeY="2" PhysicalSizeZ="3"><TiffData IFD="{at}" '
+        f'PlaneCount="{Z}"/></Pixels></Image>' for name, size, at in (("far", 9, 100), ("near", 1, 0))
+    ]  # fmt: skip
+    for name, read in (("near", True), ("far", False)):
+        xml = f"<OME>{images[0]}{images[1].replace('near', name)}</OME>"
+        tifffile.imwrite(tmp_path / "a.ome.tif", VALUES[0, 0], description=xml, metadata=None)
+        if read:
+            assert read_volume(str(tmp_path / "a.ome.tif")).spacing == (1, 2, 3)
+        else:
+            refused(DataError, "OME-XML of 2 images, pages of 1", read_volume, str(tmp_path / "a.ome.tif"))
 
 
 @pytest.mark.parametrize(

@@ -30,15 +30,8 @@ _HALVES = 10  # half-lives after which a scan is no scan of that dose
 def in_suv(slices: list[Any], headers: list[Any], wanted: str | None, path: Path) -> tuple[list[Any], str]:
     """Return slices whose ``scaling`` gives SUV by body weight, and the unit of their values.
 
-    Args:
-        slices: with ``header`` and ``scaling``.
-        headers: of all images of their series.
-        wanted: ``none`` keeps the values as they are; None keeps them where a header does not state enough.
-        path: for messages.
-
-    Raises:
-        DataError: SUV are ``wanted``, and a header does not state enough.
-        UsageError: no PET.
+    ``headers`` are of the whole series. Values stay as stored if ``wanted`` is ``none``, and, with a message, if a
+    header lacks something; raise DataError for that if it is ``bw``, and UsageError for either without PET.
     """
     first = slices[0].header
     if first.get("Modality") != "PT":
@@ -46,21 +39,22 @@ def in_suv(slices: list[Any], headers: list[Any], wanted: str | None, path: Path
             raise UsageError(f"{path}: no PET, but {printable(str(first.get('Modality')))}; leave out --suv {wanted}")
         return slices, ""
     unit = _UNITS.get(first.get("Units"), "")
-    if wanted == "none" or (wanted is None and not unit):
+    if wanted == "none" or (wanted is None and first.get("Units") and not unit):
         return slices, unit
+    earliest = min(headers, key=lambda header: _acquired(header) or datetime.max)
     try:
-        factors = [_factor(s.header, headers) for s in slices]
+        factors = [_factor(s.header, earliest) for s in slices]
     except ValueError as why:
         text = f"{path}: no SUV, for want of {why}"
         if wanted is not None:
             raise DataError(f"{text}; expected it in the header: leave out --suv {wanted}") from None
-        warnings.warn(f"{text}; values stay in {unit}", stacklevel=3)
+        warnings.warn(f"{text}; values stay {f'in {unit}' if unit else 'as stored'}", stacklevel=3)
         return slices, unit
     return [replace(s, scaling=(s.scaling[0] * f, s.scaling[1] * f)) for s, f in zip(slices, factors, strict=True)], SUV
 
 
-def _factor(header: Any, headers: list[Any]) -> float:
-    """Return SUV per value; raise ValueError that names what a header lacks for it."""
+def _factor(header: Any, earliest: Any) -> float:
+    """Return SUV per value; raise ValueError that names what a header, or the ``earliest`` of its series, lacks."""
     units, scale = header.get("Units"), 1.0
     if units == "GML" and header.get("SUVType") in (None, "", "BW"):
         return 1.0
@@ -80,13 +74,12 @@ def _factor(header: Any, headers: list[Any]) -> float:
     }  # fmt: skip
     if lacking := [key for key, there in stated.items() if not there]:
         raise ValueError(", ".join(lacking))
-    decayed = 0.0 if start == "ADMIN" else _decay(injected, half, headers) / half
+    decayed = 0.0 if start == "ADMIN" else _decay(injected, half, earliest) / half
     return float(scale * 1000 * weight / (dose * 2.0**-decayed))
 
 
-def _decay(injected: Any, half: float, headers: list[Any]) -> float:
+def _decay(injected: Any, half: float, first: Any) -> float:
     """Return the seconds from injection to the start of the scan, to which images are corrected; raise ValueError."""
-    first = min(headers, key=lambda h: _acquired(h) or datetime.max)
     acquired, scan = _acquired(first), _time(first.get("SeriesDate"), first.get("SeriesTime"))
     if scan is None or (acquired is not None and scan > acquired):  # of a series that was made later
         private = first.get((0x0009, 0x100D))

@@ -9,7 +9,7 @@ import math
 import re
 import struct
 import warnings
-from collections import defaultdict
+from collections import Counter
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -76,46 +76,36 @@ def _description(path: Path) -> str:
     import tifffile
 
     if not path.name.lower().endswith(TIFF):
-        with path.open("rb") as text:
-            return text.read(_MOST_BYTES).decode("utf-8-sig", "replace")
+        return path.read_bytes()[:_MOST_BYTES].decode("utf-8-sig", "replace")
     check_pages(path)
     with tifffile.TiffFile(path) as file:
         return str(file.ome_metadata or "")
 
 
 def _name_files(root: ElementTree.Element, path: Path, uuid: str | None) -> None:
-    """Change the files that OME-XML names for planes to their present names, and UUIDs to the same names.
+    """Change files and UUIDs of planes to the present names of files; ``uuid`` is that of the file at ``path``.
 
-    Args:
-        root: of the XML.
-        path: the file to be read.
-        uuid: its UUID, if it states one.
-
-    Raises:
-        DataError: files that are missing, or in other folders.
+    Raise DataError for files that are missing, or in other folders.
     """
     planes = [element for element in root.iter() if ome_tag(element) == "UUID"]
-    named = defaultdict[str, set[str]](set)  # by UUID
-    for plane in planes:
-        named[plane.text or ""].add(plane.get("FileName", ""))
-    if sum(map(len, named.values())) > _MOST_FILES:
-        raise DataError(f"{path}: OME-XML of {len(named)} files; expected at most {_MOST_FILES}")
-    if len(named) == 1 and not uuid:  # all planes are in one file, which is this one
-        uuid = next(iter(named))
-    pairs = [(key, name) for key, names in named.items() for name in sorted(names)]
+    pairs = sorted({(plane.text or "", plane.get("FileName", "")) for plane in planes})
+    if len(pairs) > _MOST_FILES:
+        raise DataError(f"{path}: OME-XML of {len(pairs)} files; expected at most {_MOST_FILES}")
+    names = Counter(key for key, _ in pairs)  # of a UUID: of several one is wrong
+    uuid = uuid or (pairs[0][0] if len(names) == 1 else None)  # all planes are in one file, which is this one
+    others: dict[str, str] | None = None
     present: dict[tuple[str, str], str] = {}
     for key, name in pairs:
-        own = name == path.name or (key == uuid and len(named[key]) == 1)
-        if own or _is_beside(path, name):
-            present[key, name] = path.name if own else name
-    lost = [pair for pair in pairs if pair not in present]
-    by_uuid = _uuids(path.parent) if lost else {}
-    present |= {(key, name): by_uuid[key] for key, name in lost if key in by_uuid and len(named[key]) == 1}
-    missing = [name or key for key, name in lost if (key, name) not in present]
+        if name == path.name or (key == uuid and names[key] == 1):
+            present[key, name] = path.name
+        elif _is_beside(path, name):
+            present[key, name] = name
+        else:
+            others = _uuids(path.parent) if others is None else others
+            present[key, name] = others.get(key, "") if names[key] == 1 else ""
+    missing = [name or key for (key, name), file in present.items() if not file]
     if len(pairs) == len(missing) == 1:
-        warnings.warn(
-            f"{path}: its OME-XML names {missing[0]}, which is not beside it; its own pages are read", stacklevel=4
-        )
+        warnings.warn(f"{path}: OME-XML names {missing[0]}, which is not here; its own pages are read", stacklevel=4)
         present[pairs[0]] = path.name
     elif missing:
         which = f"file {missing[0]}, which is" if len(missing) == 1 else f"files {listed(missing, ', ', 3)}, which are"

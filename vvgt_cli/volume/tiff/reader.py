@@ -304,7 +304,7 @@ def ome_facts(root: ElementTree.Element, series: int, name: str, count: int, pat
 
     Raise DataError where several images, or none, have that name.
     """
-    images = [(image.get("Name"), p) for image in root if ome_tag(image) == "Image" for p in image]
+    images = [(image.get("Name", ""), p) for image in root if ome_tag(image) == "Image" for p in image]
     images = [(title, p) for title, p in images if ome_tag(p) == "Pixels"]
     if len(images) != count:
         named = [(title, p) for title, p in images if title == name]
