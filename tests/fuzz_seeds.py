@@ -110,6 +110,17 @@ def inviwo() -> list[Seed]:
     return [Seed("a.dat", text, READ, beside), Seed("b.dat", series, volume_reader(component=2), beside)]
 
 
+def vgi() -> list[Seed]:
+    text = (
+        b"{volume1}\n[representation]\nsize = 5 4 3\n[file1]\nSkipHeader = 2\nFileFormat = raw\nSize = 5 4 2\n"
+        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n[file2]\nSize = 5 4 1\n"
+        b"Name = w.raw\nDatatype = signed integer\nBitsPerElement = 16\n{volumeprimitive1}\n[geometry]\n"
+        b"resolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
+    )
+    beside = {"v.raw": b"xx" + VALUES[:2].tobytes(), "w.raw": VALUES[2:].tobytes()}
+    return [Seed("a.vgi", text, READ, beside)]
+
+
 def slc() -> list[Seed]:
     head = b"11111\n5 4 3 8\n1.0 2.0 3.0\n1 0 0\n%d\n2 2 X" + bytes(12)
     values = VALUES.astype(np.uint8)
@@ -380,7 +391,8 @@ def readers() -> dict[str, list[Seed]]:
     from fuzz_seeds_scans import scans
 
     return {
-        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), **scans(), **hospital(),
+        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), "VGStudio": vgi(), **scans(),
+        **hospital(),
         "SLC": slc(), "TIFF": tiff(), "VTK legacy": vtk_legacy(), "VTK XML": vti(), "OpenVDB": vdb(),
         "NumPy": numpy_files(), "transfer function": transfer(), "colour map": colormaps(),
         "label table": label_tables(), "Gaussians": ply(), "Gaussians of others": others(), "SOG": sog(),

@@ -75,6 +75,10 @@ _READ = dict(
     time=click.option(
         "--time", type=click.IntRange(0), metavar="N", help="Time step, or volume of a DICOM series, to read, from 0."
     ),
+    suv=click.option(
+        "--suv", type=click.Choice(["bw", "none"]),
+        help="PET (DICOM) as SUV by body weight, or as stored. Default: bw where the file states weight and dose.",
+    ),
     crop=click.option(
         "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1",
         help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -27,7 +28,7 @@ from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.readers import SUFFIXES
+from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
 from vvgt_cli.volume import ReadOptions
@@ -44,6 +45,9 @@ _PLY = (b"ply\n", b"ply\r")
 LISTED = 50  # of several volumes in a file
 CHEAP = 64 << 20  # bytes of a volume whose range is looked for
 _HEAD = 65536  # bytes that tell a view set from a transfer function
+_FUNCTION = re.compile(
+    rb'RGBPoints|"(points|R|colorTransfer|volumeProperties)"|<(ColorMap|VolumeProperty|inviwo)', re.I
+)
 
 
 def machine_facts() -> dict[str, Any]:
@@ -101,7 +105,11 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(name)
-        return _transfer_function(file)
+        try:
+            return _transfer_function(file)
+        except DataError:
+            if name.suffix.lower() in OWN or _FUNCTION.search(head):
+                raise
     return _volume(file, read)
 
 
@@ -283,6 +291,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "scaling": [volume.slope, volume.intercept],
         **({"modality": volume.modality} if volume.modality else {}),
         "range": [stats.lo, stats.hi],
+        **({"value_unit": volume.values_in} if volume.values_in else {}),
         "nan": stats.nan_count,
         "inf": stats.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},

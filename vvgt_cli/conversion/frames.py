@@ -30,6 +30,7 @@ from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.tiff.pages import check_pages
 from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
@@ -225,12 +226,9 @@ def is_glob_of_volumes(path: str) -> bool:
 
 def _pages(path: Path) -> int:
     """Return the number of pages of a TIFF; 1 where it cannot be read, which is reported later."""
-    import tifffile
-
     try:
-        with tifffile.TiffFile(path) as file:
-            return len(file.pages)
-    except Exception:  # whatever a damaged file makes of it
+        return check_pages(path)
+    except (DataError, OSError):
         return 1
 
 

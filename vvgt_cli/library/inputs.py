@@ -188,6 +188,7 @@ class Reading(TypedDict, total=False):
     component: int | str | Sequence[int | str]
     time: int
     space: str
+    suv: str
     crop: str
     mask: Any
     keep_largest: float
@@ -395,7 +396,7 @@ def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
 
 
 def _array(values: Any, options: ReadOptions, origin: Sequence[float] | None, affine: Any, name: str) -> Volume:
-    chosen = [key for key in ("array", "component", "time") if getattr(options, key) is not None]
+    chosen = [key for key in ("array", "component", "time", "suv") if getattr(options, key) is not None]
     _refuse([*chosen, *options.raw_flags], "an array is one volume")
     if affine is not None and (options.spacing is not None or origin is not None):
         raise UsageError("affine: holds spacing and origin too; leave out those or the affine")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -84,6 +85,18 @@ class HeaderFields(dict[str, str]):
                 f"{self.name}: {key} is {text[:40]!r}; expected a type of numbers such as uchar, short, uint16 or float"
             )
         return found
+
+
+def fields_of_sections(path: Path) -> HeaderFields:
+    """Return the fields ``section/key`` of a text file, ``block/section/key`` behind a line ``{block}``."""
+    fields, block, section = HeaderFields(str(path)), "", ""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for line in map(str.strip, file.read(MAX_HEADER).splitlines()):
+            key, equals, value = line.partition("=")
+            block, section = (line.strip("{}") + "/", "") if line.startswith("{") else (block, section)
+            section = line.strip("[]").lower() if line.startswith("[") else section
+            fields.update({f"{block}{section}/{key.strip().lower()}": value.strip()} if equals else {})
+    return fields
 
 
 def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | None:

@@ -38,6 +38,8 @@ class ReadOptions:
             (`vvgt_cli.volume.blocks.Packed`).
         stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
         level: of a file with several resolutions (OME-Zarr), from 0, the finest.
+        suv: of DICOM PET, ``bw`` for SUV by body weight or an error, ``none`` for values as they are; None: SUV where
+            the file states enough.
 
     Raises:
         UsageError: a value out of its range.
@@ -58,6 +60,7 @@ class ReadOptions:
     packed: bool = False
     stored: bool = False
     level: int | None = None
+    suv: str | None = None
 
     def __post_init__(self) -> None:
         """Check the values one by one."""
@@ -78,6 +81,7 @@ class ReadOptions:
              "an index (0, 1, ...), a channel's name or magnitude"),
             ("keep-largest", self.keep_largest, math.isfinite(self.keep_largest or 0), "a finite data value"),
             ("level", self.level, (self.level or 0) >= 0, "full, or the number of a level (0, 1, ...)"),
+            ("suv", self.suv, self.suv in (None, "bw", "none"), "bw or none"),
             ("time", self.time, (self.time or 0) >= 0, "the index of a time step (0, 1, ...)"),
         ):  # fmt: skip
             if not good:

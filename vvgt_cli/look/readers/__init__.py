@@ -14,7 +14,8 @@ from vvgt_cli.look.readers.fields import load
 
 # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
 FORMATS = (paraview, minimal, slicer, inviwo, lut)
-SUFFIXES = (".json", ".xml", ".itf", ".vp", *lut.SUFFIXES)
+OWN = (".itf", ".vp", *lut.SUFFIXES)  # endings that nothing else has
+SUFFIXES = (".json", ".xml", *OWN)
 __all__ = ["read_transfer_function"]
 
 

@@ -30,7 +30,7 @@ from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
 from vvgt_cli.volume.vtk import xml_kind
 from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
-from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
@@ -335,9 +335,7 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
         image = reader.GetOutput()
         data = image.GetPointData() if info.where == "point" else image.GetCellData()
         array = data.GetArray(info.name) if info.name else data.GetArray(0)
-        error = message()
-    if error or reader.GetErrorCode() or array is None:
-        raise DataError(f"{path}: VTK cannot read array {info.name!r} ({error or 'no message'}); is the file whole?")
+        checked(array, reader, message, path, f"array {info.name!r}")
     values = vtk_to_numpy(array)
     if values.size != count(shape):
         raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")
