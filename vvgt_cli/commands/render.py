@@ -178,7 +178,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     if not isinstance(given, SourceRequest):
         return _render(run, request, given)
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
-    if not over_time and not is_glob_of_volumes(given.path):
+    if not over_time and not is_glob_of_volumes(given):
         try:
             return _render(run, request, [given])
         except SeveralSteps:  # which are the frames
