@@ -136,10 +136,8 @@ def check_lengths(first: Volume, other: Volume) -> None:
 
 def _content(source: SourceRequest, stored: bool) -> Content:
     """Return the content of the map's file, or the map itself."""
-    if not isinstance(source.volume, str):
-        return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
-    return open_content(source.path, read)
+    return open_content(source.path, read) if isinstance(source.volume, str) else content_of(source.volume)
 
 
 def _parts(

@@ -122,8 +122,8 @@ class LabelTable:
         numbers = [label.number for label in self.labels]
         if sorted(set(numbers)) != numbers:
             pairs = pairwise(sorted(self.labels, key=lambda label: label.number))
-            twice = next((f"label {a.number} twice ({a.name}, {b.name})" for a, b in pairs if a.number == b.number), "")
-            raise DataError(f"{self.name}: {twice or 'labels in no order'}; expected each label once")
+            twice = next((f"{a.number} twice ({a.name}, {b.name})" for a, b in pairs if a.number == b.number), "order")
+            raise DataError(f"{self.name}: label {twice}; expected each label once")
 
     @cached_property
     def _numbers(self) -> np.ndarray:

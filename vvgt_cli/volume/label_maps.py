@@ -56,7 +56,7 @@ def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in
     """
     if volume.segments is not None or not named_so(volume):
         return volume.segments is not None
-    most = 2 if NAMED.search(volume.name)[0].lower() == "mask" else FEW  # a masked scan is no label map
+    most = 2 if "mask" in map(str.lower, NAMED.findall(volume.name)) else FEW  # a masked scan is no label map
     middle = len(volume.data) // 2
     first = volume.slope * np.unique(volume.data[middle : middle + 1]) + volume.intercept  # one slice decides for most
     try:
