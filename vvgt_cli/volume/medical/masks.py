@@ -126,7 +126,7 @@ def _formed(source: Path, files: Sequence[Path], dates: Sequence[int], options: 
     text = f"{source}: {len(files)} binary masks are read as one label map, named by the files"
     for which, what in ((sizes == 0, "empty, and left out"), (shared > 0, "in several: voxels go to the smaller one")):
         if which[1:].any():
-            text += f"; {listed([volume_name(files[k]) for k in np.flatnonzero(which[1:])], ', ')}: {what}"
+            text += f"; {listed([volume_name(files[int(k)]) for k in np.flatnonzero(which[1:])], ', ')}: {what}"
     warnings.warn(f"{text} (as --layer each, they add up; a glob with --labels none: frames of a series)", stacklevel=2)
     labels.flags.writeable = False
     name = (source if source.is_dir() else files[0].parent).resolve().name or "masks"
