@@ -304,7 +304,7 @@ def colormaps() -> list[Seed]:
 
 
 def label_tables() -> list[Seed]:
-    from test_labels import FREESURFER, JSON, SEGMENTS, SLICER, SNAP
+    from test_labels import CATEGORICAL, DECATHLON, FREESURFER, JSON, NAMES, NNUNET, SEGMENTS, SLICER, SNAP
     from test_look_tables import BIDS, FASTSURFER, ROWS, SLICER_CSV
 
     from vvgt_cli.look.label_files import read_labels
@@ -322,7 +322,36 @@ def label_tables() -> list[Seed]:
         Seed("b.csv", SLICER_CSV.replace("lung,", "lung").replace(",", ";").encode("utf-8-sig"), read),
         Seed("dseg.tsv", BIDS.encode(), read),
         Seed("f.tsv", FASTSURFER.encode(), read),
+        *(Seed("b.json", json.dumps(one).encode(), read) for one in (NNUNET, DECATHLON, {"total": NAMES}, CATEGORICAL)),
     ]
+
+
+def label_headers() -> list[Seed]:
+    """Tables in the headers of label maps: whole files, and the tables alone."""
+    import test_masks as made
+
+    from vvgt_cli.look.label_files import labels_of
+    from vvgt_cli.volume.medical.mgh import table_entries
+    from vvgt_cli.volume.segments import segments_in, segments_of_xml
+
+    def files(path: Path) -> list[Seed]:
+        read = lambda path: labels_of(read_volume(str(path)).segments or (), "x")  # noqa: E731
+        packed = {name: gzip.decompress(Path(make(path)).read_bytes()) for name, make in made.PACKED.items()}
+        seeds = [Seed(name, data, read, pack=gzip.compress) for name, data in packed.items()]
+        made.ome(path, place="a")
+        store = {p.relative_to(path / "x.zarr" / "a").as_posix(): p for p in (path / "x.zarr" / "a").rglob("*")}
+        inside = {name: p.read_bytes() for name, p in store.items() if p.is_file()}
+        attributes = inside.pop(".zattrs")
+        seeds.append(Seed(".zattrs", attributes, lambda path: read(path.parent), inside))
+        return [*seeds, Seed("x.am", Path(made.am(path)).read_bytes(), read)]
+
+    def alone(path: Path) -> None:
+        data = path.read_bytes()
+        parse = segments_of_xml if path.suffix == ".xml" else table_entries
+        labels_of(segments_in(lambda: parse(data), "x"), "x")
+
+    with tempfile.TemporaryDirectory() as folder:
+        return [*files(Path(folder)), Seed("x.xml", made.CARET.encode(), alone), Seed("x.bin", made.TABLE[8:], alone)]
 
 
 def cameras() -> list[Seed]:
@@ -395,7 +424,8 @@ def readers() -> dict[str, list[Seed]]:
         **hospital(),
         "SLC": slc(), "TIFF": tiff(), "VTK legacy": vtk_legacy(), "VTK XML": vti(), "OpenVDB": vdb(),
         "NumPy": numpy_files(), "transfer function": transfer(), "colour map": colormaps(),
-        "label table": label_tables(), "Gaussians": ply(), "Gaussians of others": others(), "SOG": sog(),
+        "label table": label_tables(), "label header": label_headers(), "Gaussians": ply(),
+        "Gaussians of others": others(), "SOG": sog(),
         "view set": cameras(), "model card": model_card(), "manifest of views": manifest(),
         "checkpoint": checkpoint(),
     }  # fmt: skip

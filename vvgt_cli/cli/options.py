@@ -113,8 +113,8 @@ LABELS = dict(
     labels=click.option(
         "--labels", metavar="TABLE|auto|none",
         help="Treat VOLUME as a label map coloured by TABLE (3D Slicer, ITK-SNAP, FreeSurfer, CSV, TSV, .seg.nrrd, "
-        "DICOM SEG, JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name "
-        "and type.",
+        "DICOM SEG, JSON, dataset.json, ParaView); 'auto' takes its own names and colours, or assigns distinct ones, "
+        "'none' treats it as scalars. Default: detected from header, name and values.",
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",

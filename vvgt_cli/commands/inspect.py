@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,8 +26,8 @@ from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_live import VALUES_ID
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
-from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.label_files import is_table, labels_of, read_labels
+from vvgt_cli.look.labels import Label
 from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
@@ -164,11 +164,12 @@ def _transfer_function(file: str) -> dict[str, Any]:
 
 def _table(file: str) -> dict[str, Any]:
     table = read_labels(file)
-    return {"kind": "table of labels", "name": table.name, "labels": len(table.labels), "entries": _entries(table)}
+    entries = _entries(table.labels)
+    return {"kind": "table of labels", "name": table.name, "labels": len(entries), "entries": entries}
 
 
-def _entries(table: LabelTable) -> list[dict[str, Any]]:
-    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in table.labels]
+def _entries(labels: Sequence[Label]) -> list[dict[str, Any]]:
+    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in labels]
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
@@ -265,11 +266,8 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         kinds |= {"channels": len(content.volumes), "choices": _channels(content)}
     elif not isinstance(volume.data, Packed) and recognised(volume):
         kinds["label_map"] = True
-    if holds_table(content.path) and not content.overlapping:
-        kinds["label_map"] = True
-        with suppress(DataError):  # a header that says less of its segments than colours need
-            one = content.layer
-            kinds["segments"] = _entries(read_labels(file) if one is None else segments_of(file, one))
+    if named := [label for one in content.volumes for label in labels_of(one.segments or (), one.name)]:
+        kinds["segments"] = _entries(named)
     stats = statistics(volume)
     return {
         "kind": "volume",

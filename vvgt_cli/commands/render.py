@@ -182,7 +182,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     if not isinstance(given, SourceRequest):
         return _render(run, replace(request, facts=frame_facts(given)), given)
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
-    if not over_time and not is_glob_of_volumes(given.path):
+    if not over_time and not is_glob_of_volumes(given):
         try:
             return _render(run, replace(request, facts=frame_facts([given.path])), [given])
         except SeveralSteps:  # which are the frames

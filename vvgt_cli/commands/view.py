@@ -114,7 +114,7 @@ def _is_series(source: SourceRequest) -> bool:
 
     if source.path == STDIN or is_splats(source.path) or is_streamed(source.path):
         return False
-    return is_glob_of_volumes(source.path) or (
+    return is_glob_of_volumes(source) or (
         os.path.isfile(source.path) and source.read.time is None and len(list_steps(source)) > 1
     )
 

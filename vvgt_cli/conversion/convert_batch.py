@@ -309,7 +309,7 @@ def convert_files(
         request = replace(request, blocks=request.blocks or BlockOptions())
     if dry_run:
         return plan_conversion(request, console).text()
-    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
+    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source)):
         try:
             _to_file(request, console)
             return None
@@ -377,12 +377,11 @@ def convert_to_memory(
     kind = FUNCTIONS if as_clouds else LABELS if split_labels else ONE
     for one in [LAYERS if kind == LABELS and request.source.layers else kind, *([LIVE] if request.live else [])]:
         check_options(one, used)
-    path = request.source.volume
-    if kind == ONE and not (isinstance(path, str) and is_glob_of_volumes(path)):
+    if kind == ONE and not is_glob_of_volumes(request.source):
         try:
             return convert_in_memory(request, console, None if after is None else PreviousLook(after))
         except SeveralSteps:
-            if not isinstance(path, str):
+            if not isinstance(request.source.volume, str):
                 raise
     kind = FRAMES if kind == ONE else kind
     check_options(kind, used)

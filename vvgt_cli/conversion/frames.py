@@ -21,7 +21,7 @@ from vvgt_cli.field.layered import ALL, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
-from vvgt_cli.look.label_files import holds_table, table_for
+from vvgt_cli.look.label_files import table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
@@ -29,8 +29,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.tiff import SUFFIXES
-from vvgt_cli.volume.tiff.pages import check_pages
+from vvgt_cli.volume.medical.masks import hold_volumes, mask_files
 from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
@@ -214,22 +213,12 @@ def is_glob(path: str) -> bool:
     return bool(set(path) & set("*?[")) and not os.path.exists(path)
 
 
-def is_glob_of_volumes(path: str) -> bool:
-    """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
-    if not is_glob(path):
+def is_glob_of_volumes(source: SourceRequest) -> bool:
+    """Return whether a source is a glob of files that each hold a frame, and not slices of one volume, or masks."""
+    path = source.volume
+    if not isinstance(path, str) or not is_glob(path) or not hold_volumes(matching(path)):
         return False
-    files = matching(path)
-    if any(file.suffix.lower() not in SUFFIXES for file in files):
-        return True
-    return bool(files) and _pages(files[0]) > 1
-
-
-def _pages(path: Path) -> int:
-    """Return the number of pages of a TIFF; 1 where it cannot be read, which is reported later."""
-    try:
-        return check_pages(path)
-    except (DataError, OSError):
-        return 1
+    return source.labels == NO_LABELS or not mask_files(path)
 
 
 def survey(
@@ -259,7 +248,7 @@ def survey(
         first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.single_volume:
-            mapped = holds_table(content.path) or recognised(content.volumes[0])
+            mapped = recognised(content.volumes[0])
         if mapped and content.single_volume:
             found.update(labels_in(content.volumes[0]))
         stats.append([statistics(volume) for volume in content.classified])
@@ -280,27 +269,12 @@ def _without_values(volume: Volume) -> Volume:
 
 def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
     """Check that a frame has the grid and the components of the first."""
-    volume, grid = content.volumes[0], first.volumes[0]
-    if _grid(volume) != _grid(grid):
-        raise DataError(
-            f"{step.name}: {_grid_text(volume)}; expected the grid of {begin.name}, {_grid_text(grid)}: frames of one "
-            "series share it"
-        )
+    content.volumes[0].check_grid(step.name, first.volumes[0], begin.name, "frames of one series share it")
     if (len(content.volumes), content.color) != (len(first.volumes), first.color):
         raise DataError(
             f"{step.name}: components {len(content.volumes)}; expected the {len(first.volumes)} of {begin.name}: "
             "frames of one series share them"
         )
-
-
-def _grid(volume: Volume) -> tuple[Any, ...]:
-    return volume.dims, volume.spacing, volume.origin, volume.direction, volume.space
-
-
-def _grid_text(volume: Volume) -> str:
-    vectors = (volume.spacing, volume.origin, volume.direction)
-    numbers = (" ".join(f"{value:g}" for value in values) for values in vectors)
-    return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
 def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
@@ -335,7 +309,7 @@ def _functions(
     from vvgt_cli.look.resolve import parse_tf_range
 
     if frames.labels is not None and frames.first.single_volume:
-        table = table_for(source.labels or AUTO, frames.labels, "the series")
+        table = table_for(source.labels or AUTO, frames.labels, "the series", frames.grid.segments)
         return (table,), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))

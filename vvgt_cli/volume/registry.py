@@ -17,6 +17,7 @@ from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
@@ -153,9 +154,11 @@ def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
 
 
 def _slices(source: str, options: ReadOptions) -> Volume | None:
-    """Read a glob of slices; None where the source is none."""
+    """Read a glob of slices or masks; None where the source is none."""
     if not set(source) & set("*?[") or "\0" in source or os.path.exists(source):
         return None
+    if MASKS.holds is not None and MASKS.holds(Path(source)):
+        return MASKS.read(Path(source), options)
     from vvgt_cli.volume.tiff.slices import read_glob
 
     volume = read_glob(source, options)

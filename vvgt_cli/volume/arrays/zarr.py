@@ -8,6 +8,7 @@ unpickles.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import hex_color
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.types import Volume
 
 _CODECS = {
@@ -45,10 +47,27 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         array = _array(zarr, place)
         attributes = dict(array.attrs)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
-        return labelled_volume(
+        volume = labelled_volume(
             lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
             name_in(path, place), array.chunks,
         )  # fmt: skip
+        if (labels := _ome(place.parent).get("image-label")) is None:
+            return volume
+        return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
+
+
+def _segments(labels: dict[str, Any]) -> list[Segment]:
+    """Return the segments of OME-Zarr's ``image-label``: named by the first text of their properties."""
+    colors = {int(one["label-value"]): [v / 255 for v in one["rgba"]] for one in labels.get("colors") or []}
+    properties = {int(one["label-value"]): one for one in labels.get("properties") or []}
+    found = []
+    for number in colors.keys() | properties.keys():
+        named = {key: text for key, text in properties.get(number, {}).items() if isinstance(text, str)}
+        name = next((named[key] for key in ("name", "class", "label") if key in named), next(iter(named.values()), ""))
+        red, green, blue, opacity = colors.get(number, (0.0, 0.0, 0.0, None))
+        color = None if opacity is None else (red, green, blue)
+        found.append(Segment(number, name, color, opacity=opacity if number else 0.0))
+    return found
 
 
 def _array(zarr: Any, place: Path) -> Any:
@@ -196,11 +215,16 @@ def _axes(
     return axes
 
 
-def _multiscale(group: Path) -> dict[str, Any]:
-    """Return the first image of an OME-Zarr group; empty where it has none."""
+def _ome(group: Path) -> dict[str, Any]:
+    """Return the attributes of a group that OME-Zarr defines; from version 0.5 on they lie in ``ome``."""
     attributes = _attributes(group)
     inner = attributes.get("ome")
-    images = (inner if isinstance(inner, dict) else attributes).get("multiscales")
+    return inner if isinstance(inner, dict) else attributes
+
+
+def _multiscale(group: Path) -> dict[str, Any]:
+    """Return the first image of an OME-Zarr group; empty where it has none."""
+    images = _ome(group).get("multiscales")
     if isinstance(images, list) and images and isinstance(images[0], dict) and images[0].get("datasets"):
         return images[0]
     return {}
@@ -242,9 +266,7 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
 
 def _rendering(group: Path, count: int) -> tuple[tuple[str, ...], tuple[tuple[float, float, float] | None, ...]]:
     """Return names and RGB of the channels by the rendering settings (``omero``); none where their number differs."""
-    attributes = _attributes(group)
-    inner = attributes.get("ome")
-    omero = (inner if isinstance(inner, dict) else attributes).get("omero")
+    omero = _ome(group).get("omero")
     channels = omero.get("channels") if isinstance(omero, dict) else None
     if not isinstance(channels, list) or len(channels) != count or not all(isinstance(c, dict) for c in channels):
         return (), ()

@@ -20,9 +20,11 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, load_block, read_head
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.medical import NIFTI_MAGIC, byte_order, is_analyze, is_nifti
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.segments import segments_in, segments_of_xml
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
@@ -165,10 +167,18 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     The fourth is of components, too, where the intent is a vector. Where it is the only one beyond space, ``component``
     is taken for it in any case.
 
-    sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
+    sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume. An extension with a
+    table of labels in XML (Workbench, TotalSegmentator) gives its segments.
     """
     head, encoding = read_head(path, HEADER)
-    return _volume(parse_header(head, str(path)), path, encoding, options)
+    header = parse_header(head, str(path))
+    volume = _volume(header, path, encoding, options)
+    if header.offset <= HEADER + 4 or not header.single:
+        return volume
+    text = read_head(path, min(header.offset, MAX_HEADER))[0]
+    if not (table := re.search(rb"<LabelTable\b.*?</LabelTable>", text, re.DOTALL)):
+        return volume
+    return replace(volume, segments=segments_in(lambda: segments_of_xml(table[0]), str(path)))
 
 
 def _volume(header: Header, path: Path, encoding: str, options: ReadOptions) -> Volume:
