@@ -79,8 +79,8 @@ class Isosurfaces(TransferFunction):
                 nodes += [(x, TRANSLUCENT, color), (x + SHELL * (inner[0][0] - x), 0.0, color)]
             else:
                 nodes.append((x + inwards * half, 1.0, color))
-        x, y, colors = map(np.array, zip(*nodes, strict=True))
-        function = PiecewiseOpacity(x, y), ColorMap(x, colors)
+        at, opacity, colors = (np.array(column) for column in zip(*nodes, strict=True))
+        function = PiecewiseOpacity(at, opacity), ColorMap(at, colors)
         return TransferFunction(self.name, *function, opacity_unit_label=PER_VOXEL, lighting=self.lighting)
 
 
