@@ -20,7 +20,7 @@ SMALL = ("--max-gaussians", 100, "--size", 32)
 Z, Y, X = np.mgrid[-1:1:20j, -1:1:20j, -1:1:20j]
 R = np.sqrt(X**2 + Y**2 + Z**2)
 BALL = np.clip(1 - R, 0, None).astype(np.float32)  # 0 around it, 1 in the middle
-DISTANCE = (R - 0.95).astype(np.float32)  # most of the box is inside
+DISTANCE = (R - 1.1).astype(np.float32)  # most of the box is inside
 CHARGE = (np.exp(-8 * ((X - 0.4) ** 2 + Y**2 + Z**2)) - np.exp(-8 * ((X + 0.4) ** 2 + Y**2 + Z**2))).astype(np.float32)
 
 
@@ -56,7 +56,7 @@ def test_outer_surfaces_are_translucent_and_of_other_colours() -> None:
 
 
 def test_hounsfield_units_and_sigma() -> None:
-    body = np.where(R < 0.95, 40.0, -1000.0)  # tissue is the largest peak
+    body = np.where(R < 1.2, 40.0, -1000.0)  # tissue is the largest peak
     assert placed(body, "-600", hounsfield=True).opacity(np.array([-1000.0, 40])).tolist() == [0, 1]
     found = placed(BALL, "1.5sigma").breakpoints().mean()
     assert found == pytest.approx(BALL.mean() + 1.5 * BALL.std(), rel=0.01)
