@@ -95,7 +95,7 @@ def command(
 
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
-      vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
+      vvgt convert map.mrc --iso 3sigma -o map.ply --max-gaussians 50000 --steps 200
       vvgt convert head.nrrd --tf bone.json -o head.html --for quest --time-budget 60
       vvgt convert huge.zarr -o huge/lod-meta.json --max-gaussians 10000000
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5

@@ -8,6 +8,7 @@ import click
 
 from vvgt_cli.cli.options import (
     common_options,
+    iso_option,
     layer_looks_option,
     placed_read_options,
     tf_range_option,
@@ -23,6 +24,7 @@ from vvgt_cli.progress import Console
 @click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, places, values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
+@iso_option
 @layer_looks_option
 @tf_range_option
 @unit_distance_option

@@ -129,15 +129,36 @@ TF_HELP = (
 )
 
 
+def iso_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add ``--iso``, which gives the value of ``--tf``."""
+
+    @click.option(
+        "--iso", metavar="LEVEL[,COLOR]", multiple=True,
+        help="Show the isosurface at LEVEL, a data value or standard deviations above the mean (3sigma), instead of a "
+        "function (--tf). Repeatable: outer ones are translucent. ',above' or ',below' says which values are inside.",
+    )  # fmt: skip
+    @functools.wraps(function)
+    def wrapper(*args: Any, iso: tuple[str, ...], **kwargs: Any) -> Any:
+        from vvgt_cli.look.isosurfaces import with_levels
+
+        given = kwargs.get("optics", kwargs)
+        tf = with_levels(given["tf"], iso, given.get("labels"))
+        given["tf"] = (tf,) if given["tf"] == () and iso else tf
+        return function(*args, **kwargs)
+
+    return wrapper
+
+
 def optics_options(more: str = "", multiple: bool = False) -> Decorator:
     """Return the options of a look; ``--tf`` has ``more`` help, and several values if ``multiple``."""
-    return group(
+    options = group(
         "optics",
         tf=click.option("--tf", metavar="TF", multiple=multiple, help=TF_HELP + more),
         tf_range=tf_range_option,
         opacity_unit_distance=unit_distance_option,
         **LABELS,
     )
+    return lambda function: options(iso_option(function))
 
 
 tf_options = optics_options()

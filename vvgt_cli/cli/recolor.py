@@ -8,6 +8,7 @@ import click
 
 from vvgt_cli.cli.options import (
     common_options,
+    iso_option,
     layer_looks_option,
     output_option,
     overwrite_option,
@@ -25,6 +26,7 @@ from vvgt_cli.progress import Console
     "--tf", metavar="TF",
     help="Transfer function: a file or the name of a matplotlib colour map. Default: the file's own.",
 )  # fmt: skip
+@iso_option
 @output_option
 @click.option(
     "--labels", metavar="TABLE|auto",

@@ -70,14 +70,14 @@ class SourceRequest:
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
-    """Parse a layer, ``FILE[,tf=TF][,labels=TABLE][,component=N]...``, or raise UsageError."""
-    path, *rest = re.split(r",(?=[a-z]+=)", text)
+    """Parse a layer, ``FILE[,tf=TF][,iso=LEVEL][,labels=TABLE][,component=N]...``, or raise UsageError."""
+    path, *rest = re.split(r",(?=[a-z]+=)", text.replace(",iso=", ",tf=iso:"))
     given: dict[str, Any] = {}
     for part in rest:
         key, _, value = part.partition("=")
-        if key not in KEYS or not value or (KEYS[key] is int and not value.isdecimal()):
+        if key not in KEYS or key in given or not value or (KEYS[key] is int and not value.isdecimal()):
             raise UsageError(
-                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in KEYS)}"
+                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in ('iso', *KEYS))}"
             )
         given["component" if key == "channel" else key] = KEYS[key](value)
     if not path:
@@ -297,15 +297,14 @@ def load_all(
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # report its errors first
-    lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     stats = content.statistics if reused else access.statistics(volume)
     sources = []
-    for tf, lighting in zip(functions, lights, strict=True):
+    for tf in functions:
         whole = request.statistics[0] if request.statistics else stats
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
-            shown = from_histogram(whole, volume.hounsfield, volume.density)
+            shown = from_histogram(whole, volume.hounsfield, volume.density, volume.preset)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
                 f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
@@ -316,6 +315,7 @@ def load_all(
             check_visible(shown, stats)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if reused else None
+        lighting = request.light.lighting(shown.lighting, volume.space)
         sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 

@@ -18,6 +18,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, open_content
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
+from vvgt_cli.look.isosurfaces import with_levels
 from vvgt_cli.look.label_files import table_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
@@ -77,6 +78,7 @@ class Look:
             of the function or label table (of the first layer), which presets such as ct-bone have.
         labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
+        iso: a level of an isosurface or several, as values of ``--iso``, in place of ``function``.
     """
 
     function: FunctionLike | None = None
@@ -85,6 +87,7 @@ class Look:
     light: LightLike = None
     labels: LabelsLike | None = None
     layers: Sequence[LayerLike] = ()
+    iso: float | str | Sequence[float | str] = ()
 
     @classmethod
     def of(cls, look: LookLike) -> Look:
@@ -285,9 +288,10 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look; errors are those of `function_of`."""
+    levels = [look.iso] if isinstance(look.iso, str | Real) else look.iso
     return replace(
         source,
-        tf=function_of(look.function),
+        tf=with_levels(function_of(look.function), levels, look.labels),
         tf_range=look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range),
         unit_distance=None if look.unit_distance is None else str(look.unit_distance),
         light=light_of(look.light),

@@ -71,6 +71,7 @@ class Volume:
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
+        preset: name of the function that shows such values (smoke, fire); "" unknown.
         value_unit: unit of the values; "" unknown.
         time: time that the values are of, and its unit, which may be ""; None unknown.
         unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
@@ -94,6 +95,7 @@ class Volume:
     unit: str = ""
     modality: str = ""
     quantity: str = ""
+    preset: str = ""
     value_unit: str = ""
     time: tuple[float, str] | None = None
     segments: tuple[Segment, ...] | None = None
