@@ -46,8 +46,8 @@ def command(
       vvgt info --machine
     """
     from vvgt_cli.commands.inspect import inspect, machine_facts, what_leaves
-    from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.library.inputs import Look, live_look
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
@@ -55,7 +55,7 @@ def command(
         raise UsageError("--machine describes this machine, --sharing a file; expected one of them")
     if machine == (file is not None):
         raise UsageError("expected a file, or --machine")
-    look, how = function_of(tf, tf_range, opacity_unit_distance, layers=layers), ReadOptions(**read)
+    look, how = live_look(Look(tf, tf_range, opacity_unit_distance, layers=layers)), ReadOptions(**read)
     if sharing and (look, how) != (None, ReadOptions()):
         raise UsageError("--sharing describes the file as it is; omit --tf and reading options")
     if file is None:

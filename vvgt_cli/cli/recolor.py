@@ -1,8 +1,10 @@
-"""`vvgt recolor`."""
+"""`vvgt recolor`: live Gaussians shown under another function, without the volume."""
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,8 +18,67 @@ from vvgt_cli.cli.options import (
     tf_range_option,
     unit_distance_option,
 )
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.library.inputs import FunctionLike, LabelsLike, LightLike, PathLike
+    from vvgt_cli.progress import Console
+
+
+def recolor(
+    ply: PathLike, tf: FunctionLike | None = None, output: PathLike | None = None, *,
+    tf_range: str | Sequence[float] = "data", opacity_unit_distance: str | float | None = None,
+    labels: LabelsLike | None = None, light: LightLike = None, layers: Sequence[str] | Mapping[int | str, Any] = (),
+    overwrite: bool = False, progress: bool | Console = False,
+) -> Result:  # fmt: skip
+    """Show a live ``.ply`` under another function, without its volume: ``vvgt recolor``.
+
+    Args:
+        ply: file of ``vvgt convert --live``; "-" is standard input.
+        tf: function as in `Look`; None: the file's own.
+        output: file to write, of any format; "-" is standard output, None writes nothing.
+        tf_range: as in `Look`.
+        opacity_unit_distance: as in `Look`.
+        labels: table of a label map as in `Look`; None: the file's own.
+        light: as in `Look`; None: that of the function's file, else that of the file.
+        layers: for several layers or channels, values of ``--layer``, or functions or label tables by number or name.
+        overwrite: replace the output if it exists.
+        progress: print messages on standard error.
+
+    Returns:
+        Ordinary Gaussians.
+
+    Raises:
+        DataError: the Gaussians carry no values, or the function shows nothing of them.
+        UsageError: an invalid range, distance or light, or an output that may not be written.
+    """
+    from dataclasses import replace
+
+    from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
+    from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.gaussians.formats import SUFFIXES
+    from vvgt_cli.gaussians.outputs import Output, claimed
+    from vvgt_cli.library.inputs import Look, console_of, live_look
+    from vvgt_cli.score.record import ConversionReport, Run
+
+    name, run = os.fspath(ply), Run(console_of(progress), ConversionReport("recolor"))
+    listed: Any = () if isinstance(layers, Mapping) else layers
+    look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed)) or FunctionRequest()
+    with claimed(Output.of("-o", output, SUFFIXES, splats=True), [name, *look.paths()], overwrite):
+        with run.stage("read") as stage:
+            gaussians, header = open_gaussians(name)
+            stage.note = f"{len(gaussians)} Gaussians"
+        with run.stage("recolor") as stage:
+            if isinstance(layers, Mapping):
+                look = replace(look, layers=tuple(layer_look(header, key, one) for key, one in layers.items()))
+            shown, options = resolve_look(name, header, look)
+            found = apply_function(gaussians, header, shown, options)
+            stage.note = f"{len(found)} of them visible under {shown.name}"
+        if output is not None:
+            write_gaussians(run, os.fspath(output), found, options, overwrite)
+    run.finish()
+    return Result(found, run.report, options)
 
 
 @click.command("recolor", cls=SectionedCommand, short_help="Show a live .ply under another function or light.")
@@ -38,10 +99,7 @@ from vvgt_cli.progress import Console
 @relight_options
 @overwrite_option
 @common_options
-def command(
-    ply: str, tf: str | None, labels: str | None, layers: tuple[str, ...], output: str, tf_range: str,
-    opacity_unit_distance: str | None, light: dict[str, Any], overwrite: bool, console: Console,
-) -> None:  # fmt: skip
+def command(light: dict[str, Any], console: Console, **options: Any) -> None:
     """Write LIVE.ply, made by 'vvgt convert --live', as an ordinary file under another function, table or light.
 
     The volume is not needed. Gaussians that TF hides are omitted. LIVE.ply may be "-".
@@ -51,8 +109,6 @@ def command(
       vvgt recolor head-live.ply --tf skin.json --light headlight -o skin.html
       vvgt recolor cells-live.ply --layer 1,tf=magenta.json -o cells.ply
     """
-    from vvgt_cli.commands.recolor import RecolorRequest, function_of, recolor
-    from vvgt_cli.conversion.recolored import FunctionRequest
+    from vvgt_cli.look.lighting import LightOptions
 
-    function = function_of(tf, tf_range, opacity_unit_distance, labels, light, layers) or FunctionRequest()
-    recolor(RecolorRequest(ply, function, output, overwrite), console)
+    recolor(**options, light=LightOptions(**light), progress=console)

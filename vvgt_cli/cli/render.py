@@ -70,11 +70,12 @@ def command(
       vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
-    from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.commands.render import RenderRequest, render_file
     from vvgt_cli.conversion.index import movie_frames
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import Look, live_look
+    from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
     if background is not None and not all(0 <= c <= 1 for c in background):
@@ -86,8 +87,7 @@ def command(
     if any(map(is_splats, names)) or (file == "-" and read["dims"] is None):
         if ReadOptions(**read) != ReadOptions() or options is not None:
             raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
-        tf, tf_range, distance, labels, layers = optics.values()
-        function = function_of(tf, tf_range, distance, labels, light, layers)
+        function = live_look(Look(**optics, light=LightOptions(**light)))
     elif rule not in (None, "mip", "xray"):
         raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
     else:

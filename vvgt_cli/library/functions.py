@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
-    FunctionLike,
     Goal,
     GoalLike,
-    LabelsLike,
-    LightLike,
     LookLike,
     LooksLike,
     PathLike,
     Reading,
     VolumeLike,
+    blocks_of,
     console_of,
-    function_of,
-    labels_of,
-    light_of,
     looks_of,
     ply_of,
     source_of,
@@ -39,7 +34,6 @@ if TYPE_CHECKING:
 
     from vvgt_cli.commands.evaluate import Evaluation
     from vvgt_cli.conversion.clouds import Clouds
-    from vvgt_cli.field.settings import BlockOptions
 
 
 def convert(
@@ -90,17 +84,11 @@ def convert(
         raise UsageError("after: expected the result of convert for one volume and look")
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
-    request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live, editor=not live)
+    request = replace(Goal.of(goal).request(source), blocks=blocks_of(blocks), live=live, editor=not live)
     requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, as_clouds=several, split_labels=split_labels, after=after, console=console_of(progress)
     )
-
-
-def _blocks(blocks: int | str | None) -> BlockOptions | None:
-    from vvgt_cli.field.settings import BlockOptions
-
-    return None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
@@ -210,43 +198,9 @@ def evaluate(
 
     source = source_of(volume, look, reading)
     request = pipeline.EvaluateRequest(
-        ply_of(ply), source, size, rule, step, conditions, _blocks(blocks), target=target
+        ply_of(ply), source, size, rule, step, conditions, blocks_of(blocks), target=target
     )  # fmt: skip
     return pipeline.evaluate(request, console_of(progress))
-
-
-def recolor(
-    ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
-    labels: LabelsLike | None = None, light: LightLike = None, layers: Mapping[int | str, Any] | None = None,
-) -> Result:  # fmt: skip
-    """Show a live ``.ply`` under another function, without its volume: ``vvgt recolor``.
-
-    Args:
-        ply: path of a file of ``vvgt convert --live``.
-        look: a function as in `Look`; None: the file's own.
-        range: as in `Result.recolor`.
-        unit_distance: as in `Result.recolor`.
-        labels: for a label map, a table as in `Look`; None: the file's own.
-        light: as in `Look`; None: that of the function's file, else that of the file.
-        layers: for several layers or channels, functions or label tables by number or name.
-
-    Returns:
-        Ordinary Gaussians.
-
-    Raises:
-        DataError: the Gaussians carry no values, or the function shows nothing of them.
-        UsageError: an invalid range, distance or light.
-    """
-    from vvgt_cli.conversion.gaussian_files import layout_of
-    from vvgt_cli.score.record import ConversionReport
-
-    gaussians, header = read_ply(ply)
-    result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
-    distance = None if unit_distance is None else str(unit_distance)
-    return result.recolor(
-        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light),
-        layers=layers,
-    )  # fmt: skip
 
 
 def optimize(

@@ -12,10 +12,12 @@ from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 import numpy as np
 
 from vvgt_cli.conversion.index import function_name
+from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, open_content
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
 from vvgt_cli.look.isosurfaces import with_levels
@@ -67,23 +69,23 @@ class VtkImage(Protocol):
 
 @dataclass(frozen=True)
 class Look:
-    """A look: function, light, labels and layers of a volume.
+    """A look: function, light, labels and layers of a volume, named as the options of commands.
 
     Attributes:
-        function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`;
-            None chooses one from the data.
-        range: "data", "rescale" or (lo, hi): position of the function's nodes.
-        unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
+        tf: function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a
+            `TransferFunction`; None chooses one from the data.
+        tf_range: "data", "rescale" or (lo, hi): position of the function's nodes.
+        opacity_unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
         light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: that
             of the function or label table (of the first layer), which presets such as ct-bone have.
         labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
-        iso: a level of an isosurface or several, as values of ``--iso``, in place of ``function``.
+        iso: a level of an isosurface or several, as values of ``--iso``, in place of ``tf``.
     """
 
-    function: FunctionLike | None = None
-    range: str | Sequence[float] = "data"
-    unit_distance: str | float | None = None
+    tf: FunctionLike | None = None
+    tf_range: str | Sequence[float] = "data"
+    opacity_unit_distance: str | float | None = None
     light: LightLike = None
     labels: LabelsLike | None = None
     layers: Sequence[LayerLike] = ()
@@ -93,6 +95,18 @@ class Look:
     def of(cls, look: LookLike) -> Look:
         """Return a look as it is, or one with a function alone."""
         return look if isinstance(look, Look) else cls(look)
+
+    def asked(self) -> dict[str, Any]:
+        """Return all but the layers, as attributes of a request; raise DataError for an invalid function or table."""
+        distance = self.opacity_unit_distance
+        levels = [self.iso] if isinstance(self.iso, str | Real) else self.iso
+        return {
+            "tf": with_levels(function_of(self.tf), levels, self.labels),
+            "tf_range": self.tf_range if isinstance(self.tf_range, str) else _numbers(self.tf_range),
+            "unit_distance": None if distance is None else str(distance),
+            "light": light_of(self.light),
+            "labels": labels_of(self.labels),
+        }
 
 
 LookLike = Look | FunctionLike | None
@@ -117,7 +131,7 @@ def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
         alone: Any = look  # mypy takes a str for a sequence
         return {"": Look.of(alone)}, False
     looks = [Look.of(one) for one in look]
-    names = [_name_of(one.function) for one in looks]
+    names = [_name_of(one.tf) for one in looks]
     if not names or len(set(names)) < len(names):
         stated = ", ".join(dict.fromkeys(names)) or "none"
         raise UsageError(
@@ -288,16 +302,18 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look; errors are those of `function_of`."""
-    levels = [look.iso] if isinstance(look.iso, str | Real) else look.iso
-    return replace(
-        source,
-        tf=with_levels(function_of(look.function), levels, look.labels),
-        tf_range=look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range),
-        unit_distance=None if look.unit_distance is None else str(look.unit_distance),
-        light=light_of(look.light),
-        labels=labels_of(look.labels),
-        layers=tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x)) for x in look.layers),
-    )
+    space = source.read.space
+    layers = tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x), space) for x in look.layers)
+    return replace(source, **look.asked(), layers=layers)
+
+
+def live_look(look: Look) -> FunctionRequest | None:
+    """Return the request for live Gaussians under a look, with layers as ``--layer`` of `recolor` has them.
+
+    It is None where nothing is asked for; errors as above.
+    """
+    asked = FunctionRequest(**look.asked(), layers=tuple(map(parse_layer_look, map(str, look.layers))))
+    return None if asked == FunctionRequest() else asked
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
@@ -319,7 +335,12 @@ def light_of(light: LightLike) -> LightOptions:
     lights: list[Any] = list(light)
     if all(isinstance(one, Real) for one in lights):
         lights = [lights]
-    return LightOptions(tuple(p if isinstance(p, str) else ",".join(repr(float(v)) for v in p) for p in lights))
+    return LightOptions(tuple(p if isinstance(p, str) else _numbers(p) for p in lights))
+
+
+def _numbers(values: Sequence[float]) -> str:
+    """Return numbers as options have them."""
+    return ",".join(repr(float(v)) for v in values)
 
 
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:
@@ -331,9 +352,16 @@ def ply_of(ply: PathLike | Result) -> str | BinaryIO:
     return os.fspath(ply)
 
 
-def console_of(progress: bool) -> Console:
-    """Return a console that prints messages and bars, or is silent."""
-    return Console(quiet=not progress)
+def console_of(progress: bool | Console) -> Console:
+    """Return a console that prints messages and bars, or is silent; that of the command line as it is."""
+    return progress if isinstance(progress, Console) else Console(quiet=not progress)
+
+
+def blocks_of(blocks: int | str | BlockOptions | None) -> BlockOptions | None:
+    """Return a caller's options of blocks: the voxels along an edge, "auto", or all options as they are."""
+    if blocks is None or isinstance(blocks, BlockOptions):
+        return blocks
+    return BlockOptions(None if isinstance(blocks, str) else blocks)
 
 
 def volume_in_memory(
