@@ -12,7 +12,7 @@ import pytest
 from tests.processes import start
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.cli.main import run
-from vvgt_cli.commands.optimize import load_sets
+from vvgt_cli.cli.optimize import load_sets
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images import write_exr
 

@@ -21,13 +21,15 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.cli.infer import infer
+    from vvgt_cli.cli.optimize import optimize
     from vvgt_cli.cli.recolor import recolor
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
+    from vvgt_cli.library.functions import convert, evaluate, read_ply, read_volume, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
@@ -36,11 +38,13 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
+    "cli.infer": ("infer",),
+    "cli.optimize": ("optimize",),
     "cli.recolor": ("recolor",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
+    "library.functions": ("convert", "evaluate", "read_ply", "read_volume", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
@@ -73,6 +77,7 @@ __all__ = [
     "default_views",
     "evaluate",
     "export_plotter",
+    "infer",
     "optimize",
     "orbit_views",
     "read_ply",

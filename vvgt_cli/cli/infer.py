@@ -1,12 +1,54 @@
-"""`vvgt infer`."""
+"""`vvgt infer`: Gaussians improved by an exported network, kept if the views agree."""
 
 from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.library.inputs import PathLike
+    from vvgt_cli.progress import Console
+    from vvgt_cli.score.record import Run
+
+JUDGES = 4  # views that the network is not shown, as many as the default check set
+
+
+def infer(
+    ply: PathLike, output: PathLike | None = None, *, views: PathLike, model: str, provider: str = "cpu",
+    report: PathLike | None = None, overwrite: bool = False, progress: bool | Console = False,
+) -> Result:  # fmt: skip
+    """Improve Gaussians with a network that looks at views of their volume: ``vvgt infer``.
+
+    Args:
+        ply: a file, "-" is standard input.
+        output: ``.ply`` to write; "-" is standard output, None writes nothing.
+        views: folder of ``vvgt render-views``.
+        model: folder of a model, or the name of one that is shipped.
+        provider: "cpu" or "cuda".
+        report: JSON to write.
+        overwrite: replace files that exist.
+        progress: print messages and bars on standard error.
+
+    Returns:
+        The better Gaussians, or those of the file if the views that judge them show no gain.
+
+    Raises:
+        UsageError: an output that may not be written, or an unknown model or provider.
+        DataError: Gaussians, views or a model that are not valid.
+    """
+    from vvgt_cli.library.outputs import written
+
+    name = os.fspath(ply)
+    make = partial(_improved, name, os.fspath(views), model, provider)
+    return written(make, "infer", [name], output, report, overwrite=overwrite, progress=progress)
 
 
 @click.command("infer", cls=SectionedCommand, short_help="Improve a .ply with an exported network.")
@@ -22,9 +64,7 @@ from vvgt_cli.progress import Console
 @click.option("--report", metavar="FILE.json", help="Save stages, times and scores as JSON.")
 @overwrite_option
 @common_options
-def command(
-    ply: str, views: str, model: str, output: str, provider: str, report: str | None, overwrite: bool, console: Console
-) -> None:
+def command(console: Console, **options: Any) -> None:
     """Improve the Gaussians of IN.ply with a network that looks at views of their volume.
 
     The network reads a fixed number of training views, chosen far apart. Up to four other views judge the result: if
@@ -34,6 +74,57 @@ def command(
       vvgt render-views head.nrrd --tf bone.json -o views
       vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model small -o head.ply
     """
-    from vvgt_cli.commands.infer import InferRequest, infer_file
+    infer(**options, progress=console)
 
-    infer_file(InferRequest(ply, views, model, output, provider, report, overwrite), console)
+
+def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]]:
+    """Return the indices of the views that the network reads, and of those that judge it.
+
+    The judges are other views, as far apart as possible; if there are none, the views that it reads.
+    """
+    from vvgt_cli.cameras import farthest_cameras
+
+    read = farthest_cameras(cameras, wanted)
+    others = [i for i in range(len(cameras)) if i not in read]
+    judges = [others[i] for i in farthest_cameras([cameras[i] for i in others], JUDGES)] if others else read
+    return read, judges
+
+
+def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Result:
+    from dataclasses import replace
+
+    import numba
+
+    from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.images.files import load_views
+    from vvgt_cli.jit.ahead import INFER
+    from vvgt_cli.network.card import find_model
+    from vvgt_cli.network.runtime import Model
+    from vvgt_cli.score.views import Views
+
+    with run.stage("read") as stage:
+        network = Model.open(find_model(model), numba.get_num_threads(), provider)
+        gaussians, header = open_gaussians(name)
+        cameras, images = load_views(folder, "train")
+        read, judges = divide(cameras, network.card.network.total_views)
+        stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {network.card.name}"
+    run.compile(INFER)
+    with run.stage("network") as stage:
+        shown = [cameras[i] for i in read]
+        better = network.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
+        stage.note = f"reads {len(read)} views"
+    with run.stage("judge") as stage:
+        before, after = map(Views(cameras, images).take(judges).psnr, (gaussians, better))
+        stage.psnr, stage.kept = after, after > before
+        own = "" if set(judges) - set(read) else ", all read by the network"
+        stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
+    run.report.options = {
+        "model": network.card.name,
+        "provider": provider,
+        "read": [cameras[i].name for i in read],
+        "judges": [cameras[i].name for i in judges],
+        "psnr_before": before,
+        "psnr_after": after,
+    }
+    return Result(better if stage.kept else gaussians, run.report, replace(layout_of(header), certificate=None))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Result
     from vvgt_cli.library.inputs import FunctionLike, LabelsLike, LightLike, PathLike
     from vvgt_cli.progress import Console
+    from vvgt_cli.score.record import Run
 
 
 def recolor(
@@ -54,31 +55,30 @@ def recolor(
     """
     from dataclasses import replace
 
-    from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
+    from vvgt_cli.conversion.gaussian_files import open_gaussians
     from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
     from vvgt_cli.conversion.result import Result
     from vvgt_cli.gaussians.formats import SUFFIXES
-    from vvgt_cli.gaussians.outputs import Output, claimed
-    from vvgt_cli.library.inputs import Look, console_of, live_look
-    from vvgt_cli.score.record import ConversionReport, Run
+    from vvgt_cli.library.inputs import Look, live_look
+    from vvgt_cli.library.outputs import written
 
-    name, run = os.fspath(ply), Run(console_of(progress), ConversionReport("recolor"))
-    listed: Any = () if isinstance(layers, Mapping) else layers
+    name, listed = os.fspath(ply), () if isinstance(layers, Mapping) else layers
     look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed)) or FunctionRequest()
-    with claimed(Output.of("-o", output, SUFFIXES, splats=True), [name, *look.paths()], overwrite):
+
+    def make(run: Run) -> Result:
         with run.stage("read") as stage:
             gaussians, header = open_gaussians(name)
             stage.note = f"{len(gaussians)} Gaussians"
         with run.stage("recolor") as stage:
-            if isinstance(layers, Mapping):
-                look = replace(look, layers=tuple(layer_look(header, key, one) for key, one in layers.items()))
-            shown, options = resolve_look(name, header, look)
+            own = layers.items() if isinstance(layers, Mapping) else ()
+            named = tuple(layer_look(header, key, one) for key, one in own)
+            shown, options = resolve_look(name, header, replace(look, layers=look.layers + named))
             found = apply_function(gaussians, header, shown, options)
             stage.note = f"{len(found)} of them visible under {shown.name}"
-        if output is not None:
-            write_gaussians(run, os.fspath(output), found, options, overwrite)
-    run.finish()
-    return Result(found, run.report, options)
+        return Result(found, run.report, options)
+
+    inputs = [name, *look.paths()]
+    return written(make, "recolor", inputs, output, overwrite=overwrite, progress=progress, suffixes=SUFFIXES)
 
 
 @click.command("recolor", cls=SectionedCommand, short_help="Show a live .ply under another function or light.")

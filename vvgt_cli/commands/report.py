@@ -17,7 +17,6 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
-from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.peers import Peer, PeerViews, train
 from vvgt_cli.conversion.convert import convert, open_field
 from vvgt_cli.conversion.live import live_refusal
@@ -36,7 +35,7 @@ from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images import png_bytes
 from vvgt_cli.jit.ahead import INIT
-from vvgt_cli.network.card import find_model
+from vvgt_cli.network.card import SHIPPED, find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.charts import FILES, draw, write_plots
