@@ -13,7 +13,7 @@ PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
-    *("conversion", "checks", "commands", "library", "integrations", "cli"),
+    *("conversion", "checks", "library", "commands", "integrations", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),

@@ -153,7 +153,7 @@ def test_pipes(folder, vvgt):
 
 
 def test_evaluate_scores_every_condition(converted, vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.commands.evaluate.viewing_conditions", viewing_conditions)
+    monkeypatch.setattr("vvgt_cli.commands.evaluation.viewing_conditions", viewing_conditions)
     ply = converted[0] / "a.ply"
     options = ("evaluate", ply, "--volume", SOURCE, "--step", 0.5)
     document = json.loads(vvgt(*options, "--json").out)

@@ -21,15 +21,17 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.cli.evaluate import evaluate
     from vvgt_cli.cli.infer import infer
     from vvgt_cli.cli.optimize import optimize
     from vvgt_cli.cli.recolor import recolor
+    from vvgt_cli.cli.synth import synth
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, evaluate, read_ply, read_volume, render_views
+    from vvgt_cli.library.functions import convert, read_ply, read_volume, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
@@ -38,13 +40,15 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
+    "cli.evaluate": ("evaluate",),
     "cli.infer": ("infer",),
     "cli.optimize": ("optimize",),
     "cli.recolor": ("recolor",),
+    "cli.synth": ("synth",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "evaluate", "read_ply", "read_volume", "render_views"),
+    "library.functions": ("convert", "read_ply", "read_volume", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
@@ -85,6 +89,7 @@ __all__ = [
     "read_volume",
     "recolor",
     "render_views",
+    "synth",
 ]
 
 

@@ -1,16 +1,57 @@
-"""`vvgt evaluate`."""
+"""`vvgt evaluate`: scores of Gaussians against their volume."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import block_options
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import rule_option, target_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.commands.evaluation import Evaluation
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
+
+
+def evaluate(
+    ply: PathLike | Result, volume: VolumeLike, look: LookLike = None, *, size: int | None = None,
+    rule: str | None = None, target: str | None = None, conditions: bool = True, step: float = 0.125,
+    preview: PathLike | None = None, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
+    progress: bool | Console = False, **reading: Unpack[Reading],
+) -> Evaluation:  # fmt: skip
+    """Score Gaussians against their volume: ``vvgt evaluate``.
+
+    Args:
+        ply: path, "-" for standard input, or result of `convert` or `optimize`.
+        volume: as in `convert`.
+        look: as in `convert`.
+        size: pixels along the edge of pictures; None: the file's.
+        rule: drawing rule; None: the file's.
+        target: device to score it on, as ``--for``.
+        conditions: also score every rule at several sizes and close up, and texture on smooth areas.
+        step: step of the reference, in voxels.
+        preview: PNG to write: volume, splats and difference.
+        blocks: as in `convert`.
+        overwrite: replace the preview if it exists.
+        progress: print messages and bars on standard error.
+        **reading: as in `convert`.
+
+    Raises:
+        DataError, UsageError: see `convert`.
+    """
+    from vvgt_cli.commands.evaluation import score
+    from vvgt_cli.library.inputs import blocks_of, console_of, ply_of, source_of
+
+    return score(
+        console_of(progress), ply_of(ply), source_of(volume, look, reading), blocks_of(blocks), size=size, rule=rule,
+        target=target, conditions=conditions, step=step, preview=preview, overwrite=overwrite,
+    )  # fmt: skip
 
 
 @click.command("evaluate", cls=SectionedCommand, short_help="Measure the error of a .ply against its volume.")
@@ -41,7 +82,10 @@ from vvgt_cli.progress import Console
 @block_options
 @overwrite_option
 @common_options
-def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], console: Console, **options: Any) -> None:
+def command(
+    ply: str, volume: str, as_json: bool, optics: dict[str, Any], light: dict[str, Any], read: dict[str, Any],
+    blocks: dict[str, Any], console: Console, **options: Any,
+) -> None:  # fmt: skip
     """Score OUT.ply against the volume it was made from.
 
     OUT.ply may be a FOLDER of streamed levels, scored at the finest level; FOLDER#1 is level 1.
@@ -56,12 +100,9 @@ def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], consol
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    from vvgt_cli.cli.blocks import block_options_of
-    from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
+    from vvgt_cli.library.inputs import Look
+    from vvgt_cli.look.lighting import LightOptions
 
-    source = source_request(volume, options["read"], options["optics"], options["light"])
-    names = ("size", "rule", "step", "conditions", "preview", "overwrite", "target")
-    asked = {name: options[name] for name in names}
-    evaluation = evaluate(EvaluateRequest(ply, source, blocks=block_options_of(blocks), **asked), console)
-    click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)
+    look = Look(**optics, light=LightOptions(**light))
+    scores = evaluate(ply, volume, look, blocks=block_options_of(blocks), progress=console, **options, **read)
+    click.echo(scores.to_json() if as_json else scores.table(), nl=False)

@@ -1,14 +1,70 @@
-"""`vvgt synth`."""
+"""`vvgt synth`: a synthetic volume, written as NRRD."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.library.inputs import PathLike
+    from vvgt_cli.progress import Console
+    from vvgt_cli.volume import Volume
 
 KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells", "bodies")
+TURBULENCE_SIZE, SHAPE_SIZE, DEVELOPED = 64, 128, 2.0
+
+
+def synth(
+    kind: str, output: PathLike | None = None, *, size: int | None = None, seed: int = 0, field: str | None = None,
+    turnovers: float | None = None, overwrite: bool = False, progress: bool | Console = False,
+) -> Volume:  # fmt: skip
+    """Make a volume that resembles measured or simulated data: ``vvgt synth``.
+
+    >>> import vvgt_cli as vvgt
+    >>> vvgt.synth("tubes", size=16).dims
+    (16, 16, 16)
+
+    Args:
+        kind: "isotropic", "stratified", or a name of `vvgt_cli.volume.shapes.SHAPES`.
+        output: ``.nrrd`` to write, None for none.
+        size: voxels along an edge; None: 64 for turbulence, else 128.
+        seed: random seed.
+        field: of turbulence: "speed", "vorticity" or "temperature"; None for the kind's default.
+        turnovers: of the largest eddies, in which turbulence develops; None: 2.
+        overwrite: replace a file that exists.
+        progress: print messages and bars on standard error.
+
+    Raises:
+        UsageError: options that the kind does not have, or an output that may not be written.
+        DataError: a volume too large for memory.
+    """
+    from vvgt_cli.gaussians.outputs import Output, claimed
+    from vvgt_cli.library.inputs import console_of
+    from vvgt_cli.score.record import ConversionReport, Run
+    from vvgt_cli.volume.medical.nrrd import write_nrrd
+    from vvgt_cli.volume.shapes import SHAPES, make_shape
+
+    shape, run = kind in SHAPES, Run(console_of(progress), ConversionReport("synth"))
+    if shape and (field or turnovers is not None):
+        raise UsageError(f"synth {kind}: --field and --turnovers apply only to turbulence")
+    if field == "temperature" and kind != "stratified":
+        raise UsageError(f"synth {kind}: --field temperature applies only to stratified turbulence")
+    with claimed(Output.of("-o", output, (".nrrd",)), [], overwrite):
+        with run.stage(kind) as stage:
+            if shape:
+                volume = make_shape(kind, size or SHAPE_SIZE, seed)
+            else:
+                volume, stage.note = _turbulence(kind, size, seed, field, turnovers, run.console)
+        if output is not None:
+            with run.stage("write") as stage:
+                run.report.bytes = write_nrrd(output, volume, overwrite)
+                stage.note = f"{output}: {' x '.join(map(str, volume.dims))} float32"
+    run.finish()
+    return volume
 
 
 @click.command(
@@ -31,10 +87,7 @@ KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells
 )  # fmt: skip
 @overwrite_option
 @common_options
-def command(
-    kind: str, output: str, size: int | None, seed: int, field: str | None, turnovers: float | None, overwrite: bool,
-    console: Console,
-) -> None:  # fmt: skip
+def command(console: Console, **options: Any) -> None:
     """Make a volume that resembles measured or simulated data, for training and experiments.
 
     KIND: isotropic (forced turbulence), stratified (rotating, stratified turbulence with temperature), both solved by a
@@ -46,6 +99,19 @@ def command(
       vvgt synth tubes --seed 3 -o tubes.nrrd
       vvgt convert tubes.nrrd -o tubes.ply
     """
-    from vvgt_cli.commands.synth import SynthRequest, synthesise
+    synth(**options, progress=console)
 
-    synthesise(SynthRequest(kind, output, size, seed, field, turnovers, overwrite), console)
+
+def _turbulence(
+    kind: str, size: int | None, seed: int, field: str | None, turnovers: float | None, console: Console
+) -> tuple[Volume, str]:
+    """Return the volume, and a note about the flow."""
+    from vvgt_cli.volume.shapes import volume_of
+    from vvgt_cli.volume.turbulence import TURNOVER, Solver, advance, fields, flow_of
+
+    solver, turned = Solver(flow_of(kind, size or TURBULENCE_SIZE)), DEVELOPED if turnovers is None else turnovers
+    state = advance(solver, solver.start(seed), turned * TURNOVER, console.bar(kind))
+    field = field or ("temperature" if kind == "stratified" else "speed")
+    energy, loss = solver.energy(state), solver.dissipation(state)
+    note = f"{field} after {turned:g} turnovers, energy {energy:.3g}, dissipation {loss:.3g}"
+    return volume_of(fields(solver, state)[field], f"{kind}-{field}-{seed}"), note

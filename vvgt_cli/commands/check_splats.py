@@ -21,7 +21,7 @@ from vvgt_cli.checks.splats import (
     row_cases,
     value_cases,
 )
-from vvgt_cli.commands.evaluate import EvaluateRequest, opened, shown
+from vvgt_cli.commands.evaluation import opened, shown
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.errors import DataError
@@ -99,7 +99,7 @@ def open_splats(
         yield OpenedSplats(about, None, None, [*cases, *value_cases(gaussians, None, size), *_order(gaussians, size)])
         return
     run = Run(console, ConversionReport("evaluate"))
-    with opened(run, EvaluateRequest(file, source, size), gaussians, header) as field:
+    with opened(run, source, gaussians, header, size) as field:
         current = shown(gaussians, header, field.source, source)
         cases += [*value_cases(gaussians, 2.0, size), *_against(field, current, header, size, tolerance or TOLERANCE)]
         yield OpenedSplats(about, volume_record(field.source), tf_record(field.source, source), cases)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.result import Conversion, Result
+from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
@@ -22,7 +22,6 @@ from vvgt_cli.library.inputs import (
     blocks_of,
     console_of,
     looks_of,
-    ply_of,
     source_of,
     volume_of,
     with_look,
@@ -32,7 +31,6 @@ from vvgt_cli.volume import Volume
 if TYPE_CHECKING:
     import numpy as np
 
-    from vvgt_cli.commands.evaluate import Evaluation
     from vvgt_cli.conversion.clouds import Clouds
 
 
@@ -161,43 +159,3 @@ def render_views(
     scene = source.scene()
     draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
-
-
-def evaluate(
-    ply: PathLike | Result,
-    volume: VolumeLike,
-    look: LookLike = None,
-    *,
-    size: int | None = None,
-    rule: str | None = None,
-    step: float = 0.125,
-    conditions: bool = True,
-    target: str | None = None,
-    blocks: int | str | None = None,
-    progress: bool = False,
-    **reading: Unpack[Reading],
-) -> Evaluation:
-    """Score a ``.ply``, or a result, against its volume: ``vvgt evaluate``.
-
-    Args:
-        ply: path, or result of `convert` or `optimize`.
-        volume: as in `convert`.
-        look: as in `convert`.
-        size: pixels along the edge of pictures; None: the file's.
-        rule: drawing rule; None: the file's.
-        step: step of the reference, in voxels.
-        conditions: also score every rule at several sizes and close up.
-        target: device to score it on, as ``--for``.
-        blocks: as in `convert`.
-        progress: print messages and bars on standard error.
-
-    Raises:
-        DataError, UsageError: see `convert`.
-    """
-    from vvgt_cli.commands import evaluate as pipeline
-
-    source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(
-        ply_of(ply), source, size, rule, step, conditions, blocks_of(blocks), target=target
-    )  # fmt: skip
-    return pipeline.evaluate(request, console_of(progress))

@@ -1,4 +1,4 @@
-"""`evaluate`: scores of a `.ply` against its volume, on test views and under all viewing conditions."""
+"""Scores of Gaussians against their volume, on test views and under all viewing conditions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import headset_axes, preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
+from vvgt_cli.conversion.place import preview as side_by_side
 from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -24,8 +25,10 @@ from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.gaussians.targets import target_of
+from vvgt_cli.images import write_png
 from vvgt_cli.images.metrics import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
+from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
@@ -48,39 +51,6 @@ from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
-
-
-@dataclass(frozen=True)
-class EvaluateRequest:
-    """File of Gaussians to score, and how.
-
-    Attributes:
-        ply: Gaussians, "-" for standard input, or a stream of them.
-        source: volume and function that they were made from.
-        size: pixels along an image's edge; None: the size recorded in the file.
-        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
-        step: sampling distance of the reference, in voxels.
-        conditions: also score every rule at several sizes and close up, and texture on smooth areas.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
-        preview: PNG to write (reference, splats, difference of a test view and of a close-up), None for none.
-        overwrite: replace it if it exists.
-        target: name of the device to score it on, by its size and rule where none is given; None: as the file records.
-    """
-
-    ply: str | BinaryIO
-    source: SourceRequest
-    size: int | None = None
-    rule: str | None = None
-    step: float = 0.125
-    conditions: bool = True
-    blocks: BlockOptions | None = None
-    preview: str | None = None
-    overwrite: bool = False
-    target: str | None = None
-
-    def inputs(self) -> list[str]:
-        """Return the files that are read."""
-        return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
 
 
 @dataclass
@@ -130,10 +100,12 @@ def _cell(value: Any) -> str:
 
 
 @contextmanager
-def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
+def opened(
+    run: Run, request: SourceRequest, gaussians: Gaussians, header: PlyHeader, size: int,
+    options: BlockOptions | None = None,
+) -> Iterator[Field]:  # fmt: skip
     """Open the volume, by default in the file's own anatomical space, light and unit distance."""
-    size, asked = request.size or header.screen_size or SIZE, request.source.light
-    dark = replace(request.source, light=LightOptions())
+    dark = replace(request, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
     other = header.live is not None and (
@@ -150,9 +122,9 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
         first, *others = source.layers
         if recorded:
             first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
-        return replace(source, layers=(first, *others), lighting=asked.lighting(preset, source.volume.space))
+        return replace(source, layers=(first, *others), lighting=request.light.lighting(preset, source.volume.space))
 
-    kernels, options = for_degree(EVALUATE, gaussians.degree), request.blocks or automatic(dark, run.console)
+    kernels, options = for_degree(EVALUATE, gaussians.degree), options or automatic(dark, run.console)
     if options is None:
         with run.stage("read") as stage:
             source = lit(load(dark))
@@ -198,35 +170,44 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
 
 
-def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
-    """Score a `.ply` against its volume.
-
-    Raises:
-        UsageError: both inputs are standard input, or the preview may not be written.
-        DataError: a file that is not valid.
-    """
-    if request.ply == STDIN == request.source.volume:
+def score(
+    console: Console, ply: str | BinaryIO, request: SourceRequest, options: BlockOptions | None, *, size: int | None,
+    rule: str | None, target: str | None, conditions: bool, step: float, preview: PathLike | None, overwrite: bool,
+) -> Evaluation:  # fmt: skip
+    """Score Gaussians against their volume; see `vvgt_cli.evaluate`."""
+    if ply == STDIN == request.volume:
         raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
-    run = Run(console or Console(), ConversionReport("evaluate"))
-    if (target := target_of(request.target)) is not None:
-        if target.eye is not None and not request.conditions:
+    run = Run(console, ConversionReport("evaluate"))
+    if (device := target_of(target)) is not None:
+        if device.eye is not None and not conditions:
             raise UsageError(
-                f"--no-conditions with --for {target.name}: its eyes are conditions; give one or the other"
+                f"--no-conditions with --for {device.name}: its eyes are conditions; give one or the other"
             )
-        request = replace(request, size=request.size or target.size, rule=request.rule or target.rule)
-    if request.preview:
-        check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
-    gaussians, header = open_gaussians(request.ply)
-    with opened(run, request, gaussians, header) as volume:
-        source = volume.source
-        gaussians = shown(gaussians, header, source, request.source)
-        gaussians = to_box_frame(gaussians, source.volume)
-        for remark in _doubts(request, header, source):
-            run.console.message(f"{request.ply}: {remark}")
-        return _scored(run, request, volume, gaussians, header)
+        size, rule = size or device.size, rule or device.rule
+    inputs = [*request.paths(), *([ply] if isinstance(ply, str) else [])]
+    check_outputs(Output.of("--preview", preview, (".png",)), inputs, overwrite)
+    gaussians, header = open_gaussians(ply)
+    size, drawn = size or header.screen_size or SIZE, file_rule(header, rule)
+    with opened(run, request, gaussians, header, size, options) as field:
+        volume = field.source.volume
+        gaussians = to_box_frame(shown(gaussians, header, field.source, request), volume)
+        for remark in _doubts(header, field.source):
+            run.console.message(f"{ply}: {remark}")
+        evaluation = _scored(run, field, gaussians, header, drawn, tf_record(field.source, request), size, step)
+        if preview is not None:
+            camera, axes = default_views("test", size=size)[PICTURED], upright_axes(volume, header.up)
+            with run.stage("preview"):
+                sheet = side_by_side(field.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, drawn)
+                write_png(preview, sheet, overwrite)
+        if conditions:
+            eyes = eye_pictures(target, headset_axes(volume, header.up))
+            _look_around(run, evaluation, field, gaussians, drawn, eyes)
+    evaluation.stages = run.report.stages
+    evaluation.seconds = run.finish().seconds
+    return evaluation
 
 
-def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iterator[str]:
+def _doubts(header: PlyHeader, source: Source) -> Iterator[str]:
     """Yield reasons to doubt that the file was made from this volume and look."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         yield f"its header's affine differs from that of {source.volume.name}; was it made from another volume?"
@@ -237,21 +218,19 @@ def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iter
         )
 
 
-def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussians, header: PlyHeader) -> Evaluation:
-    """Measure the scores, and write a preview if requested."""
+def _scored(
+    run: Run, volume: Field, gaussians: Gaussians, header: PlyHeader, rule: Rule, function: dict[str, Any], size: int,
+    step: float,
+) -> Evaluation:  # fmt: skip
+    """Score Gaussians (box frame) on the test views, and check their certificate; ``function`` is its record."""
     from vvgt_cli.dvr import REFERENCE
-    from vvgt_cli.images import write_png
 
-    source = volume.source
-    size, rule = request.size or header.screen_size or SIZE, file_rule(header, request.rule)
     with run.stage("reference") as stage:
-        own = _reference_psnr(volume, size, request.step)
+        own = _reference_psnr(volume, size, step)
         stage.note = f"its own error {own:.1f} dB"
-    evaluation = Evaluation(
-        len(gaussians), size, rule.name, request.step, len(default_views("test")), volume_record(source),
-        tf_record(source, request.source), own,
-    )  # fmt: skip
-    settings = replace(REFERENCE, step=request.step)
+    count, views, record = len(gaussians), len(default_views("test")), volume_record(volume.source)
+    evaluation = Evaluation(count, size, rule.name, step, views, record, function, own)
+    settings = replace(REFERENCE, step=step)
     wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
@@ -263,16 +242,6 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
             verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
-    if request.preview:
-        camera, axes = default_views("test", size=size)[PICTURED], upright_axes(source.volume, header.up)
-        with run.stage("preview"):
-            sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
-            write_png(request.preview, sheet, request.overwrite)
-    if request.conditions:
-        eyes = eye_pictures(request.target, headset_axes(source.volume, header.up))
-        _look_around(run, evaluation, volume, gaussians, rule, eyes)
-    evaluation.stages = run.report.stages
-    evaluation.seconds = run.finish().seconds
     return evaluation
 
 
