@@ -21,6 +21,7 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.cli.check import check
     from vvgt_cli.cli.evaluate import evaluate
     from vvgt_cli.cli.infer import infer
     from vvgt_cli.cli.optimize import optimize
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
+    "cli.check": ("check",),
     "cli.evaluate": ("evaluate",),
     "cli.infer": ("infer",),
     "cli.optimize": ("optimize",),
@@ -77,6 +79,7 @@ __all__ = [
     "UsageError",
     "Volume",
     "VvgtError",
+    "check",
     "convert",
     "default_views",
     "evaluate",

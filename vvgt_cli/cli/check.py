@@ -1,15 +1,64 @@
-"""`vvgt check`."""
+"""`vvgt check`: this installation, cases and stiffness of one scene, or a file of Gaussians."""
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
 from vvgt_cli.cli.options import common_options, light_options, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.checks.report import CheckReport
+    from vvgt_cli.library.inputs import LookLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
+
+TOLERANCE = 0.002  # RMS of RGBA
+
+
+def check(
+    file: VolumeLike | None = None, look: LookLike = None, *, volume: VolumeLike | None = None,
+    tolerance: float | None = None, progress: bool | Console = False, **reading: Unpack[Reading],
+) -> CheckReport:  # fmt: skip
+    """Check this installation, the scene of a volume and its look, or a file of Gaussians: ``vvgt check``.
+
+    Args:
+        file: a volume as in `convert`, or a file of Gaussians; None: the installation.
+        look: of the volume, as in `convert`.
+        volume: that the Gaussians were made from; None checks the file alone.
+        tolerance: RMS error in [0, 1] that a scene's views or pictures of Gaussians may have; None: 0.002, or 0.056.
+        progress: print messages and bars on standard error.
+        **reading: of the volume, as in `convert`.
+
+    Raises:
+        UsageError, DataError: a volume or Gaussians that cannot be read.
+    """
+    from vvgt_cli.checks.report import CheckReport, run_cases
+    from vvgt_cli.checks.self_test import scene_cases, self_test_cases
+    from vvgt_cli.checks.stiffness import measure_stiffness
+    from vvgt_cli.commands.check_splats import check_splats
+    from vvgt_cli.field.source import describe_source, load, tf_record, volume_record
+    from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import console_of, source_of
+
+    console = console_of(progress)
+    if isinstance(file, str | os.PathLike) and is_splats(os.fspath(file)):
+        compared = None if volume is None else source_of(volume, look, reading)
+        return check_splats(os.fspath(file), compared, tolerance, console)
+    if volume is not None:
+        raise UsageError(f"--volume {volume}: expected a file of Gaussians to compare it with, not {file or 'nothing'}")
+    if file is None:
+        return CheckReport(run_cases(list(self_test_cases()), console))
+    source = source_of(file, look, reading)
+    loaded = load(source)
+    console.message(describe_source(loaded))
+    scene = loaded.scene()
+    found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
+    outcomes = run_cases(list(scene_cases(scene)), console)
+    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 
 
 @click.command(
@@ -28,8 +77,9 @@ from vvgt_cli.progress import Console
 @read_options
 @common_options
 def command(
-    file: str | None, volume: str | None, tolerance: float | None, as_json: bool, console: Console, **options: Any
-) -> None:
+    file: str | None, volume: str | None, as_json: bool, optics: dict[str, Any], light: dict[str, Any],
+    read: dict[str, Any], console: Console, **options: Any,
+) -> None:  # fmt: skip
     """Test this installation and print a table; exit status 1 if a case fails.
 
     Compiles missing kernels, compares renderer, splatter and gradients with float64 twins, converts three tiny volumes,
@@ -46,22 +96,15 @@ def command(
       vvgt check trained.ply --volume head.nrrd --tf bone.json
       vvgt check trained.ply --json | jq '.outcomes[] | select(.passed | not)'
     """
-    from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.commands.check import check
     from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import Look
 
-    splats = file if file is not None and is_splats(file) else None
-    if volume is not None and splats is None:
-        raise UsageError(f"--volume {volume}: expected a file of Gaussians to compare it with, not {file or 'nothing'}")
-    scene = volume if splats else file
-    asked = options["optics"] | options["read"] | options["light"]
     flags = {"lights": "light", "occlusion": "ambient-occlusion"}
-    given = [f"--{flags.get(key, key).replace('_', '-')}" for key, value in asked.items() if value]
-    given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]
-    if scene is None and given:
-        raise UsageError(f"{', '.join(given)}: only with a volume; expected {'--volume' if splats else 'VOLUME'} too")
-    source = None if scene is None else source_request(scene, options["read"], options["optics"], options["light"])
-    report = check(source, tolerance, console, splats)
+    given = [key for key, value in (optics | read | light).items() if value and (key, value) != ("tf_range", "data")]
+    if given and volume is None and (file is None or is_splats(file)):
+        names = ", ".join(f"--{flags.get(key, key).replace('_', '-')}" for key in given)
+        raise UsageError(f"{names}: only with a volume; expected {'--volume' if file else 'VOLUME'} too")
+    report = check(file, Look(**optics, light=light), volume=volume, progress=console, **options, **read)
     click.echo(report.to_json() if as_json else report.table(), nl=False)
     if report.failed:
         names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])

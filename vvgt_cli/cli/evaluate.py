@@ -101,8 +101,7 @@ def command(
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
     from vvgt_cli.library.inputs import Look
-    from vvgt_cli.look.lighting import LightOptions
 
-    look = Look(**optics, light=LightOptions(**light))
+    look = Look(**optics, light=light)
     scores = evaluate(ply, volume, look, blocks=block_options_of(blocks), progress=console, **options, **read)
     click.echo(scores.to_json() if as_json else scores.table(), nl=False)

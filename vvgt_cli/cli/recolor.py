@@ -99,7 +99,7 @@ def recolor(
 @relight_options
 @overwrite_option
 @common_options
-def command(light: dict[str, Any], console: Console, **options: Any) -> None:
+def command(console: Console, **options: Any) -> None:
     """Write LIVE.ply, made by 'vvgt convert --live', as an ordinary file under another function, table or light.
 
     The volume is not needed. Gaussians that TF hides are omitted. LIVE.ply may be "-".
@@ -109,6 +109,4 @@ def command(light: dict[str, Any], console: Console, **options: Any) -> None:
       vvgt recolor head-live.ply --tf skin.json --light headlight -o skin.html
       vvgt recolor cells-live.ply --layer 1,tf=magenta.json -o cells.ply
     """
-    from vvgt_cli.look.lighting import LightOptions
-
-    recolor(**options, light=LightOptions(**light), progress=console)
+    recolor(**options, progress=console)

@@ -75,7 +75,6 @@ def command(
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians.formats import is_splats
     from vvgt_cli.library.inputs import Look, live_look
-    from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
     if background is not None and not all(0 <= c <= 1 for c in background):
@@ -87,7 +86,7 @@ def command(
     if any(map(is_splats, names)) or (file == "-" and read["dims"] is None):
         if ReadOptions(**read) != ReadOptions() or options is not None:
             raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
-        function = live_look(Look(**optics, light=LightOptions(**light)))
+        function = live_look(Look(**optics, light=light))
     elif rule not in (None, "mip", "xray"):
         raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
     else:

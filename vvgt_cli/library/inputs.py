@@ -34,7 +34,7 @@ from vvgt_cli.volume.stored import Stored
 
 PathLike = str | os.PathLike[str]
 VolumeLike: TypeAlias = "PathLike | Volume | Content | ReadAlready | ArrayLike | VtkImage"
-LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
+LightLike = LightOptions | Mapping[str, Any] | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
@@ -76,8 +76,9 @@ class Look:
             `TransferFunction`; None chooses one from the data.
         tf_range: "data", "rescale" or (lo, hi): position of the function's nodes.
         opacity_unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
-        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: that
-            of the function or label table (of the first layer), which presets such as ct-bone have.
+        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions` or a mapping
+            of their attributes; None: that of the function or label table (of the first layer), as presets such as
+            ct-bone have.
         labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
         iso: a level of an isosurface or several, as values of ``--iso``, in place of ``tf``.
@@ -327,9 +328,9 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
 
 
 def light_of(light: LightLike) -> LightOptions:
-    """Return light options as they are, or made from a name, three numbers, or several of these."""
-    if isinstance(light, LightOptions):
-        return light
+    """Return light options as they are, or made from their attributes, a name, three numbers, or several of these."""
+    if isinstance(light, LightOptions | Mapping):
+        return light if isinstance(light, LightOptions) else LightOptions(**light)
     if light is None or isinstance(light, str):
         return LightOptions(() if light is None else (light,))
     lights: list[Any] = list(light)

@@ -1,4 +1,4 @@
-"""`check`: self-test of an installation, cases and stiffness of one scene, or cases of a file of Gaussians."""
+"""The report of `vvgt check`: cases are run, and their outcomes listed."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from itertools import groupby
 from typing import Any
 
 from vvgt_cli.checks import Case, Outcome, run_case
-from vvgt_cli.checks.self_test import scene_cases, self_test_cases
-from vvgt_cli.checks.stiffness import Stiffness, measure_stiffness
-from vvgt_cli.commands.check_splats import open_splats
-from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.checks.stiffness import Stiffness
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import document
-
-TOLERANCE = 0.002  # RMS of RGBA
 
 
 @dataclass
@@ -79,37 +74,7 @@ def _stiffness_lines(found: Stiffness) -> list[str]:
     return [f"{key:<{width}}  {value}" for key, value in rows.items()]
 
 
-def check(
-    source: SourceRequest | None, tolerance: float | None, console: Console | None = None, splats: str | None = None
-) -> CheckReport:
-    """Check the installation; with a source that scene, with a file of Gaussians that file.
-
-    Args:
-        source: volume and transfer function, None for the self-test or a file of Gaussians alone.
-        tolerance: RMS error in [0, 1] that a scene's views or the pictures of Gaussians may have; None: `TOLERANCE`, or
-            that of `check_splats`.
-        console: for messages.
-        splats: file of Gaussians, compared with the source if there is one.
-
-    Raises:
-        UsageError, DataError: a source that cannot be read.
-    """
-    console = console or Console()
-    if splats is not None:
-        with open_splats(splats, source, tolerance, console) as opened:
-            outcomes = _run_cases(opened.cases, console)
-        return CheckReport(outcomes, opened.volume, opened.function, splats=opened.about)
-    if source is None:
-        return CheckReport(_run_cases(list(self_test_cases()), console))
-    loaded = load(source)
-    console.message(describe_source(loaded))
-    scene = loaded.scene()
-    found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
-    outcomes = _run_cases(list(scene_cases(scene)), console)
-    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
-
-
-def _run_cases(cases: list[Case], console: Console) -> list[Outcome]:
+def run_cases(cases: list[Case], console: Console) -> list[Outcome]:
     """Run cases, with a line on the console for each stage."""
     outcomes: list[Outcome] = []
     bar = console.bar("check")
