@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands import report
+from vvgt_cli.commands import report_runs as report
 from vvgt_cli.commands.peers import Peer
 from vvgt_cli.errors import UsageError
 from vvgt_cli.score.charts import draw

@@ -72,23 +72,24 @@ def command(
       vvgt report example:frog --size 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report
       vvgt report --compare head-report/report.json other/report.json -o both
     """
-    from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.commands import report as pipeline
+    from vvgt_cli.commands import report_runs
+    from vvgt_cli.commands.peers import Peer
+    from vvgt_cli.library.inputs import Look, source_of
 
     if compare:
         other = [p.opts[-1] for p in typed(ctx) if p.name not in COMPARE_PARAMETERS]
         if other:
             raise UsageError(f"{', '.join(other)}: not with --compare, which only overlays reports")
-        pipeline.compare(paths, output, options["overwrite"], console)
+        report_runs.compare(paths, output, options["overwrite"], console)
         return
     if len(paths) != 1:
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
-    runs = pipeline.RunOptions(
+    runs = report_runs.RunOptions(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
-        block_options_of(options["blocks"]), peers=tuple(pipeline.Peer.of(text) for text in options["peers"]),
+        block_options_of(options["blocks"]), peers=tuple(map(Peer.of, options["peers"])),
     )  # fmt: skip
-    source = source_request(paths[0], options["read"], options["optics"], options["light"])
-    request = pipeline.ReportRequest(
-        source, output, runs, options["picture_size"], options["overwrite"], command_line(ctx)
-    )
-    pipeline.report(request, console)
+    source = source_of(paths[0], Look(**options["optics"], light=options["light"]), options["read"])
+    report_runs.report(
+        source, output, runs, picture_size=options["picture_size"], overwrite=options["overwrite"],
+        command_line=command_line(ctx), console=console,
+    )  # fmt: skip

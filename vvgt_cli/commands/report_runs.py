@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -365,66 +365,59 @@ PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
 VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32 RGBA
 
 
-@dataclass(frozen=True)
-class ReportRequest:
-    """A report.
-
-    Attributes:
-        source: the scene.
-        output: folder to write to; created if missing.
-        options: of the runs.
-        picture_size: largest edge of the page's pictures, in pixels.
-        overwrite: replace files that exist.
-        command_line: what the user typed, for the page.
-    """
-
-    source: SourceRequest
-    output: str
-    options: RunOptions = field(default_factory=RunOptions)
-    picture_size: int = 400
-    overwrite: bool = False
-    command_line: str = ""
-
-
-def report(request: ReportRequest, console: Console | None = None) -> dict[str, Any]:
+def report(
+    source: SourceRequest, output: str, options: RunOptions, *, picture_size: int, overwrite: bool, command_line: str,
+    console: Console,
+) -> dict[str, Any]:  # fmt: skip
     """Do all runs, write `report.json`, `report.csv`, the plots and `report.html`, and return the JSON's content.
+
+    ``picture_size`` is the largest edge of the page's pictures, in pixels, and ``command_line`` what the user typed.
 
     Raises:
         UsageError: an output that may not be written, or standard input as the volume, which every run reads again.
         DataError: invalid input.
     """
-    console = console or Console()
-    if request.source.volume == STDOUT:
+    if source.volume == STDOUT:
         raise UsageError("VOLUME is '-', but every run reads it again; expected a file")
-    folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
-    request = replace(request, options=_with_model(request.options))
-    size = request.options.size
+    folder = _folder(output, (DATA, TABLE, PAGE, *FILES), overwrite)
+    options, size = _with_model(options), options.size
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
-    fit = FitOptions(request.options.max_gaussians, size)
-    whole = ConvertRequest(request.source, fit=fit, blocks=request.options.blocks)
+    whole = ConvertRequest(source, fit=FitOptions(options.max_gaussians, size), blocks=options.blocks)
     with open_field(Run(console, ConversionReport("report")), whole, INIT) as volume:
-        source = volume.source
-        live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
-        request = replace(request, options=replace(request.options, live=live_refusal(live, source) is None))
-        warm_up(request.source, request.options)
+        scene = volume.source
+        options = replace(options, live=live_refusal(replace(whole, live=True), scene) is None)
+        warm_up(source, options)
         reference = Reference.render(volume, size, console)
         ceiling = reference.psnr_of("vtk", volume)
     runs, ours = [], []
-    total = len(plan_runs(request.options))
-    for run, images in do_runs(request.source, request.options, reference, console):
+    total = len(plan_runs(options))
+    for run, images in do_runs(source, options, reference, console):
         runs.append(run)
-        ours.append(list(map(png_bytes, pictures(images, PICTURED, request.picture_size))))
+        ours.append(list(map(png_bytes, pictures(images, PICTURED, picture_size))))
         score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
-    text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
+    best, bend = [run["name"] for run in pareto(runs)], knee(runs)
+    content = {
+        "command_line": command_line,
+        "volume": volume_record(scene),
+        "transfer_function": tf_record(scene, source),
+        "options": asdict(options),
+        "reference": {"views": len(reference.cameras), "size": size, "step": reference.step, "rays": reference.rays},
+        "front": best,
+        "knee": bend["name"] if bend else None,
+        "unit_costs": unit_costs(runs),
+        "runs": [run | {"cost": cost(run)} for run in runs],
+        "vtk_psnr": ceiling,
+    }
+    text = document("vvgt-report", content)
     found: dict[str, Any] = json.loads(text)
-    series = [ReportRuns(source.volume.name, runs, found)]
-    shown = list(map(png_bytes, pictures(reference.shown, PICTURED, request.picture_size)))
+    series = [ReportRuns(scene.volume.name, runs, found)]
+    shown = list(map(png_bytes, pictures(reference.shown, PICTURED, picture_size)))
     folder.mkdir(exist_ok=True)
-    write_text(str(folder / DATA), text, request.overwrite)
-    title = f"Error against run time: {source.volume.name}"
-    _write(folder, series, title, Pictures(list(PICTURED), shown, ours), request.overwrite)
+    write_text(str(folder / DATA), text, overwrite)
+    title = f"Error against run time: {scene.volume.name}"
+    _write(folder, series, title, Pictures(list(PICTURED), shown, ours), overwrite)
     console.message(f"{folder / PAGE}")
     return found
 
@@ -440,25 +433,7 @@ def _with_model(options: RunOptions) -> RunOptions:
     return replace(options, model=SHIPPED)
 
 
-def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    best, bend = [run["name"] for run in pareto(runs)], knee(runs)
-    return {
-        "command_line": request.command_line,
-        "volume": volume_record(source),
-        "transfer_function": tf_record(source, request.source),
-        "options": asdict(request.options),
-        "reference": {
-            "views": len(reference.cameras), "size": request.options.size, "step": reference.step,
-            "rays": reference.rays,
-        },
-        "front": best,
-        "knee": bend["name"] if bend else None,
-        "unit_costs": unit_costs(runs),
-        "runs": [run | {"cost": cost(run)} for run in runs],
-    }  # fmt: skip
-
-
-def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console | None = None) -> None:
+def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console) -> None:
     """Compare several reports: write `report.csv`, the plots and `report.html`.
 
     Args:
@@ -471,7 +446,6 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
         UsageError: fewer than two reports, or outputs that may not be written.
         DataError: a file that is not a report.
     """
-    console = console or Console()
     if len(paths) < 2:
         raise UsageError(f"--compare: {len(paths)} report; expected two or more, as --compare A.json B.json")
     folder = _folder(output, (TABLE, PAGE, *FILES), overwrite, paths)
@@ -515,6 +489,3 @@ def _write(folder: Path, series: list[ReportRuns], title: str, shown: Pictures |
     charts = draw(series)
     write_plots(folder, charts, overwrite)
     write_text(str(folder / PAGE), page(series, charts, title, shown), overwrite)
-
-
-__all__ = ["Peer", "ReportRequest", "RunOptions", "compare", "report"]
