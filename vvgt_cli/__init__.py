@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vvgt_cli.cli.infer import infer
     from vvgt_cli.cli.optimize import optimize
     from vvgt_cli.cli.recolor import recolor
+    from vvgt_cli.cli.render import render
     from vvgt_cli.cli.synth import synth
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
@@ -46,6 +47,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cli.infer": ("infer",),
     "cli.optimize": ("optimize",),
     "cli.recolor": ("recolor",),
+    "cli.render": ("render",),
     "cli.synth": ("synth",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
@@ -91,6 +93,7 @@ __all__ = [
     "read_transfer_function",
     "read_volume",
     "recolor",
+    "render",
     "render_views",
     "synth",
 ]

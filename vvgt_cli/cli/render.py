@@ -1,19 +1,77 @@
-"""`vvgt render`."""
+"""`vvgt render`: pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
 from vvgt_cli.cli.blocks import block_options, block_options_of
-from vvgt_cli.cli.fit import rule_option, source_request
+from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from vvgt_cli.conversion.recolored import FunctionRequest
+    from vvgt_cli.field.settings import BlockOptions
     from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
+
+
+def render(
+    file: VolumeLike, output: PathLike, look: LookLike = None, *, camera: PathLike | None = None,
+    orbit: int | None = None, size: int | None = None, rule: str | None = None, exr: bool = False,
+    background: Sequence[float] | None = None, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
+    progress: bool | Console = False, **reading: Unpack[Reading],
+) -> int:  # fmt: skip
+    """Write pictures or a movie of Gaussians or of a volume, and return the number of views: ``vvgt render``.
+
+    Args:
+        file: Gaussians ("-" for standard input, a glob or an index for several), or a volume as in `convert`.
+        output: directory for pictures, one picture (``.png``), numbered ones ("{:04d}.png"), or a movie by its ending.
+        look: of a volume, as in `convert`, or of live Gaussians; None: their own.
+        camera: view-set file.
+        orbit: number of views on a circle around the up axis.
+        size: image height in pixels; None: the view set's, the one that the Gaussians are made for, or 400.
+        rule: drawing rule of Gaussians, "mip" or "xray", also of a volume; None: the file's.
+        exr: also write float EXR.
+        background: (r, g, b) in [0, 1]; None: transparent pictures and black movies.
+        blocks: as in `convert`.
+        overwrite: replace files that exist.
+        progress: print messages and bars on standard error.
+        **reading: of a volume, as in `convert`.
+
+    Raises:
+        UsageError: an output exists or cannot be made; views or an output that do not suit the frames.
+        DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
+    """
+    from vvgt_cli.commands.pictures import Drawing, draw_files
+    from vvgt_cli.conversion.index import movie_frames
+    from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import Look, blocks_of, console_of, live_look, source_of
+    from vvgt_cli.score.record import ConversionReport, Run
+    from vvgt_cli.volume import ReadOptions
+
+    if background is not None and not all(0 <= c <= 1 for c in background):
+        raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
+    frames = movie_frames(os.fspath(file)) if isinstance(file, str | os.PathLike) else ()
+    given: tuple[str | None, ...] | SourceRequest = frames
+    function: FunctionRequest | None = None
+    if any(map(is_splats, filter(None, frames))) or (file == "-" and reading.get("dims") is None):
+        if source_of(file, None, reading).read != ReadOptions() or blocks is not None:
+            raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
+        function = live_look(Look.of(look))
+    elif rule not in (None, "mip", "xray"):
+        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
+    else:
+        given = source_of(file, look, reading)
+    how = (os.fspath(output), camera, orbit, size, rule, exr, background, overwrite)
+    run = Run(console_of(progress), ConversionReport("render"))
+    return draw_files(run, Drawing(given, function, blocks_of(blocks), *how))
 
 
 @click.command("render", cls=SectionedCommand, short_help="Render pictures or a movie of Gaussians or a volume.")
@@ -46,9 +104,8 @@ if TYPE_CHECKING:
 @overwrite_option
 @common_options
 def command(
-    file: str, camera: str | None, orbit: int | None, size: int | None, rule: str | None, output: str, exr: bool,
-    background: tuple[float, float, float] | None, optics: dict[str, Any], light: dict[str, Any],
-    read: dict[str, Any], blocks: dict[str, Any], overwrite: bool, console: Console,
+    file: str, output: str, optics: dict[str, Any], light: dict[str, Any], read: dict[str, Any],
+    blocks: dict[str, Any], console: Console, **options: Any,
 ) -> None:  # fmt: skip
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
@@ -70,27 +127,7 @@ def command(
       vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
-    from vvgt_cli.commands.render import RenderRequest, render_file
-    from vvgt_cli.conversion.index import movie_frames
-    from vvgt_cli.errors import UsageError
-    from vvgt_cli.gaussians.formats import is_splats
-    from vvgt_cli.library.inputs import Look, live_look
-    from vvgt_cli.volume import ReadOptions
+    from vvgt_cli.library.inputs import Look
 
-    if background is not None and not all(0 <= c <= 1 for c in background):
-        raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    frames = movie_frames(file)
-    names = [path for path in frames if path is not None]
-    given: tuple[str | None, ...] | SourceRequest = frames
-    function, options = None, block_options_of(blocks)
-    if any(map(is_splats, names)) or (file == "-" and read["dims"] is None):
-        if ReadOptions(**read) != ReadOptions() or options is not None:
-            raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
-        function = live_look(Look(**optics, light=light))
-    elif rule not in (None, "mip", "xray"):
-        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
-    else:
-        given = source_request(file, read, optics, light)
-    render_file(
-        RenderRequest(given, output, camera, orbit, size, rule, exr, background, overwrite, function, options), console
-    )
+    look = Look(**optics, light=light)
+    render(file, output, look, blocks=block_options_of(blocks), progress=console, **options, **read)

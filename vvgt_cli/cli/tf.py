@@ -1,14 +1,17 @@
-"""`vvgt tf`."""
+"""`vvgt tf`: transfer functions written in another format, suggested for a volume, or drawn over its histogram."""
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_range_option
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.progress import Console
 
 
 @click.group("tf", short_help="Show, convert and suggest transfer functions.")
@@ -32,10 +35,22 @@ def show(
     Example:
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
-    from vvgt_cli.commands.tf import show_transfer_function
-    from vvgt_cli.volume import ReadOptions
+    from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs
+    from vvgt_cli.look import draw, read_transfer_function, resolve
+    from vvgt_cli.volume import ReadOptions, read_volume, statistics
 
-    show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
+    options = ReadOptions(**read)
+    if output == STDOUT:
+        raise UsageError("-o -: a picture goes to a file; expected a name ending in .png")
+    if volume is None and (tf_range != "data" or options != ReadOptions()):
+        raise UsageError("--tf-range and reading options need --volume")
+    check_outputs([Output("-o", output, (".png",))], [tf, volume], overwrite)
+    function, stats = read_transfer_function(tf), None
+    if volume is not None:
+        data = read_volume(volume, options)
+        stats = statistics(data)
+        function = resolve(function, stats, tf_range, data.hounsfield)
+    draw(function, stats, output, overwrite)
 
 
 @command.command("convert", cls=SectionedCommand, short_help="Write a transfer function in another format.")
@@ -57,9 +72,27 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
       vvgt tf convert CT-Bone.vp bone.json
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
     """
-    from vvgt_cli.commands.tf import convert_transfer_function
+    from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
+    from vvgt_cli.look import read_transfer_function
+    from vvgt_cli.look.convert import placed, to_text
+    from vvgt_cli.look.function import PER_VOXEL
+    from vvgt_cli.look.resolve import parse_tf_range
 
-    convert_transfer_function(tf, output, form, tf_range, overwrite, console)
+    check_outputs([Output("OUT", output, (".json",), binary=False)], [tf.partition("#")[0]], overwrite)
+    limits = parse_tf_range(tf_range)
+    if limits == "rescale":
+        raise UsageError("--tf-range rescale needs the data, and this command reads none; give --tf-range LO,HI")
+    function = placed(read_transfer_function(tf), None if isinstance(limits, str) else limits)
+    text = to_text(function, form)
+    distance = PER_VOXEL if function.opacity_unit_label == PER_VOXEL else f"{function.opacity_unit_distance or 0:g}"
+    if form == "paraview" and distance != "0":
+        console.message(
+            f"{output}: a ParaView preset stores no unit distance: set it to {distance} there, or give "
+            f"--opacity-unit-distance {distance} here"
+        )
+    if form == "paraview" and function.lighting is not None:
+        console.message(f"{output}: a ParaView preset stores no shading; use --light headlight with it")
+    write_text(output, text, overwrite)
 
 
 @command.command("list", cls=SectionedCommand, short_help="List the named functions.")
@@ -88,7 +121,9 @@ def list_named(console: Console) -> None:
 @read_options
 @overwrite_option
 @common_options
-def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwrite: bool, console: Console) -> None:
+def suggest_functions(
+    volume: str, number: int, output: str, read: dict[str, Any], overwrite: bool, console: Console
+) -> None:
     """Write N transfer functions for VOLUME, each showing one range of values in its own colour.
 
     The background is excluded and the remaining values are divided evenly, half by value and half by number of
@@ -97,8 +132,34 @@ def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwri
     Example:
       vvgt tf suggest head.nrrd -n 10 -o bands
     """
-    from vvgt_cli.commands.tf import suggest_transfer_functions
-    from vvgt_cli.volume import ReadOptions
+    from vvgt_cli.gaussians.outputs import write_text
+    from vvgt_cli.look.suggest import fitting, suggest
+    from vvgt_cli.score.record import ConversionReport, Run
+    from vvgt_cli.volume import ReadOptions, read_volume, statistics
 
-    for path in suggest_transfer_functions(volume, number, output, ReadOptions(**read), overwrite, console):
+    folder = Path(output)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a directory for the functions")
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
+    paths = [folder / f"band_{k:0{len(str(number))}d}.json" for k in range(1, number + 1)]
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise UsageError(f"{path} exists; give --overwrite to replace it, or another directory")
+    run = Run(console, ConversionReport("tf suggest"))
+    with run.stage("read") as stage:
+        grid = read_volume(volume, ReadOptions(**read))
+        stats = statistics(grid)
+        stage.note = f"{grid.name}: values {stats.lo:g} to {stats.hi:g}"
+    with run.stage("suggest") as stage:
+        suggestions = suggest(stats, number, sum(grid.dims) / 3, sum(grid.spacing) / 3)
+        folder.mkdir(exist_ok=True)
+        for path, suggestion in zip(paths, suggestions, strict=True):
+            write_text(str(path), suggestion.to_json(), overwrite)
+        stage.note = f"{number} functions in {folder}"
+    for path, suggestion in zip(paths, suggestions, strict=True):
+        console.message(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
+    preset = fitting(stats, grid)
+    console.message(f"preset that fits: --tf {preset}" if preset else "no preset fits ('vvgt tf list')")
+    for path in paths:
         click.echo(path)

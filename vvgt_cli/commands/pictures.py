@@ -1,9 +1,10 @@
-"""`render`: pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
+"""Pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
@@ -41,10 +42,11 @@ from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
+from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.record import Run
 from vvgt_cli.volume import Statistics
 from vvgt_cli.volume.space import shear_text
 
@@ -55,41 +57,25 @@ MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between th
 
 
 @dataclass(frozen=True)
-class RenderRequest:
-    """Pictures to draw.
+class Drawing:
+    """What to draw, from where, and into which files: arguments of `vvgt_cli.render`.
 
     Attributes:
-        source: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie, None for an empty one; or a volume
-            or a series of volumes with its look.
-        output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
-            ending (`SUFFIXES`).
-        camera: view-set file, or None.
-        orbit: number of views on a circle around the up axis, or None; not both. Single pictures and frames need
-            neither.
-        size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
-        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `vvgt_cli.conversion.grey.NAMES`, also for a
-            volume; None: the Gaussians' file's.
-        exr: write EXR too.
-        background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
-        overwrite: replace images that exist.
-        function: look to show live Gaussians under; None: the look of the file.
-        blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
-        facts: step, time and stem of each frame, for places in the output's name, as far as its input states them.
+        source: files of Gaussians, None for an empty frame, or volumes; several are frames.
+        function: look of live Gaussians; None: the file's.
     """
 
     source: tuple[str | None, ...] | SourceRequest
+    function: FunctionRequest | None
+    blocks: BlockOptions | None
     output: str
-    camera: str | None = None
-    orbit: int | None = None
-    size: int | None = None
-    rule: str | None = None
-    exr: bool = False
-    background: tuple[float, float, float] | None = None
-    overwrite: bool = False
-    function: FunctionRequest | None = None
-    blocks: BlockOptions | None = None
-    facts: Sequence[Mapping[str, Any]] = ({},)
+    camera: PathLike | None
+    orbit: int | None
+    size: int | None
+    rule: str | None
+    exr: bool
+    background: Sequence[float] | None
+    overwrite: bool
 
     @property
     def png(self) -> bool:
@@ -116,7 +102,7 @@ class RenderRequest:
                 "a movie, as 'run_*.vti'"
             )
         if self.camera is not None:
-            cameras = read_cameras(self.camera, self.size)
+            cameras = read_cameras(os.fspath(self.camera), self.size)
         else:
             circle = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
             cameras = [to_box_frame(camera, upright_matrix(up))[0] for camera in circle]
@@ -171,18 +157,17 @@ class RenderRequest:
         return shares
 
 
-def render_file(request: RenderRequest, console: Console | None = None) -> int:
+def draw_files(run: Run, request: Drawing) -> int:
     """Write one PNG (and EXR) per view and `transforms.json`, single pictures, or a movie; return the number of views.
 
-    Raises:
-        UsageError: an image exists, or the directory cannot be made; views or an output that do not suit the frames.
-        DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
+    Errors are those of `vvgt_cli.render`.
     """
-    run, given = Run(console or Console(), ConversionReport("render")), request.source
+    given = request.source
     if not isinstance(given, SourceRequest):
-        return _render(run, replace(request, facts=frame_facts(given)), given)
-    over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
-    if not over_time and not is_glob_of_volumes(given):
+        return _render(run, request, given)
+    file = given.volume if isinstance(given.volume, str) else ""
+    over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(file)
+    if not file or not (over_time or is_glob_of_volumes(file)):
         try:
             return _render(run, replace(request, facts=frame_facts([given.path])), [given])
         except SeveralSteps:  # which are the frames
@@ -193,7 +178,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
 
 
 def _render(
-    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest | None], series: FrameSeries | None = None
+    run: Run, request: Drawing, frames: Sequence[str | SourceRequest | None], series: FrameSeries | None = None
 ) -> int:  # fmt: skip
     """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
     shares = request.check(len(frames))
@@ -240,7 +225,7 @@ def _blank(rule: str | None) -> Draw:
 
 
 def _frame(
-    run: Run, request: RenderRequest, source: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
+    run: Run, request: Drawing, source: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
     first: PlyHeader | None = None,
 ) -> tuple[Draw, str, PlyHeader | None]:  # fmt: skip
     """Return the renderer of a frame, its name, and the header of Gaussians; ``first`` is that of the first frame."""
@@ -290,7 +275,7 @@ def _placed(draw: Draw, name: str, header: PlyHeader, first: PlyHeader | None) -
 
 
 def _volume(
-    run: Run, request: RenderRequest, asked: SourceRequest, cameras: list[Camera], stack: ExitStack
+    run: Run, request: Drawing, asked: SourceRequest, cameras: list[Camera], stack: ExitStack
 ) -> tuple[Draw, str]:
     """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
     from vvgt_cli.dvr import RenderSettings, render_view
@@ -326,7 +311,7 @@ def _volume(
     return draw, f"ray casting{where}"
 
 
-def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
+def _opened(request: Drawing, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
     """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
     manifest, function = by_view(name), None if request.rule in NAMES else request.function
     if manifest is None:
@@ -347,7 +332,7 @@ def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple
     return seen, recolored(name, coarsest, header, function), header
 
 
-def _pictures(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
+def _pictures(request: Drawing, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
     """Write PNG and EXR, and `transforms.json` beside those in a directory; return the output."""
     from vvgt_cli.images import over, write_exr, write_png
 
@@ -363,7 +348,7 @@ def _pictures(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: l
     return str(where)
 
 
-def _movie(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
+def _movie(request: Drawing, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
     """Write one movie, and return its name and what it holds."""
     from vvgt_cli.images import over
 
