@@ -14,7 +14,7 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.view import streamed_resources
+from vvgt_cli.commands.viewer import streamed_resources
 from vvgt_cli.conversion.convert_batch import convert_files
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from vvgt_cli.cli.recolor import recolor
     from vvgt_cli.cli.render import render
     from vvgt_cli.cli.synth import synth
+    from vvgt_cli.cli.view import view
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
@@ -49,6 +50,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cli.recolor": ("recolor",),
     "cli.render": ("render",),
     "cli.synth": ("synth",),
+    "cli.view": ("view",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
@@ -96,6 +98,7 @@ __all__ = [
     "render",
     "render_views",
     "synth",
+    "view",
 ]
 
 

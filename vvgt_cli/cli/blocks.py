@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,6 +11,7 @@ from vvgt_cli.cli.options import group
 
 if TYPE_CHECKING:
     from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.progress import Console
 
 
 def _number_or(word: str, number: str) -> Callable[[click.Context, click.Parameter, str | None], int | str | None]:
@@ -75,3 +76,20 @@ def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
         return None
     size = blocks.pop("block_size")
     return BlockOptions(**{**blocks, "size": None if size == "auto" else size})
+
+
+def arguments(
+    console: Console, optics: dict[str, Any] | None = None, light: dict[str, Any] | None = None,
+    blocks: dict[str, Any] | None = None, read: Mapping[str, Any] = {}, **options: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the arguments of the function that a command calls, with its groups of options as the function takes them.
+
+    Raise UsageError for options of blocks that do not fit together.
+    """
+    from vvgt_cli.library.inputs import Look
+
+    if optics is not None:
+        options["look"] = Look(**optics, light=light)
+    if blocks is not None:
+        options["blocks"] = block_options_of(blocks)
+    return {**options, **read, "progress": console}

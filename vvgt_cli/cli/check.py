@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
+from vvgt_cli.cli.blocks import arguments
 from vvgt_cli.cli.options import common_options, light_options, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
@@ -76,10 +77,7 @@ def check(
 @light_options
 @read_options
 @common_options
-def command(
-    file: str | None, volume: str | None, as_json: bool, optics: dict[str, Any], light: dict[str, Any],
-    read: dict[str, Any], console: Console, **options: Any,
-) -> None:  # fmt: skip
+def command(file: str | None, volume: str | None, as_json: bool, **options: Any) -> None:
     """Test this installation and print a table; exit status 1 if a case fails.
 
     Compiles missing kernels, compares renderer, splatter and gradients with float64 twins, converts three tiny volumes,
@@ -97,14 +95,14 @@ def command(
       vvgt check trained.ply --json | jq '.outcomes[] | select(.passed | not)'
     """
     from vvgt_cli.gaussians.formats import is_splats
-    from vvgt_cli.library.inputs import Look
 
     flags = {"lights": "light", "occlusion": "ambient-occlusion"}
-    given = [key for key, value in (optics | read | light).items() if value and (key, value) != ("tf_range", "data")]
+    asked = options["optics"] | options["read"] | options["light"]
+    given = [key for key, value in asked.items() if value and (key, value) != ("tf_range", "data")]
     if given and volume is None and (file is None or is_splats(file)):
         names = ", ".join(f"--{flags.get(key, key).replace('_', '-')}" for key in given)
         raise UsageError(f"{names}: only with a volume; expected {'--volume' if file else 'VOLUME'} too")
-    report = check(file, Look(**optics, light=light), volume=volume, progress=console, **options, **read)
+    report = check(file, volume=volume, **arguments(**options))
     click.echo(report.to_json() if as_json else report.table(), nl=False)
     if report.failed:
         names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])

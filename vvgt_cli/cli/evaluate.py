@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, block_options_of
+from vvgt_cli.cli.blocks import arguments, block_options
 from vvgt_cli.cli.fit import rule_option, target_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
@@ -82,10 +82,7 @@ def evaluate(
 @block_options
 @overwrite_option
 @common_options
-def command(
-    ply: str, volume: str, as_json: bool, optics: dict[str, Any], light: dict[str, Any], read: dict[str, Any],
-    blocks: dict[str, Any], console: Console, **options: Any,
-) -> None:  # fmt: skip
+def command(as_json: bool, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
     OUT.ply may be a FOLDER of streamed levels, scored at the finest level; FOLDER#1 is level 1.
@@ -100,8 +97,5 @@ def command(
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    from vvgt_cli.library.inputs import Look
-
-    look = Look(**optics, light=light)
-    scores = evaluate(ply, volume, look, blocks=block_options_of(blocks), progress=console, **options, **read)
+    scores = evaluate(**arguments(**options))
     click.echo(scores.to_json() if as_json else scores.table(), nl=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, block_options_of
+from vvgt_cli.cli.blocks import arguments, block_options
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
@@ -103,10 +103,7 @@ def render(
 @block_options
 @overwrite_option
 @common_options
-def command(
-    file: str, output: str, optics: dict[str, Any], light: dict[str, Any], read: dict[str, Any],
-    blocks: dict[str, Any], console: Console, **options: Any,
-) -> None:  # fmt: skip
+def command(**options: Any) -> None:
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
     Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif
@@ -127,7 +124,4 @@ def command(
       vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
-    from vvgt_cli.library.inputs import Look
-
-    look = Look(**optics, light=light)
-    render(file, output, look, blocks=block_options_of(blocks), progress=console, **options, **read)
+    render(**arguments(**options))

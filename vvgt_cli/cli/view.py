@@ -1,11 +1,14 @@
-"""`vvgt view`."""
+"""`vvgt view`: Gaussians or a volume shown in a browser, or written in another format."""
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
+from vvgt_cli.cli.blocks import arguments
 from vvgt_cli.cli.options import (
     common_options,
     light_options,
@@ -16,7 +19,56 @@ from vvgt_cli.cli.options import (
     title_option,
 )
 from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.progress import Console
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading
+    from vvgt_cli.progress import Console
+
+
+def view(
+    files: PathLike | Sequence[PathLike], look: LookLike = None, *, output: PathLike | None = None,
+    port: int | None = None, browser: bool = True, live: bool = True, slices: bool = True, title: str | None = None,
+    overwrite: bool = False, progress: bool | Console = False, **reading: Unpack[Reading],
+) -> None:  # fmt: skip
+    """Show files of Gaussians or a volume in a browser until an interrupt, or write them: ``vvgt view``.
+
+    Args:
+        files: of Gaussians, globs of them, or indexes of ``vvgt convert``; several are a series. Or one volume, or one
+            series of volumes: a glob, or a file of several time steps.
+        look: of a volume, as in `convert`.
+        output: file to write instead of showing.
+        port: of the server; None takes a free one. Its address is printed.
+        browser: open one, if there is a display.
+        live: let a page of a volume have a function editor.
+        slices: let it have slices.
+        title: of the page; None: the file's own.
+        overwrite: replace the output if it exists.
+        progress: print messages on standard error.
+        **reading: of a volume, as in `convert`.
+
+    Raises:
+        UsageError: several volumes, options of volumes with files of Gaussians, or a port or an output that cannot be
+            used.
+        DataError: a file that is not valid.
+    """
+    from vvgt_cli.commands import viewer
+    from vvgt_cli.conversion.index import named_files
+    from vvgt_cli.library.inputs import console_of, source_of
+    from vvgt_cli.score.record import ConversionReport, Run
+
+    if output is not None and (port is not None or not browser):
+        raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
+    if output is None and not (live and slices):
+        raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
+    names = [files] if isinstance(files, str | os.PathLike) else files
+    clouds, run = named_files([os.fspath(name) for name in names]), Run(console_of(progress), ConversionReport("view"))
+    source = source_of(clouds[0][1], look, reading)
+    if output is None:
+        viewer.show(run, clouds, source, title, port or 0, browser, click.echo)
+    else:
+        how = {"live": live, "slices": slices, "overwrite": overwrite}
+        viewer.save(run, clouds, source, os.fspath(output), title=title, **how)
 
 
 @click.command("view", cls=SectionedCommand, short_help="Show Gaussians or a volume in a browser, or save a page.")
@@ -43,11 +95,7 @@ from vvgt_cli.progress import Console
 @placed_read_options
 @overwrite_option
 @common_options
-def command(
-    files: tuple[str, ...], output: str | None, port: int | None, browser: bool, live: bool, slices: bool,
-    title: str | None, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any], overwrite: bool,
-    console: Console,
-) -> None:  # fmt: skip
+def command(**options: Any) -> None:
     """Show FILE in a browser: Gaussians in any supported format, or a volume.
 
     A volume appears within seconds. If its transfer function is changed in the page, the volume is converted for it in
@@ -73,14 +121,4 @@ def command(
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html
     """
-    from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.commands.view import ViewRequest, view
-    from vvgt_cli.errors import UsageError
-
-    if output is not None and (port is not None or not browser):
-        raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
-    if output is None and not (live and slices):
-        raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
-    source = source_request(files[0], read, optics, light)
-    request = ViewRequest(files, source, output, port or 0, browser, overwrite, live, slices, title)
-    view(request, click.echo, console)
+    view(**arguments(**options))

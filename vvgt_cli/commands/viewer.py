@@ -1,4 +1,4 @@
-"""`view`: Gaussians shown in a browser by a local server, or written in another format."""
+"""Gaussians or a volume shown in a browser by a local server, or written in another format."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import time
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.commands.converter import Converter
 from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
@@ -43,69 +43,63 @@ from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.request import ConvertRequest
+
 TICK = 0.2  # seconds within which Ctrl-C is answered
 SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
 LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
-@dataclass(frozen=True)
-class ViewRequest:
-    """Gaussians or a volume to show.
-
-    Attributes:
-        files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume, or one
-            series of volumes: a glob, or a file of several time steps.
-        source: how to read the volume, and its function; left at its defaults for files of Gaussians.
-        output: file to write instead of showing, None for none.
-        port: of the server; 0 takes a free one.
-        browser: open one, if there is a display.
-        overwrite: replace the file if it exists.
-        live: let a page of a volume have a function editor.
-        slices: let it have slices.
-        title: title of the page; None: the file's own.
-    """
-
-    files: tuple[str, ...]
-    source: SourceRequest
-    output: str | None = None
-    port: int = 0
-    browser: bool = True
-    overwrite: bool = False
-    live: bool = True
-    slices: bool = True
-    title: str | None = None
+Clouds = Sequence[tuple[str, str]]  # name and file of each
 
 
-def view(request: ViewRequest, announce: Callable[[str], None], console: Console | None = None) -> None:
-    """Show Gaussians until an interrupt, or write them.
+def save(
+    run: Run, clouds: Clouds, source: SourceRequest, output: str, *, live: bool, slices: bool, title: str | None,
+    overwrite: bool,
+) -> None:  # fmt: skip
+    """Write Gaussians, or a volume that is converted, as `vvgt_cli.view` does."""
+    from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.request import ConvertRequest
 
-    Args:
-        request: files and options.
-        announce: called with the page's URL once it can be opened.
-        console: for messages.
-
-    Raises:
-        UsageError: several volumes, options of volumes with files of Gaussians, or a port or an output that cannot be
-            used.
-        DataError: a file that is not valid.
-    """
-    run = Run(console or Console(), ConversionReport("view"))
-    clouds = named_files(request.files)
-    if len(clouds) == 1 and _is_series(source := replace(request.source, volume=clouds[0][1])):
-        _show_series(run, request, source, announce)
-        return
-    if request.output is None:
-        _serve(run, request, clouds, announce)
-        return
+    file, request = clouds[0][1], ConvertRequest(source, editor=live and is_page(output), title=title)
     if len(clouds) > 1:
-        _join(run, request, clouds)
+        _join(run, output, clouds, source, overwrite)
+    elif _is_series(source):
+        if not is_page(output):
+            raise UsageError(f"-o {output}: holds one frame; expected a page (.html), or --time N")
+        convert_files(replace(request, output=output, overwrite=overwrite, slices=slices), console=run.console)
+    else:
+        with claimed([Output("-o", output, SUFFIXES, splats=True)], [file], overwrite):
+            gaussians, options, extras = _opened(run, file, request, slices and is_page(output))
+            write_gaussians(run, output, gaussians, options, overwrite, extras=extras)
+            run.compile(for_degree(DRAW, gaussians.degree))
+            report_agreement(run, output, gaussians, options)
+
+
+def show(
+    run: Run, clouds: Clouds, source: SourceRequest, title: str | None, port: int, browser: bool,
+    announce: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Show Gaussians or a volume until an interrupt; ``announce`` is called with the page's URL when it can be opened.
+
+    The server takes a free port for 0.
+    """
+    from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+
+    if len(clouds) > 1 or not _is_series(source):
+        _serve(run, clouds, source, port, browser, announce)
         return
-    file = clouds[0][1]
-    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
-        gaussians, options, extras = _opened(run, request, file)
-        write_gaussians(run, request.output, gaussians, options, request.overwrite, extras=extras)
-        run.compile(for_degree(DRAW, gaussians.degree))
-        report_agreement(run, request.output, gaussians, options)
+    with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
+        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=title)
+        try:
+            convert_files(quick, console=run.console)
+        except NoLiveForm as error:  # takes longer
+            run.console.message(f"converted without a live form: {error}")
+            convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
+        frames = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
+        _serve(run, frames, SourceRequest(source.path), port, browser, announce)
 
 
 def _is_series(source: SourceRequest) -> bool:
@@ -119,47 +113,21 @@ def _is_series(source: SourceRequest) -> bool:
     )
 
 
-def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce: Callable[[str], None]) -> None:
-    """Convert the frames of a volume: refined to a page that is written, or as live Gaussians that are shown."""
-    from vvgt_cli.conversion.convert_batch import convert_files
-    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
-
-    if request.output is not None:
-        if not is_page(request.output):
-            raise UsageError(f"-o {request.output}: holds one frame; expected a page (.html), or --time N")
-        whole = ConvertRequest(
-            source, request.output, overwrite=request.overwrite, title=request.title, editor=request.live,
-            slices=request.slices,
-        )  # fmt: skip
-        convert_files(whole, console=run.console)
-        return
-    with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=request.title)
-        try:
-            convert_files(quick, console=run.console)
-        except NoLiveForm as error:  # takes longer
-            run.console.message(f"converted without a live form: {error}")
-            convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
-        clouds = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
-        shown = replace(request, files=tuple(file for _, file in clouds), source=SourceRequest(source.path))
-        _serve(run, shown, clouds, announce)
-
-
-def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
+def _join(run: Run, output: str, clouds: Clouds, source: SourceRequest, overwrite: bool) -> None:
     """Write several files into one page."""
     files = [file for _, file in clouds]
     _only_gaussians(files)
-    _refuse_reading(request.source, files[0])
-    if request.output is None or not is_page(request.output):
+    _refuse_reading(source, files[0])
+    if not is_page(output):
         raise UsageError(
-            f"-o {request.output}: got {len(files)} files; expected a page (.html), which holds several "
+            f"-o {output}: got {len(files)} files; expected a page (.html), which holds several "
             "(one .glb, .usdc or .usdz of several labels is written by 'vvgt convert MAP --split-labels')"
         )
-    with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
+    with claimed([Output("-o", output, (".html",), splats=True)], files, overwrite):
         names = [name for name, _ in clouds]
         if len(set(names)) < len(names):
             names = list(files)
-        write_page(run, request.output, list(zip(names, files, strict=True)), request.overwrite)
+        write_page(run, output, list(zip(names, files, strict=True)), overwrite)
 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
@@ -184,28 +152,23 @@ def _only_gaussians(files: Sequence[str]) -> None:
         )
 
 
-def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, Extras]:
+def _opened(run: Run, name: str, request: ConvertRequest, slices: bool) -> tuple[Gaussians, PlyOptions, Extras]:
     """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
-    given = request.source
+    from vvgt_cli.conversion.convert import convert_in_memory
+
     if name == STDIN or is_splats(name):
-        _refuse_reading(given, name)
+        _refuse_reading(request.source, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
         return gaussians, replace(options, title=request.title or options.title), NO_EXTRAS
-    from vvgt_cli.conversion.convert import convert_in_memory
-    from vvgt_cli.conversion.request import ConvertRequest
-
-    editor = request.live and is_page(request.output)
-    conversion = convert_in_memory(
-        ConvertRequest(replace(given, volume=name), editor=editor, title=request.title), run.console
-    )
-    extras = conversion.extras(editor, request.slices, run) if is_page(request.output) else NO_EXTRAS
+    conversion = convert_in_memory(request, run.console)
+    extras = conversion.extras(request.editor, slices, run)
     return conversion.gaussians, conversion.ply, extras
 
 
 def _serve(
-    run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]], announce: Callable[[str], None]
-) -> None:  # fmt: skip
+    run: Run, clouds: Clouds, source: SourceRequest, port: int, browser: bool, announce: Callable[[str], None]
+) -> None:
     files = [file for _, file in clouds]
     if len(files) > 1:
         _only_gaussians(files)
@@ -215,7 +178,7 @@ def _serve(
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
         if given := files[0] == STDIN or is_splats(files[0]):
-            _refuse_reading(request.source, files[0])
+            _refuse_reading(source, files[0])
         if is_streamed(files[0]):
             resources |= streamed_resources(files[0])
         elif len(files) > 1:
@@ -223,15 +186,14 @@ def _serve(
         elif given:
             gaussians, header = open_gaussians(files[0])
             controller.show(ServedCloud(gaussians, layout_of(header), controller.name))
-        url = stack.enter_context(served(site, request.port))
+        url = stack.enter_context(served(site, port))
         if not resources.get(""):
-            source = replace(request.source, volume=files[0])
             converter = stack.enter_context(Converter(source, controller.name, controller.on_message))
             controller.await_volume(converter, partial(slices_in, source))
             controller.ready.wait(SOON)
         if controller.error is None:
             announce(url)
-            opened = request.browser and display() and webbrowser.open(url)
+            opened = browser and display() and webbrowser.open(url)
             run.console.message(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C stops")
         while controller.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
@@ -240,7 +202,7 @@ def _serve(
         raise controller.error
 
 
-def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
+def _series(clouds: Clouds) -> dict[str, Resource]:
     """Return the page of several files, and each file, read when it is requested."""
 
     def content(k: int) -> bytes:
