@@ -1,10 +1,39 @@
-"""`vvgt plugin`."""
+"""`vvgt plugin`: the adapters for other programs, what each does and how it is enabled, as its own file says."""
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import click
 
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.errors import UsageError
+
+FOLDER = Path(__file__).parents[1] / "integrations"
+PLUGINS = {  # file of each, in that folder; its docstring has the lines "Tried:" and "Enable:"
+    "pyvista": "pyvista.py",
+    "paraview": "paraview_plugin.py",
+    "catalyst": "catalyst.py",
+    "slicer": "slicer/GaussianSplats.py",
+    "napari": "napari.py",
+    "jupyter": "jupyter.py",
+    "xarray": "xarray.py",
+    "blender": "blender/gaussian_splats/__init__.py",
+}
+
+
+def plugin(name: str) -> tuple[Path, str, str, list[str]]:
+    """Return an adapter's file, what it does, the version it was tried with, and the lines that enable it.
+
+    They are those of the file's docstring, as its program may be missing.
+    """
+    path = FOLDER / PLUGINS[name]
+    lines = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()
+    tried = next(line.removeprefix("Tried:").strip() for line in lines if line.startswith("Tried:"))
+    places = {"file": path, "folder": path.parent, "above": path.parents[1]}
+    enable = [line.strip().format(**places) for line in lines[lines.index("Enable:") + 1 :]]
+    return path, lines[0], tried, list(filter(None, enable))
+
 
 
 @click.command(
@@ -18,14 +47,9 @@ def command(name: str | None) -> None:
       vvgt plugin
       vvgt plugin slicer
     """
-    from vvgt_cli.errors import UsageError
-    from vvgt_cli.integrations.plugins import PLUGINS, plugin
-
-    if name is None:
-        for found in map(plugin, PLUGINS):
-            click.echo(f"{found.name:<10}{found.does}\n{'':<10}tried with {found.tried}")
-    elif name in PLUGINS:
-        found = plugin(name)
-        click.echo("\n".join((str(found.path), *found.enable)))
-    else:
+    if name is not None and name not in PLUGINS:
         raise UsageError(f"no plugin {name!r}; expected one of {', '.join(PLUGINS)}")
+    for one in PLUGINS if name is None else [name]:
+        path, does, tried, enable = plugin(one)
+        short = f"{one:<10}{does}\n{'':<10}tried with {tried}"
+        click.echo(short if name is None else "\n".join((str(path), *enable)))
