@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera

@@ -12,6 +12,7 @@ import click
 
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import SECONDS, Measure, common_options, device_option, overwrite_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import UsageError
 
 FOLDER = Path(__file__).parents[1] / "integrations"
@@ -33,7 +34,6 @@ def plugin(name: str) -> tuple[Path, str, str, list[str]]:
     places = {"file": path, "folder": path.parent, "above": path.parents[1]}
     enable = [line.strip().format(**places) for line in lines[lines.index("Enable:") + 1 :]]
     return path, lines[0], tried, list(filter(None, enable))
-
 
 
 @click.command(

@@ -18,6 +18,7 @@ from vvgt_cli.cli.options import (
     tf_range_option,
     unit_distance_option,
 )
+from vvgt_cli.cli.sections import SectionedCommand
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Result

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_range_option
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
@@ -63,6 +63,7 @@ class Drawing:
     Attributes:
         source: files of Gaussians, None for an empty frame, or volumes; several are frames.
         function: look of live Gaussians; None: the file's.
+        facts: step, time and stem of each frame, for places in the output's name, as far as its input states them.
     """
 
     source: tuple[str | None, ...] | SourceRequest
@@ -76,6 +77,7 @@ class Drawing:
     exr: bool
     background: Sequence[float] | None
     overwrite: bool
+    facts: Sequence[Mapping[str, Any]] = ({},)
 
     @property
     def png(self) -> bool:
@@ -164,12 +166,12 @@ def draw_files(run: Run, request: Drawing) -> int:
     """
     given = request.source
     if not isinstance(given, SourceRequest):
-        return _render(run, request, given)
+        return _render(run, replace(request, facts=frame_facts(given)), given)
     file = given.volume if isinstance(given.volume, str) else ""
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(file)
     if not file or not (over_time or is_glob_of_volumes(file)):
         try:
-            return _render(run, replace(request, facts=frame_facts([given.path])), [given])
+            return _render(run, replace(request, facts=frame_facts([file or None])), [given])
         except SeveralSteps:  # which are the frames
             pass
     series = FrameSeries(ConvertRequest(given, request.output, blocks=request.blocks), Shard(), page=False)
