@@ -169,7 +169,7 @@ def draw_files(run: Run, request: Drawing) -> int:
         return _render(run, replace(request, facts=frame_facts(given)), given)
     file = given.volume if isinstance(given.volume, str) else ""
     over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(file)
-    if not file or not (over_time or is_glob_of_volumes(file)):
+    if not file or not (over_time or is_glob_of_volumes(given)):
         try:
             return _render(run, replace(request, facts=frame_facts([file or None])), [given])
         except SeveralSteps:  # which are the frames

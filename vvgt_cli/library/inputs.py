@@ -100,7 +100,7 @@ class Look:
     def asked(self) -> dict[str, Any]:
         """Return all but the layers, as attributes of a request; raise DataError for an invalid function or table."""
         distance = self.opacity_unit_distance
-        levels = [self.iso] if isinstance(self.iso, str | Real) else self.iso
+        levels: Any = [self.iso] if isinstance(self.iso, str | Real) else self.iso
         return {
             "tf": with_levels(function_of(self.tf), levels, self.labels),
             "tf_range": self.tf_range if isinstance(self.tf_range, str) else _numbers(self.tf_range),
