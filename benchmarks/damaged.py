@@ -19,7 +19,7 @@ import click
 import numpy as np
 from dvr_scenes import write_rows
 
-from vvgt_cli.cli.check import check
+from vvgt_cli.commands.check import check
 from vvgt_cli.gaussians.formats import read_columns
 from vvgt_cli.gaussians.formats.splats import Splats, opacities_of, ply_bytes
 from vvgt_cli.library.inputs import Look

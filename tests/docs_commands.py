@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.processes import replaced
 from tests.spared import spare
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 SIZES = {"convert": "--max-gaussians 200 --size 48", "init": "--max-gaussians 200", "render": "--size 48"}
 SIZES |= {"render-views": "--views 8 --test-views 2 --size 32", "evaluate": "--size 48 --no-conditions --step 1"}

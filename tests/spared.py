@@ -17,4 +17,4 @@ def spare() -> None:
 
 if __name__ == "__main__":
     spare()
-    import_module("vvgt_cli.cli.main").main()
+    import_module("vvgt_cli.commands.main").main()

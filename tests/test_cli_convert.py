@@ -193,7 +193,7 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
 
 
 def test_rules_are_the_tables():
-    from vvgt_cli.cli.fit import RULES as NAMES
+    from vvgt_cli.commands.options import RULES as NAMES
     from vvgt_cli.gaussians.rules import RULES
 
     assert tuple(RULES) == NAMES

@@ -5,8 +5,8 @@ import re
 import click
 import pytest
 
-from vvgt_cli.cli.main import COMMANDS, cli
-from vvgt_cli.cli.sections import SECTIONS, SectionedCommand
+from vvgt_cli.commands.main import COMMANDS, cli
+from vvgt_cli.commands.words import SECTIONS, SectionedCommand
 
 
 def options(command: str) -> list[click.Option]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vvgt_cli.cli.plugin import FOLDER, PLUGINS, plugin
+from vvgt_cli.commands.plugin import FOLDER, PLUGINS, plugin
 
 ROOT = Path(__file__).parents[1]
 

@@ -283,7 +283,7 @@ def test_bytes_for_pages_lose_little() -> None:
 
 @pytest.fixture(scope="module")
 def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     folder = tmp_path_factory.mktemp("live")
     (folder / "tf.json").write_text(json.dumps(TF))

@@ -13,9 +13,9 @@ from tifffile import imwrite
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.cli.render import render as write_views
 from vvgt_cli.commands import pictures as command
 from vvgt_cli.commands.pictures import write_movie
+from vvgt_cli.commands.render import render as write_views
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError

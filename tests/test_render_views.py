@@ -11,7 +11,7 @@ from tests.refused import refused
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
 from vvgt_cli.cameras import look_at
 from vvgt_cli.cameras.files import camera_to_opengl, read_cameras, transforms_json
-from vvgt_cli.commands.render_views import CameraRequest, function_name
+from vvgt_cli.commands.view_sets import CameraRequest, function_name
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load

@@ -8,7 +8,7 @@ import pytest
 
 from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
-from vvgt_cli.commands.render_views import CameraRequest
+from vvgt_cli.commands.view_sets import CameraRequest
 from vvgt_cli.conversion.manifest import Manifest, Shard, read_manifest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import cameras_digest, volume_digest

@@ -61,7 +61,7 @@ class Reader(HTMLParser):
 @pytest.fixture(scope="module")
 def scene_report(tmp_path_factory):
     """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
-    from vvgt_cli.cli.main import run as vvgt
+    from vvgt_cli.commands.main import run as vvgt
 
     folder = tmp_path_factory.mktemp("report")
     step = np.zeros(14)

@@ -17,7 +17,7 @@ import vvgt_cli as library
 from tests.headers import uncertified
 from tests.processes import replaced
 from tests.test_streamed import contents as files_in
-from vvgt_cli.cli import main
+from vvgt_cli.commands import main
 from vvgt_cli.conversion.frames import merge_statistics
 from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, frame_facts, is_pattern, put_name
 from vvgt_cli.errors import UsageError

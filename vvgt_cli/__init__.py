@@ -21,14 +21,14 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
-    from vvgt_cli.cli.check import check
-    from vvgt_cli.cli.evaluate import evaluate
-    from vvgt_cli.cli.infer import infer
-    from vvgt_cli.cli.optimize import optimize
-    from vvgt_cli.cli.recolor import recolor
-    from vvgt_cli.cli.render import render
-    from vvgt_cli.cli.synth import synth
-    from vvgt_cli.cli.view import view
+    from vvgt_cli.commands.check import check
+    from vvgt_cli.commands.evaluate import evaluate
+    from vvgt_cli.commands.infer import infer
+    from vvgt_cli.commands.optimize import optimize
+    from vvgt_cli.commands.recolor import recolor
+    from vvgt_cli.commands.render import render
+    from vvgt_cli.commands.synth import synth
+    from vvgt_cli.commands.view import view
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
-    "cli.check": ("check",),
-    "cli.evaluate": ("evaluate",),
-    "cli.infer": ("infer",),
-    "cli.optimize": ("optimize",),
-    "cli.recolor": ("recolor",),
-    "cli.render": ("render",),
-    "cli.synth": ("synth",),
-    "cli.view": ("view",),
+    "commands.check": ("check",),
+    "commands.evaluate": ("evaluate",),
+    "commands.infer": ("infer",),
+    "commands.optimize": ("optimize",),
+    "commands.recolor": ("recolor",),
+    "commands.render": ("render",),
+    "commands.synth": ("synth",),
+    "commands.view": ("view",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),

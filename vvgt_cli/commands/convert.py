@@ -7,43 +7,30 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, block_options_of
-from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option, target_option
-from vvgt_cli.cli.options import (
-    common_options,
-    device_option,
-    light_options,
-    optics_options,
-    output_option,
-    overwrite_option,
-    placed_read_options,
-    slices_option,
-    title_option,
-)
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.cli.typed import ASIDE, command_line, typed
+from vvgt_cli.commands import options as shared
+from vvgt_cli.commands.words import ASIDE, command_line, typed
 from vvgt_cli.defaults import MAX_STEPS, RULE, STEPS
 from vvgt_cli.progress import Console
 
 
-@click.command("convert", cls=SectionedCommand, short_help="Convert a volume to a .ply of Gaussians.")
+@shared.command("convert", short_help="Convert a volume to a .ply of Gaussians.")
 @click.argument("volume")
-@output_option
-@optics_options(" Repeatable: each function gets a file, named by {} in OUT.ply.", multiple=True)
-@target_option(
+@shared.output_option
+@shared.optics_options(" Repeatable: each function gets a file, named by {} in OUT.ply.", multiple=True)
+@shared.target_option(
     "Device to make the file for: sets --max-gaussians, --max-size, --size and --rule where they are not given, and "
     "scores it as seen there, on a headset by both eyes."
 )
-@fit_options
-@limit_options
-@light_options
+@shared.fit_options
+@shared.limit_options
+@shared.light_options
 @click.option(
     "--preview", metavar="P.png", help="Save volume, splats and difference side by side, in three test views."
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
-@title_option
-@overwrite_option
-@rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
+@shared.title_option
+@shared.overwrite_option
+@shared.rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help=f"Maximum number of gradient descent steps; 0 for none. Default: {STEPS}, or up to {MAX_STEPS} with a target "
@@ -54,10 +41,10 @@ from vvgt_cli.progress import Console
     help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function. By default, a "
     "page (.html) of one volume holds this form as well, for its editor of the function; --no-live omits it.",
 )  # fmt: skip
-@slices_option
+@shared.slices_option
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
-@ply_options
-@placed_read_options
+@shared.ply_options
+@shared.placed_read_options
 @click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
 @click.option(
     "--checkpoint", metavar="FOLDER",
@@ -68,10 +55,10 @@ from vvgt_cli.progress import Console
     help="Write one file per label of a label map, named by {} in OUT.ply, and an index; or one page (.html), or one "
     ".glb, .usdc or .usdz with a node per label and, with --layer, per layer.",
 )  # fmt: skip
-@device_option("views are drawn and steps are taken")
-@block_options
+@shared.device_option("views are drawn and steps are taken")
+@shared.block_options
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
-@common_options
+@shared.common_options
 def command(
     volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool | None, slices: bool,
     title: str | None, console: Console, blocks: dict[str, Any], **options: Any,
@@ -108,7 +95,7 @@ def command(
       vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
-    from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.commands.options import convert_request
     from vvgt_cli.conversion.convert_batch import convert_files
     from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.errors import UsageError
@@ -124,7 +111,7 @@ def command(
         raise UsageError(f"--no-live and --no-slices are for a page; got -o {request.output}; expected -o OUT.html")
     editor = live is None and is_page(request.output)
     request = replace(
-        request, blocks=block_options_of(blocks), live=bool(live), editor=editor, slices=slices,
+        request, blocks=shared.block_options_of(blocks), live=bool(live), editor=editor, slices=slices,
         command=line, title=title,
     )  # fmt: skip
     plan = convert_files(

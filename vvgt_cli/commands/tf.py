@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_range_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
+from vvgt_cli.commands.words import SectionedCommand
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,14 +20,17 @@ def command() -> None:
     """Show, convert and suggest transfer functions."""
 
 
-@command.command("show", cls=SectionedCommand, short_help="Draw a transfer function over a histogram.")
+command.command_class = SectionedCommand
+
+
+@command.command("show", short_help="Draw a transfer function over a histogram.")
 @click.argument("tf")
 @click.option("-o", "--output", required=True, metavar="OUT.png", help="Output file.")
 @click.option("--volume", metavar="VOLUME", help="Volume whose histogram is drawn behind the function.")
-@tf_range_option
-@read_options
-@overwrite_option
-@common_options
+@shared.tf_range_option
+@shared.read_options
+@shared.overwrite_option
+@shared.common_options
 def show(
     tf: str, output: str, volume: str | None, tf_range: str, read: dict[str, Any], overwrite: bool, console: Console
 ) -> None:
@@ -54,16 +57,16 @@ def show(
     draw(function, stats, output, overwrite)
 
 
-@command.command("convert", cls=SectionedCommand, short_help="Write a transfer function in another format.")
+@command.command("convert", short_help="Write a transfer function in another format.")
 @click.argument("tf", metavar="IN")
 @click.argument("output", metavar="OUT")
 @click.option(
     "--format", "form", type=click.Choice(["minimal", "paraview"]), default="minimal", show_default=True,
     help="Minimal JSON, which stores the unit distance, or a ParaView preset, which stores midpoints and sharpness.",
 )  # fmt: skip
-@tf_range_option
-@overwrite_option
-@common_options
+@shared.tf_range_option
+@shared.overwrite_option
+@shared.common_options
 def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, console: Console) -> None:
     """Convert the transfer function IN (any supported format, or the name of a colour map) to the JSON file OUT.
 
@@ -96,8 +99,8 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
     write_text(output, text, overwrite)
 
 
-@command.command("list", cls=SectionedCommand, short_help="List the named functions.")
-@common_options
+@command.command("list", short_help="List the named functions.")
+@shared.common_options
 def list_named(console: Console) -> None:
     """Print the names of the built-in functions, which --tf and 'vvgt tf' accept, and what each shows.
 
@@ -112,16 +115,16 @@ def list_named(console: Console) -> None:
         click.echo(f"{name:<{max(map(len, found)) + 2}}{shows}")
 
 
-@command.command("suggest", cls=SectionedCommand, short_help="Suggest functions that each show one range of values.")
+@command.command("suggest", short_help="Suggest functions that each show one range of values.")
 @click.argument("volume")
 @click.option(
     "-n", "--number", type=click.IntRange(1, 100), default=10, show_default=True, metavar="N",
     help="Number of functions.",
 )  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="DIR", help="Output directory, created if missing.")
-@read_options
-@overwrite_option
-@common_options
+@shared.read_options
+@shared.overwrite_option
+@shared.common_options
 def suggest_functions(
     volume: str, number: int, output: str, read: dict[str, Any], overwrite: bool, console: Console
 ) -> None:

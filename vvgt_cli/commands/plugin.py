@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 FOLDER = Path(__file__).parents[1] / "integrations"
@@ -36,9 +36,7 @@ def plugin(name: str) -> tuple[Path, str, str, list[str]]:
     return path, lines[0], tried, list(filter(None, enable))
 
 
-@click.command(
-    "plugin", cls=SectionedCommand, short_help="List the adapters for other programs, or say how one is enabled."
-)
+@shared.command("plugin", short_help="List the adapters for other programs, or say how one is enabled.")
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
     """List the adapters for the programs that volumes are open in; with NAME, print its file and how it is enabled.

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.options import (
-    common_options,
-    iso_option,
-    layer_looks_option,
-    output_option,
-    overwrite_option,
-    relight_options,
-    tf_range_option,
-    unit_distance_option,
-)
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Result
@@ -82,24 +72,24 @@ def recolor(
     return written(make, "recolor", inputs, output, overwrite=overwrite, progress=progress, suffixes=SUFFIXES)
 
 
-@click.command("recolor", cls=SectionedCommand, short_help="Show a live .ply under another function or light.")
+@shared.command("recolor", short_help="Show a live .ply under another function or light.")
 @click.argument("ply", metavar="LIVE.ply")
 @click.option(
     "--tf", metavar="TF",
     help="Transfer function: a file or the name of a matplotlib colour map. Default: the file's own.",
 )  # fmt: skip
-@iso_option
-@output_option
+@shared.iso_option
+@shared.output_option
 @click.option(
     "--labels", metavar="TABLE|auto",
     help="Table of labels, for a file of a label map; opacity 0 hides a label. Default: the file's own.",
 )  # fmt: skip
-@layer_looks_option
-@tf_range_option
-@unit_distance_option
-@relight_options
-@overwrite_option
-@common_options
+@shared.layer_looks_option
+@shared.tf_range_option
+@shared.unit_distance_option
+@shared.relight_options
+@shared.overwrite_option
+@shared.common_options
 def command(console: Console, **options: Any) -> None:
     """Write LIVE.ply, made by 'vvgt convert --live', as an ordinary file under another function, table or light.
 

@@ -6,10 +6,8 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, block_options_of
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
-from vvgt_cli.cli.sections import SectionedCommand
-from vvgt_cli.cli.typed import command_line, typed
+from vvgt_cli.commands import options as shared
+from vvgt_cli.commands.words import command_line, typed
 from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
@@ -17,7 +15,7 @@ from vvgt_cli.progress import Console
 COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "quiet"}
 
 
-@click.command("report", cls=SectionedCommand, short_help="Plot error against run time, as an HTML page and tables.")
+@shared.command("report", short_help="Plot error against run time, as an HTML page and tables.")
 @click.argument("paths", nargs=-1, required=True, metavar="VOLUME | A.json B.json ...")
 @click.option("-o", "--output", required=True, metavar="DIR", help="Output folder, created if missing.")
 @click.option(
@@ -50,12 +48,12 @@ COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "qui
     "any.",
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed.")
-@tf_options
-@light_options
-@read_options
-@block_options
-@overwrite_option
-@common_options
+@shared.tf_options
+@shared.light_options
+@shared.read_options
+@shared.block_options
+@shared.overwrite_option
+@shared.common_options
 @click.pass_context
 def command(
     ctx: click.Context, /, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
@@ -86,7 +84,7 @@ def command(
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
     runs = report_runs.RunOptions(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
-        block_options_of(options["blocks"]), peers=tuple(map(Peer.of, options["peers"])),
+        shared.block_options_of(options["blocks"]), peers=tuple(map(Peer.of, options["peers"])),
     )  # fmt: skip
     source = source_of(paths[0], Look(**options["optics"], light=options["light"]), options["read"])
     report_runs.report(

@@ -42,7 +42,7 @@ def end_on_signals() -> None:
     """Make SIGTERM, SIGINT and SIGHUP (unless ignored, as under nohup) end the process like an exception.
 
     A compiled kernel that is running may replace the exception, so the signal is also recorded in `received`, which
-    `vvgt_cli.cli.main.run` reads.
+    `vvgt_cli.commands.main.run` reads.
 
     Python runs signal handlers between its own instructions, so a long kernel would delay them. A second thread
     therefore ends a process that has not ended after `GRACE` seconds, without unwinding but without temporary files

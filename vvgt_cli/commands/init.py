@@ -7,32 +7,22 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import shared_block_options
-from vvgt_cli.cli.fit import fit_options, ply_options
-from vvgt_cli.cli.options import (
-    common_options,
-    light_options,
-    output_option,
-    overwrite_option,
-    placed_read_options,
-    tf_options,
-)
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("init", cls=SectionedCommand, short_help="Compute the closed form only, without rendering.")
+@shared.command("init", short_help="Compute the closed form only, without rendering.")
 @click.argument("volume")
-@output_option
-@tf_options
-@fit_options
-@light_options
-@overwrite_option
-@ply_options
-@placed_read_options
+@shared.output_option
+@shared.tf_options
+@shared.fit_options
+@shared.light_options
+@shared.overwrite_option
+@shared.ply_options
+@shared.placed_read_options
 @click.option("--report", metavar="R.json", help="Save the times of all stages as JSON; - is standard output.")
-@shared_block_options
-@common_options
+@shared.shared_block_options
+@shared.common_options
 def command(volume: str, console: Console, blocks: dict[str, Any], **options: Any) -> None:
     """Compute Gaussians of VOLUME in closed form, without rendering an image.
 
@@ -45,8 +35,7 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
       vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G
     """
-    from vvgt_cli.cli.blocks import block_options_of
-    from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.commands.options import block_options_of, convert_request
     from vvgt_cli.conversion.convert import initialise_only
     from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
     from vvgt_cli.field.open import automatic

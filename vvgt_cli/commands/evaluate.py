@@ -6,10 +6,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import arguments, block_options
-from vvgt_cli.cli.fit import rule_option, target_option
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 
 if TYPE_CHECKING:
     from vvgt_cli.commands.evaluation import Evaluation
@@ -54,15 +51,17 @@ def evaluate(
     )  # fmt: skip
 
 
-@click.command("evaluate", cls=SectionedCommand, short_help="Measure the error of a .ply against its volume.")
+@shared.command("evaluate", short_help="Measure the error of a .ply against its volume.")
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--volume", required=True, metavar="VOLUME", help="Volume that OUT.ply was made from.")
 @click.option(
     "--size", type=click.IntRange(16, 8192), metavar="PX",
     help="Image size to score at. Default: the size recorded in the file, or 400.",
 )  # fmt: skip
-@rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
-@target_option("Device to score it on: by its size and rule unless given, on a headset also as both eyes see it.")
+@shared.rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
+@shared.target_option(
+    "Device to score it on: by its size and rule unless given, on a headset also as both eyes see it."
+)
 @click.option(
     "--no-conditions", "conditions", is_flag=True, default=True, flag_value=False,
     help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
@@ -76,12 +75,12 @@ def evaluate(
     help="Save volume, splats and difference side by side, from the side and close up.",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
-@tf_options
-@light_options
-@placed_read_options
-@block_options
-@overwrite_option
-@common_options
+@shared.tf_options
+@shared.light_options
+@shared.placed_read_options
+@shared.block_options
+@shared.overwrite_option
+@shared.common_options
 def command(as_json: bool, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
@@ -97,5 +96,5 @@ def command(as_json: bool, **options: Any) -> None:
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    scores = evaluate(**arguments(**options))
+    scores = evaluate(**shared.arguments(**options))
     click.echo(scores.to_json() if as_json else scores.table(), nl=False)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
@@ -52,7 +51,7 @@ def infer(
     return written(make, "infer", [name], output, report, overwrite=overwrite, progress=progress)
 
 
-@click.command("infer", cls=SectionedCommand, short_help="Improve a .ply with an exported network.")
+@shared.command("infer", short_help="Improve a .ply with an exported network.")
 @click.argument("ply", metavar="IN.ply")
 @click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
 @click.option(
@@ -63,8 +62,8 @@ def infer(
     "--provider", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Device for onnxruntime."
 )
 @click.option("--report", metavar="FILE.json", help="Save stages, times and scores as JSON.")
-@overwrite_option
-@common_options
+@shared.overwrite_option
+@shared.common_options
 def command(console: Console, **options: Any) -> None:
     """Improve the Gaussians of IN.ply with a network that looks at views of their volume.
 

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import arguments
-from vvgt_cli.cli.options import common_options, light_options, read_options, tf_options
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -62,9 +60,7 @@ def check(
     return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 
 
-@click.command(
-    "check", cls=SectionedCommand, short_help="Test this installation, how stiff a scene is, or a file of Gaussians."
-)
+@shared.command("check", short_help="Test this installation, how stiff a scene is, or a file of Gaussians.")
 @click.argument("file", metavar="VOLUME|GAUSSIANS", required=False)
 @click.option("--volume", metavar="VOLUME", help="Volume that GAUSSIANS were made from.")
 @click.option(
@@ -73,10 +69,10 @@ def check(
     "of GAUSSIANS may have, default 0.056 (25 dB).",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
-@tf_options
-@light_options
-@read_options
-@common_options
+@shared.tf_options
+@shared.light_options
+@shared.read_options
+@shared.common_options
 def command(file: str | None, volume: str | None, as_json: bool, **options: Any) -> None:
     """Test this installation and print a table; exit status 1 if a case fails.
 
@@ -102,7 +98,7 @@ def command(file: str | None, volume: str | None, as_json: bool, **options: Any)
     if given and volume is None and (file is None or is_splats(file)):
         names = ", ".join(f"--{flags.get(key, key).replace('_', '-')}" for key in given)
         raise UsageError(f"{names}: only with a volume; expected {'--volume' if file else 'VOLUME'} too")
-    report = check(file, volume=volume, **arguments(**options))
+    report = check(file, volume=volume, **shared.arguments(**options))
     click.echo(report.to_json() if as_json else report.table(), nl=False)
     if report.failed:
         names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.options import common_options
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("train", cls=SectionedCommand, short_help="Train the network on volumes.")
+@shared.command("train", short_help="Train the network on volumes.")
 @click.option(
     "--data", required=True, metavar="DIR",
     help="Folder with volumes in DIR/train and DIR/held; scenes are cached in DIR/scenes.",
@@ -18,7 +17,7 @@ from vvgt_cli.progress import Console
 @click.option(
     "--config", "path", metavar="FILE.yaml", help="Settings that differ from the defaults, or a run's config.yaml."
 )
-@common_options
+@shared.common_options
 def command(data: str, output: str, path: str | None, console: Console) -> None:
     """Train a network on scenes made from the volumes in DIR, keeping the best on held-out scenes.
 
@@ -27,7 +26,7 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     step), held.csv (one row per evaluation), last.pt, best.pt, and tensorboard/ if TensorBoard is installed.
 
     After SIGTERM or Ctrl-C the current step is saved; run the same command again to resume with identical results. To
-    use several processes: torchrun --nproc-per-node N -m vvgt_cli.cli.main train ... Requires torch and PyYAML:
+    use several processes: torchrun --nproc-per-node N -m vvgt_cli.commands.main train ... Requires torch and PyYAML:
     install vvgt[train].
 
     Example:
@@ -39,7 +38,7 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     """
     import sys
 
-    from vvgt_cli.cli.process import ending
+    from vvgt_cli.commands.process import ending
     from vvgt_cli.errors import UsageError
 
     try:

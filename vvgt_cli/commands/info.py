@@ -6,30 +6,22 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import (
-    common_options,
-    iso_option,
-    layer_looks_option,
-    placed_read_options,
-    tf_range_option,
-    unit_distance_option,
-)
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
+@shared.command("info", short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file", required=False)
 @click.option("--machine", is_flag=True, help="Describe this machine instead: processors, memory, GPU.")
 @click.option("--sharing", is_flag=True, help="Describe what leaves with a file of Gaussians: names, places, values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
-@iso_option
-@layer_looks_option
-@tf_range_option
-@unit_distance_option
-@placed_read_options
-@common_options
+@shared.iso_option
+@shared.layer_looks_option
+@shared.tf_range_option
+@shared.unit_distance_option
+@shared.placed_read_options
+@shared.common_options
 def command(
     file: str | None, machine: bool, sharing: bool, as_json: bool, tf: str | None, layers: tuple[str, ...],
     tf_range: str, opacity_unit_distance: str | None, read: dict[str, Any], console: Console,

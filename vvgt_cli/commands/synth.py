@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -68,9 +67,7 @@ def synth(
     return volume
 
 
-@click.command(
-    "synth", cls=SectionedCommand, short_help="Make a synthetic volume: turbulence, or shapes like those in CT and MR."
-)
+@shared.command("synth", short_help="Make a synthetic volume: turbulence, or shapes like those in CT and MR.")
 @click.argument("kind", metavar="KIND", type=click.Choice(KINDS))
 @click.option("-o", "--output", required=True, metavar="FILE.nrrd", help="Output file: NRRD, float32.")
 @click.option(
@@ -86,8 +83,8 @@ def synth(
     "--turnovers", type=click.FloatRange(0, 100), metavar="T",
     help="Time for turbulence to develop, in turnovers of the largest eddies. Default: 2.",
 )  # fmt: skip
-@overwrite_option
-@common_options
+@shared.overwrite_option
+@shared.common_options
 def command(console: Console, **options: Any) -> None:
     """Make a volume that resembles measured or simulated data, for training and experiments.
 

@@ -16,8 +16,8 @@ from difflib import get_close_matches
 
 import click
 
-from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import ENDING, end_on_signals, first_of_group, leave, open_streams, received
+from vvgt_cli.commands.process import ENDING, end_on_signals, first_of_group, leave, open_streams, received
+from vvgt_cli.commands.words import expand
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console, Once
@@ -47,7 +47,7 @@ class LazyGroup(click.Group):
         """Import and return a command, None if there is none of this name."""
         if cmd_name not in COMMANDS:
             return None
-        result: click.Command = importlib.import_module(f"vvgt_cli.cli.{cmd_name.replace('-', '_')}").command
+        result: click.Command = importlib.import_module(f"vvgt_cli.commands.{cmd_name.replace('-', '_')}").command
         return result
 
     def resolve_command(
@@ -64,7 +64,7 @@ class LazyGroup(click.Group):
 
 def _describe(context: click.Context, parameter: click.Parameter, given: bool) -> None:
     if given:
-        from vvgt_cli.cli.slicer import description
+        from vvgt_cli.commands.slicer import description
 
         click.echo(description())
         context.exit()
@@ -125,7 +125,7 @@ def run(args: Sequence[str] | None = None) -> int:
     try:
         words, console = list(sys.argv[1:] if args is None else args), Console
         if words[:1] == ["--slicer"]:
-            from vvgt_cli.cli.slicer import SlicerConsole, arguments
+            from vvgt_cli.commands.slicer import SlicerConsole, arguments
 
             words, console = arguments(words[1:]), SlicerConsole
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own

@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape
 
 import click
 
-from vvgt_cli.cli.convert import command
+from vvgt_cli.commands.convert import command
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.version import VERSION
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("export", cls=SectionedCommand, short_help="Export a trained network as a model for infer.")
+@shared.command("export", short_help="Export a trained network as a model for infer.")
 @click.argument("checkpoint", metavar="CHECKPOINT")
 @click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create; its name becomes the model's.")
 @click.option(
     "--storage", type=click.Choice(["float32", "float16"]), default="float32", show_default=True,
     help="Storage type of the weights; float16 halves the files, computation stays float32.",
 )  # fmt: skip
-@overwrite_option
-@common_options
+@shared.overwrite_option
+@shared.common_options
 def command(checkpoint: str, output: str, storage: str, overwrite: bool, console: Console) -> None:
     """Write the network of CHECKPOINT as two ONNX graphs and a model card.
 

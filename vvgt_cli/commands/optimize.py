@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import click
 
-from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import SECONDS, Measure, common_options, device_option, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -71,7 +69,7 @@ def optimize(
     if max_gaussians is not None and method != "3dgs":
         raise UsageError(f"--max-gaussians applies to --method 3dgs; --method {method} does not change the number")
     if (steps is None) == (time_budget is None):
-        raise UsageError("give either --steps N or --time-budget SECONDS")
+        raise UsageError("give either --steps N or --time-budget shared.SECONDS")
     kept = None if checkpoint is None else os.fspath(checkpoint)
     how = OptimizeOptions.of(
         method, steps=steps, time_budget=time_budget, target_psnr=target_psnr, max_gaussians=max_gaussians, seed=seed,
@@ -84,7 +82,7 @@ def optimize(
     return written(make, "optimize", inputs, output, report, overwrite=overwrite, progress=progress)
 
 
-@click.command("optimize", cls=SectionedCommand, short_help="Refine a .ply by gradient descent on views.")
+@shared.command("optimize", short_help="Refine a .ply by gradient descent on views.")
 @click.argument("ply", metavar="IN.ply")
 @click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
 @click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
@@ -92,7 +90,7 @@ def optimize(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N", help="Maximum number of steps, one view each."
 )
 @click.option(
-    "--time-budget", type=Measure("time", SECONDS), metavar="TIME",
+    "--time-budget", type=shared.Measure("time", shared.SECONDS), metavar="TIME",
     help="Time for the descent, such as 90 or 10m, instead of --steps.",
 )  # fmt: skip
 @click.option(
@@ -114,7 +112,7 @@ def optimize(
     "--size", type=click.IntRange(16, 8192), metavar="PX",
     help="Screen size to optimise for, in pixels. Default: the size recorded in IN.ply, or that of the views.",
 )  # fmt: skip
-@rule_option("Viewer to optimise for. Default: the one recorded in IN.ply, or inria.")
+@shared.rule_option("Viewer to optimise for. Default: the one recorded in IN.ply, or inria.")
 @click.option(
     "--sh-degree", type=click.IntRange(0, 3), metavar="N",
     help="Degree of the spherical harmonics to refine; missing ones start at 0. Default: that of IN.ply.",
@@ -123,9 +121,9 @@ def optimize(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
 )
 @click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
-@device_option("steps of --method frame are taken")
-@overwrite_option
-@common_options
+@shared.device_option("steps of --method frame are taken")
+@shared.overwrite_option
+@shared.common_options
 def command(console: Console, **options: Any) -> None:
     """Refine IN.ply so that its pictures match the views in DIR.
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("merge", cls=SectionedCommand, short_help="Merge the blocks of 'init --shard' into a .ply.")
+@shared.command("merge", short_help="Merge the blocks of 'init --shard' into a .ply.")
 @click.argument("folder")
 @click.option(
     "-o", "--output", required=True, metavar="OUT.ply",
     help="Output file, or FOLDER/lod-meta.json for streamed levels; - is standard output.",
 )  # fmt: skip
-@overwrite_option
-@common_options
+@shared.overwrite_option
+@shared.common_options
 def command(folder: str, output: str, overwrite: bool, console: Console) -> None:
     """Merge the blocks that 'vvgt init --shard I/N' has written to FOLDER into a .ply.
 

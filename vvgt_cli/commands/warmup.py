@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.options import common_options
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.progress import Console
 
 
-@click.command("warmup", cls=SectionedCommand, short_help="Compile the kernels ahead of time.")
-@common_options
+@shared.command("warmup", short_help="Compile the kernels ahead of time.")
+@shared.common_options
 def command(console: Console) -> None:
     """Compile the numerical kernels ahead of time and print the folder where they are stored.
 

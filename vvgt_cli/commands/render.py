@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import arguments, block_options
-from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -74,7 +71,7 @@ def render(
     return draw_files(run, Drawing(given, function, blocks_of(blocks), *how))
 
 
-@click.command("render", cls=SectionedCommand, short_help="Render pictures or a movie of Gaussians or a volume.")
+@shared.command("render", short_help="Render pictures or a movie of Gaussians or a volume.")
 @click.argument("file", metavar="FILE")
 @click.option("--camera", metavar="FILE", help="Camera poses from a transforms.json, in the unit frame.")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the up axis.")
@@ -92,17 +89,17 @@ def render(
     "--background", type=float, nargs=3, metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )  # fmt: skip
-@tf_options
-@light_options
-@rule_option(
+@shared.tf_options
+@shared.light_options
+@shared.rule_option(
     "Viewer to imitate when drawing Gaussians; mip and xray show the values of a volume or a live file in grey. "
     "Default: the one recorded in the file, or inria.",
     more=("mip", "xray"),
 )
-@placed_read_options
-@block_options
-@overwrite_option
-@common_options
+@shared.placed_read_options
+@shared.block_options
+@shared.overwrite_option
+@shared.common_options
 def command(**options: Any) -> None:
     """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
@@ -124,4 +121,4 @@ def command(**options: Any) -> None:
       vvgt render 'run_*.vti' --tf viridis -o time.mp4
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
-    render(**arguments(**options))
+    render(**shared.arguments(**options))

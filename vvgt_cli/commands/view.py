@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
-from vvgt_cli.cli.blocks import arguments
-from vvgt_cli.cli.options import (
-    common_options,
-    light_options,
-    overwrite_option,
-    placed_read_options,
-    slices_option,
-    tf_options,
-    title_option,
-)
-from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -71,7 +61,7 @@ def view(
         viewer.save(run, clouds, source, os.fspath(output), title=title, **how)
 
 
-@click.command("view", cls=SectionedCommand, short_help="Show Gaussians or a volume in a browser, or save a page.")
+@shared.command("view", short_help="Show Gaussians or a volume in a browser, or save a page.")
 @click.argument("files", metavar="FILE...", nargs=-1, required=True)
 @click.option(
     "-o", "--output", metavar="OUT.html",
@@ -88,13 +78,13 @@ def view(
     "--no-live", "live", is_flag=True, default=True, flag_value=False,
     help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
 )  # fmt: skip
-@slices_option
-@title_option
-@tf_options
-@light_options
-@placed_read_options
-@overwrite_option
-@common_options
+@shared.slices_option
+@shared.title_option
+@shared.tf_options
+@shared.light_options
+@shared.placed_read_options
+@shared.overwrite_option
+@shared.common_options
 def command(**options: Any) -> None:
     """Show FILE in a browser: Gaussians in any supported format, or a volume.
 
@@ -121,4 +111,4 @@ def command(**options: Any) -> None:
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html
     """
-    view(**arguments(**options))
+    view(**shared.arguments(**options))
