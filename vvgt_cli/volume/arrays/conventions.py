@@ -13,22 +13,14 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, Axis, axis
+from vvgt_cli.volume.headers import text_of
+from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis
 
 
-def text_of(value: Any) -> str:
-    """Return an attribute as text, the first of several."""
-    value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, str]]:
-    """Read a dataset of coordinates along an axis, float64, and the attributes that describe the axis."""
-    stated = {key: text_of(dataset.attrs[key]) for key in AXIS_ATTRIBUTES if key in dataset.attrs}
-    scale, offset = (
-        float(np.ravel(dataset.attrs.get(key, plain))[0]) for key, plain in (("scale_factor", 1), ("add_offset", 0))
-    )
-    return np.asarray(dataset[()], np.float64) * scale + offset, stated
+def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """Read a dataset of coordinates along an axis, as stored, and the attributes that describe them."""
+    stated = {key: dataset.attrs[key] for key in (*AXIS_ATTRIBUTES, *CF_ATTRIBUTES) if key in dataset.attrs}
+    return np.asarray(dataset[()]), stated
 
 
 def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:

@@ -14,10 +14,10 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, text_of
+from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.components import choose
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
     DESCRIBES,

@@ -119,8 +119,7 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
         found = group.variables.get(name)
         if found is not None and found.shape == (size,) and np.dtype(found.dtype).kind in "iuf":
             stated = {key: found.getncattr(key) for key in found.ncattrs()}
-            scale, offset = float(stated.get("scale_factor", 1.0)), float(stated.get("add_offset", 0.0))
-            return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, stated)
+            return axis(name, size, np.asarray(found[:]), stated)
         group = group.parent
     return axis(name, size)
 

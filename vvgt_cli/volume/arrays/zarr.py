@@ -7,6 +7,7 @@ unpickles.
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
         array = _array(zarr, place)
-        attributes = dict(array.attrs)
+        attributes = _marked(array)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
         return labelled_volume(
             lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
@@ -61,6 +62,20 @@ def _array(zarr: Any, place: Path) -> Any:
     if server:
         server.allow(min(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize, MAX_CHUNK))
     return array
+
+
+def _marked(array: Any) -> dict[str, Any]:
+    """Return an array's attributes with its ``_FillValue`` where xarray puts it.
+
+    That is the fill value of a version 2 array with named dimensions; version 3 has floats of 8 bytes as base64.
+    """
+    attributes = dict(array.attrs)
+    if "_ARRAY_DIMENSIONS" in attributes and array.fill_value is not None:
+        attributes.setdefault("_FillValue", array.fill_value)
+    text = attributes.get("_FillValue")
+    if isinstance(text, str) and len(text) == 12:
+        attributes["_FillValue"] = np.frombuffer(base64.b64decode(text), "<f8")
+    return attributes
 
 
 def name_in(path: Path, place: Path) -> str:
@@ -190,9 +205,9 @@ def _axes(
             axes.append(axis(name, size))
             continue
         _check_codecs(beside, coordinate)
-        centres = np.asarray(_array(zarr, beside)[:size])
-        numbers = centres.dtype.kind in "iuf"
-        axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
+        stored = _array(zarr, beside)
+        centres = np.asarray(stored[:size]) if stored.dtype.kind in "iuf" else None
+        axes.append(axis(name, size, centres, _marked(stored)))
     return axes
 
 

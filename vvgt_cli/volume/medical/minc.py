@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, volume_name
