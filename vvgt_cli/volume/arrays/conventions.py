@@ -1,4 +1,4 @@
-"""Axes that conventions on top of HDF5 state: openPMD, NeXus, ilastik, and voxel sizes as Fiji's plugin writes them.
+"""Axes that conventions on top of HDF5 state: openPMD, NeXus, Velox, ilastik, and voxel sizes of Fiji's plugin.
 
 Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standard), NXdata of the NeXus manual
 (https://manual.nexusformat.org), vigra's ``axistags``.
@@ -7,6 +7,7 @@ Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standa
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +20,8 @@ from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis
 
 def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
     """Read a dataset of coordinates along an axis, as stored, and the attributes that describe them."""
-    stated = {key: dataset.attrs[key] for key in (*AXIS_ATTRIBUTES, *CF_ATTRIBUTES) if key in dataset.attrs}
+    keys = ("name", *AXIS_ATTRIBUTES, *CF_ATTRIBUTES)
+    stated = {key: dataset.attrs[key] for key in keys if key in dataset.attrs}
     return np.asarray(dataset[()]), stated
 
 
@@ -34,6 +36,8 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     found: list[Axis] = []
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
         found = _nexus(group, dataset)
+    elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
+        found = _velox(group, dataset)
     elif "axistags" in dataset.attrs:
         found = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
@@ -94,6 +98,18 @@ def _nexus(group: Any, dataset: Any) -> list[Axis]:
             continue
         axes.append(axis(name, size, *coordinates_of(beside)))
     return axes
+
+
+def _velox(group: Any, dataset: Any) -> list[Axis]:
+    """Return the axes y, x and frames of an image of Velox; its metadata are JSON in bytes, a column a frame."""
+    stated = group["Metadata"][:, 0].tobytes().partition(b"\0")[0] if "Metadata" in group else b"{}"
+    facts = json.loads(stated).get("BinaryResult", {})
+    axes = []
+    for name, side, size in zip("yx", ("height", "width"), dataset.shape, strict=False):
+        step = float(facts.get("PixelSize", {}).get(side) or 0)
+        centres = step * np.arange(size) if step > 0 else None
+        axes.append(axis(name, size, centres, {"units": facts.get(f"PixelUnit{name.upper()}", "")}))
+    return [*axes, Axis("frame", dataset.shape[2], None, "", "t")]
 
 
 def _vigra(tags: Sequence[Any], dataset: Any) -> list[Axis]:
