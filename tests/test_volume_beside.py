@@ -70,7 +70,7 @@ def test_arrays_that_may_be_coordinates_are_named(tmp_path: Path, form: str) -> 
         ({"field": VALUES[:, ::-1], "x": X, "y": Y[::-1], "z": Z}, {}, ""),
         ({"field": VALUES, "X (um)": X, "Y (um)": Y, "Z (um)": Z}, {}, "um"),
         ({"field": VALUES.T, "x_mm": X, "y_mm": Y, "z_mm": Z}, {}, "mm"),
-        ({"field": VALUES, "x": X[None], "y": Y[None], "z": Z[:, None]}, dict.fromkeys("xyz", {"units": "nm"}), "nm"),
+        ({"field": VALUES, "x": X[None], "y": Y[None], "z": Z[:, None]}, {key: {"units": "nm"} for key in "xyz"}, "nm"),
         ({"fields/rho": VALUES, "coords/x": X, "coords/y": Y, "coords/z": Z}, {}, ""),
         ({"data": VALUES} | {f"dim{k}": line for k, line in enumerate((Z, Y, X), 1)},
          {"dim3": {"name": "x", "units": "[n_m]"}, "dim1": {"name": "z", "units": "[n_m]"},
