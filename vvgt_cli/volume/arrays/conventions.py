@@ -36,6 +36,8 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     found: list[Axis] = []
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
         found = _nexus(group, dataset)
+    elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
+        return _bigdataviewer(file[view[1]], int(view[2]), dataset)
     elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
         found = _velox(group, dataset)
     elif "axistags" in dataset.attrs:
@@ -98,6 +100,18 @@ def _nexus(group: Any, dataset: Any) -> list[Axis]:
             continue
         axes.append(axis(name, size, *coordinates_of(beside)))
     return axes
+
+
+def _bigdataviewer(setup: Any, level: int, dataset: Any) -> tuple[list[Axis], dict[str, Any]]:
+    """Return the axes of a view of BigDataViewer in voxels of the finest level, and the sign of its values.
+
+    Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
+    """
+    axes = []
+    for name, size, factor in zip("zyx", dataset.shape, setup["resolutions"][level][::-1], strict=True):
+        axes.append(axis(name, size, (factor - 1) / 2 + factor * np.arange(size)))
+    unsigned = text_of(setup.attrs.get("dataType", "uint16")).startswith("uint")
+    return axes, {"_Unsigned": "true"} if unsigned else {}
 
 
 def _velox(group: Any, dataset: Any) -> list[Axis]:

@@ -31,6 +31,7 @@ from vvgt_cli.volume.labelled import (
     labelled_volume,
 )
 from vvgt_cli.volume.libraries import library_errors, need, read_part
+from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -41,13 +42,22 @@ MAX_BESIDE = 1000  # members of a group that are looked at for coordinates
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> Volume:
-    """Read one dataset of an HDF5 file."""
+    """Read one dataset of an HDF5 file, or what Imaris or BigDataViewer have in one."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         if is_imaris(file):
             return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
-        if options.level is not None:
-            raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
+    if (volume := bigdataviewer.read_beside(path, options)) is not None:
+        return volume
+    if options.level is not None:
+        raise UsageError(f"{path}: of neither Imaris nor BigDataViewer, which have levels; leave out --level")
+    return read_dataset(path, options)
+
+
+def read_dataset(path: Path, options: ReadOptions) -> Volume:
+    """Read one dataset of an HDF5 file, as it is."""
+    h5py = need("h5py", "hdf5", str(path), "HDF5")
+    with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{printable(dataset.name)}"
         check_storage(h5py, dataset, path, source)
