@@ -51,12 +51,13 @@ class _Setup:
 
 @dataclass(frozen=True)
 class _Dataset:
-    """What an XML file says: the data, their kind (of `READ`), setups and time points.
+    """What an XML file says: the data, their kind (of `READ`), setups and time points; ``source`` is for messages.
 
     By time point and setup: ``affines`` (4, 4) from voxels to the world, views that are ``missing``, and ``groups`` of
     OME-Zarr.
     """
 
+    source: Path
     data: Path
     kind: str
     setups: Sequence[_Setup]
@@ -69,7 +70,7 @@ class _Dataset:
         """Return time and setup of a view, or of the setup's first where that one is missing."""
         views = ((t, setup.number) for t in (time, *self.times))
         if (view := next((view for view in views if view not in self.missing), None)) is None:
-            raise DataError(f"{self.data}: setup {setup.number} has no values at any time point; expected some")
+            raise DataError(f"{self.source}: setup {setup.number} has no values at any time point; expected some")
         return view
 
     def read(self, view: tuple[int, int], level: int) -> Volume:
@@ -107,11 +108,17 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
     if shapes := imaris.level_shapes(path, options):
         return shapes
     try:
-        with open(path, "rb") as file:
-            bdv = _described(path) if b"<SpimData" in file.read(4096) else _of_data(path, False)
+        bdv = _described(path) if _is_xml(path) else _of_data(path, False)
         return [] if bdv is None else bdv.levels(bdv.present(bdv.times[0], bdv.setups[0]))
     except (VvgtError, OSError):
         return []  # said where it is read
+
+
+def _is_xml(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return b"<SpimData" in file.read(4096)
 
 
 def _of_data(path: Path, tell: bool) -> _Dataset | None:
@@ -127,17 +134,17 @@ def _of_data(path: Path, tell: bool) -> _Dataset | None:
     if not views:
         return None
     for xml in sorted(path.resolve().parent.glob("*.xml")):
-        with open(xml, "rb") as file:
-            named = b"<SpimData" in file.read(4096)
-        if named and (bdv := _described(xml)).data.resolve() == path.resolve():
-            return bdv
+        if _is_xml(xml) and (bdv := _described(xml)).data.resolve() == path.resolve():
+            return replace(bdv, source=path)
     if tell:
         warnings.warn(
-            f"{path}: without the XML file of BigDataViewer that names it, voxel sizes are taken as 1; put it beside or "
+            f"{path}: without the XML file of BigDataViewer that names it, voxel sizes are taken as 1; add it, or "
             "state --spacing X Y Z", stacklevel=2,
         )  # fmt: skip
     times, setups = (sorted({view[k] for view in views}) for k in (0, 1))
-    return _Dataset(path, kind, [_Setup(s) for s in setups], times, missing={*itertools.product(times, setups)} - views)
+    return _Dataset(
+        path, path, kind, [_Setup(s) for s in setups], times, missing={*itertools.product(times, setups)} - views
+    )
 
 
 def _view_of(name: str) -> tuple[int, int, int] | None:
@@ -147,7 +154,7 @@ def _view_of(name: str) -> tuple[int, int, int] | None:
 
 
 def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
-    source, setups = str(bdv.data), bdv.setups
+    source, setups = str(bdv.source), bdv.setups
     if view := _view_of(options.array or ""):
         setups = [one for one in setups if one.number == view[1]]
         if not setups or view[0] not in bdv.times:
@@ -172,14 +179,16 @@ def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volu
     """Read a view, left in its file, at the place that its registration gives it."""
     view, level = bdv.present(time, setup), options.level or 0
     if level and level >= (count := len(bdv.levels(view))):
-        raise UsageError(f"{bdv.data}: --level {level}: expected full, or 0 to {count - 1}")
+        raise UsageError(f"{bdv.source}: --level {level}: expected full, or 0 to {count - 1}")
     finest, volume = bdv.read(view, 0), bdv.read(view, level)
     if len(setup.size) and [*finest.dims] != [*setup.size]:
         dims, stated = (" x ".join(f"{n:g}" for n in some) for some in (finest.dims, setup.size))
-        raise DataError(f"{bdv.data}: setup {setup.number} has {dims} voxels; expected {stated}, as its XML file says")
+        raise DataError(
+            f"{bdv.source}: setup {setup.number} has {dims} voxels; expected {stated}, as its XML file says"
+        )
     data = volume.data
     if view[0] != time:
-        warnings.warn(f"{bdv.data}: setup {setup.number} is missing at time point {time}: all 0", stacklevel=2)
+        warnings.warn(f"{bdv.source}: setup {setup.number} is missing at time point {time}: all 0", stacklevel=2)
         data = np.zeros(data.shape, data.dtype)
     factor = np.array(volume.spacing) / finest.spacing
     shift = (np.array(volume.origin) - finest.origin) / finest.spacing
@@ -191,20 +200,22 @@ def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volu
 def _affine(bdv: _Dataset, time: int, setup: _Setup) -> np.ndarray:
     """Return the affine (4, 4) of a view, voxels to the world.
 
-    Registrations often count in the smallest voxel size: with the proportions of the voxel sizes they are scaled to
-    them; others are taken as they are, with a message.
+    Registrations may count in voxels, turning nothing, or in the smallest voxel size: those with the proportions of
+    the voxel sizes are scaled to them. Others are taken as they are, with a message.
     """
     spacing = np.array(setup.spacing if len(setup.spacing) else (1.0, 1.0, 1.0))
     matrix = bdv.affines.get((time, setup.number), np.diag([*spacing, 1.0]))
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if not len(setup.spacing) or not lengths.all():
         return matrix
+    if np.array_equal(matrix[:3, :3], np.eye(3)):
+        return np.diag([*spacing, 1.0]) @ matrix
     ratio = spacing / lengths
     if np.ptp(ratio) <= ALIKE * ratio.max():
         return np.diag([ratio.mean()] * 3 + [1.0]) @ matrix
     steps, stated = (" ".join(f"{n:.4g}" for n in some) for some in (lengths, spacing))
     warnings.warn(
-        f"{bdv.data}: setup {setup.number} is registered with voxels of {steps}, which are taken, not its voxel size "
+        f"{bdv.source}: setup {setup.number} is registered with voxels of {steps}, which are taken, not its voxel size "
         f"{stated} (--spacing X Y Z sets it)", stacklevel=2,
     )  # fmt: skip
     return matrix
@@ -239,7 +250,7 @@ def _described(path: Path) -> _Dataset:
     homes = {path.parent.resolve(), path.resolve().parent}
     for place in (path.parent / (root.findtext("BasePath") or ".").strip() / inner, path.parent / inner.name):
         if inner.name and place.exists() and any(place.resolve().is_relative_to(home) for home in homes):
-            return _Dataset(place, kind, setups, times, affines, missing, groups)
+            return _Dataset(path, place, kind, setups, times, affines, missing, groups)
     raise DataError(f"{path}: its data {stated[:80]!r} are not beside it; expected {path.parent / inner.name}")
 
 
