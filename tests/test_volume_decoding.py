@@ -78,3 +78,30 @@ def test_zarr_marks_missing_values_as_xarray_does(tmp_path: Path, version: int, 
         volume = read_volume(str(tmp_path / "v.zarr"), ReadOptions(stored=blocks))
         assert (volume.spacing, volume.origin) == ((0.5, 1, 1), (0, 1, 0))
         np.testing.assert_allclose(decoded(tmp_path / "v.zarr", stored=blocks), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("prefix", ["", "counts_"])
+def test_fields_of_nexus_are_scaled(tmp_path: Path, prefix: str) -> None:
+    with h5py.File(tmp_path / "v.nxs", "w") as file:
+        group = file.create_group("entry/data")
+        group.attrs.update({"NX_class": "NXdata", "signal": "counts", "axes": ["z", "y", "x"]})
+        group["counts"] = np.resize(np.arange(50, dtype="u2"), (3, 4, 5))
+        group[f"{prefix}scaling_factor"], group[f"{prefix}offset"] = 0.5, -10.0
+        for name, size in zip("zyx", (3, 4, 5), strict=True):
+            group[name] = np.arange(size) * 2.0
+        stored = group["counts"][()].astype(float)
+    np.testing.assert_allclose(decoded(tmp_path / "v.nxs"), (stored - 10) * 0.5)
+
+
+def test_geometry_of_dream3d_and_of_groups(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "v.dream3d", "w") as file:
+        file["DataContainers/Image/CellData/Phase"] = np.zeros((3, 4, 5, 1), "f4")
+        geometry = file.create_group("DataContainers/Image/_SIMPL_GEOMETRY")
+        geometry["SPACING"], geometry["ORIGIN"] = np.array([0.25, 0.5, 2.0]), np.array([1.0, 2.0, 3.0])
+    volume = read_volume(str(tmp_path / "v.dream3d"))
+    assert (volume.spacing, volume.origin) == ((0.25, 0.5, 2), (1.125, 2.25, 4))
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file["a/b"] = np.zeros((3, 4, 5))
+        file["a"].attrs["voxel_size"] = [1.0, 2, 3]
+    with pytest.warns(UserWarning, match="attributes voxel_size are not read; --spacing X Y Z sets it"):
+        read_volume(str(tmp_path / "v.h5"))

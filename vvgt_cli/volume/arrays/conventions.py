@@ -1,4 +1,4 @@
-"""Axes that conventions on top of HDF5 state: openPMD, NeXus, Velox, ilastik, and voxel sizes of Fiji's plugin.
+"""Axes that conventions on top of HDF5 state: openPMD, NeXus, Velox, BigDataViewer, DREAM.3D, ilastik, Fiji's plugin.
 
 Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standard), NXdata of the NeXus manual
 (https://manual.nexusformat.org), vigra's ``axistags``.
@@ -34,8 +34,11 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):
         return _openpmd(dataset, source)
     found: list[Axis] = []
+    more: dict[str, Any] = {}
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
-        found = _nexus(group, dataset)
+        found, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
+    elif "_SIMPL_GEOMETRY/SPACING" in group.parent and len(dataset.shape) >= 3:
+        found = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
     elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
         return _bigdataviewer(file[view[1]], int(view[2]), dataset)
     elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
@@ -49,7 +52,7 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
             Axis(name, n, None if step is None else step * np.arange(n), "um" if name else "", name)
             for name, n, step in zip(names, dataset.shape, steps, strict=True)
         ]
-    return (found, {}) if found else None
+    return (found, more) if found else None
 
 
 def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
@@ -124,6 +127,25 @@ def _velox(group: Any, dataset: Any) -> list[Axis]:
         centres = step * np.arange(size) if step > 0 else None
         axes.append(axis(name, size, centres, {"units": facts.get(f"PixelUnit{name.upper()}", "")}))
     return [*axes, Axis("frame", dataset.shape[2], None, "", "t")]
+
+
+def _nexus_scaling(group: Any, name: str) -> dict[str, Any]:
+    """Return the scaling of an NXdata field, ``(value + offset) * scaling_factor``, as CF has it."""
+    factor, offset = (
+        float(np.ravel(group.get(f"{name}_{key}", group.get(key, plain)))[0])
+        for key, plain in (("scaling_factor", 1.0), ("offset", 0.0))
+    )
+    return {"scale_factor": factor, "add_offset": offset * factor} if (factor, offset) != (1, 0) else {}
+
+
+def _dream3d(geometry: Any, dataset: Any) -> list[Axis]:
+    """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
+    steps, first = (np.ravel(geometry[key])[::-1] for key in ("SPACING", "ORIGIN"))
+    spatial = [
+        axis(name, size, start + step * (np.arange(size) + 0.5))
+        for name, size, start, step in zip("zyx", dataset.shape, first, steps, strict=False)
+    ]
+    return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 
 
 def _vigra(tags: Sequence[Any], dataset: Any) -> list[Axis]:

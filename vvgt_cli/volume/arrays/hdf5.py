@@ -65,6 +65,7 @@ def read_dataset(path: Path, options: ReadOptions) -> Volume:
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
+        attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})
