@@ -55,6 +55,11 @@ def test_coordinates_beside_an_array_place_it(tmp_path: Path, form: str) -> None
     assert read_volume(path, ReadOptions(spacing=(1, 2, 3))).spacing == (1, 2, 3)
 
 
+def test_members_that_are_no_numbers_are_no_coordinates(tmp_path: Path) -> None:
+    np.savez(tmp_path / "v.npz", field=VALUES, facts=np.array({"a": 1}, object), **LINES)
+    check_grid(read_volume(str(tmp_path / "v.npz")))
+
+
 @pytest.mark.parametrize("form", ["h5", "npz", "nc", "zarr"])
 def test_arrays_that_may_be_coordinates_are_named(tmp_path: Path, form: str) -> None:
     path = write(tmp_path, form, {"field": VALUES, "energies": Z, "other": np.arange(7.0)})

@@ -8,7 +8,9 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO
@@ -73,9 +75,12 @@ def read_npz(path: Path, options: ReadOptions) -> Volume:
             name = _choose(archive, members, options.array, path)
             values, shape, fortran = _member(archive, members[name], path)
             small = [key for key, info in members.items() if info.file_size <= MAX_BESIDE and key != name]
-            lines = {key: np.load(io.BytesIO(archive.read(members[key])), allow_pickle=False) for key in small}
+            lines = {}
+            for key in small:
+                with suppress(zipfile.BadZipFile, EOFError, ValueError, zlib.error):  # objects, or damaged
+                    lines[key] = np.load(io.BytesIO(archive.read(members[key])), allow_pickle=False)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise DataError(f"{path}: damaged .npz file ({error}); check that it is whole") from error
+        raise DataError(f"{path}: damaged .npz file ({str(error)[:200]}); check that it is whole") from error
     beside = {key: Neighbour.of(line.shape, lambda line=line: (line, {})) for key, line in lines.items()}
     return _volume(values, shape, fortran, options, f"{path}:{name}", f"{volume_name(path)}:{name}", beside)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume.components import magnitude
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.libraries import need
 from vvgt_cli.volume.microscopy import imaris
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
@@ -251,7 +252,9 @@ def _described(path: Path) -> _Dataset:
     for place in (path.parent / (root.findtext("BasePath") or ".").strip() / inner, path.parent / inner.name):
         if inner.name and place.exists() and any(place.resolve().is_relative_to(home) for home in homes):
             return _Dataset(path, place, kind, setups, times, affines, missing, groups)
-    raise DataError(f"{path}: its data {stated[:80]!r} are not beside it; expected {path.parent / inner.name}")
+    raise DataError(
+        f"{path}: its data {stated[:80]!r} are not beside it; expected {path.parent / printable(inner.name)}"
+    )
 
 
 def _setup(element: Element, channels: dict[str | None, str]) -> _Setup:
