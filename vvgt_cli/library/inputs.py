@@ -390,7 +390,7 @@ def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
         for key, one in stated.items()
         if one.ndim == 1
     }
-    axes = [*with_neighbours(axes, beside, label, options.spacing is not None)]
+    axes = with_neighbours(axes, beside, label, options.spacing is not None)
     if data.chunks is None:
         return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
     read = Chunks(data.data, label)

@@ -40,9 +40,7 @@ class Neighbour:
     along: str = ""
 
     @classmethod
-    def of(
-        cls, shape: Sequence[int], read: Callable[[], tuple[np.ndarray, Mapping[str, Any]]], along: str = ""
-    ) -> Neighbour:
+    def of(cls, shape: Sequence[int], read: Any, along: str = "") -> Neighbour:
         """Make a neighbour of an array of any shape; one of more than one axis has no size."""
         sizes = [n for n in shape or () if n > 1]
         return cls(sizes[0] if len(sizes) == 1 else 0, read, along)
@@ -50,7 +48,7 @@ class Neighbour:
 
 def with_neighbours(
     axes: Sequence[Axis], beside: Mapping[str, Neighbour], source: str, spacing_given: bool
-) -> Sequence[Axis]:
+) -> list[Axis]:
     """Return an array's axes with the coordinates beside it, where names and sizes assign them in one way.
 
     Otherwise one message names the neighbours whose sizes fit, and the axes stay as they are, as they do if any has
@@ -58,7 +56,7 @@ def with_neighbours(
     numbers for all axes (``dim1``, ``dim2``, ``dim3`` of EMD, where two values stand for an even axis).
     """
     if spacing_given or any(a.centres is not None for a in axes):
-        return axes
+        return [*axes]
     if (numbered := _numbered(axes, beside)) is not None:
         return numbered
     fits = {name: one for name, one in beside.items() if any(_lies_along(one, a) for a in axes)}
@@ -73,7 +71,7 @@ def with_neighbours(
         for order in itertools.permutations(range(len(axes)), len(chosen))
         if chosen and all(_lies_along(fits[name], axes[k], read[name]) for k, name in zip(order, chosen, strict=True))
     ]
-    along = [[read[way[k]].centres if k in way else None for k in range(len(axes))] for way in ways]
+    along: list[list[Any]] = [[read[way[k]].centres if k in way else None for k in range(len(axes))] for way in ways]
     if ways and all(np.array_equal(a, b) for way in along for a, b in zip(way, along[0], strict=True)):
         return [read[ways[0][k]] if k in ways[0] else a for k, a in enumerate(axes)]
     if read:
@@ -82,7 +80,7 @@ def with_neighbours(
             f"{source}: states no spacing, which is taken as 1; beside it lie, as long as its axes, {steps}; --spacing "
             "X Y Z sets it", stacklevel=3,
         )  # fmt: skip
-    return axes
+    return [*axes]
 
 
 def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axis] | None:

@@ -205,15 +205,17 @@ def _affine(bdv: _Dataset, time: int, setup: _Setup) -> np.ndarray:
     the voxel sizes are scaled to them. Others are taken as they are, with a message.
     """
     spacing = np.array(setup.spacing if len(setup.spacing) else (1.0, 1.0, 1.0))
-    matrix = bdv.affines.get((time, setup.number), np.diag([*spacing, 1.0]))
+    matrix: np.ndarray = bdv.affines.get((time, setup.number), np.diag([*spacing, 1.0]))
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if not len(setup.spacing) or not lengths.all():
         return matrix
     if np.array_equal(matrix[:3, :3], np.eye(3)):
-        return np.diag([*spacing, 1.0]) @ matrix
+        matrix = np.diag([*spacing, 1.0]) @ matrix
+        return matrix
     ratio = spacing / lengths
     if np.ptp(ratio) <= ALIKE * ratio.max():
-        return np.diag([ratio.mean()] * 3 + [1.0]) @ matrix
+        matrix = np.diag([ratio.mean()] * 3 + [1.0]) @ matrix
+        return matrix
     steps, stated = (" ".join(f"{n:.4g}" for n in some) for some in (lengths, spacing))
     warnings.warn(
         f"{bdv.source}: setup {setup.number} is registered with voxels of {steps}, which are taken, not its voxel size "
@@ -241,7 +243,9 @@ def _described(path: Path) -> _Dataset:
         times = _times(sequence.find("Timepoints"))
         affines = {_pair(one): _product(one) for one in root.iterfind("ViewRegistrations/ViewRegistration")}
         missing = {_pair(one) for one in sequence.iterfind("MissingViews/MissingView")}
-        groups = {_pair(one): one.get("path") or one.findtext("path", "") for one in loader.iterfind("zgroups/zgroup")}
+        groups = {
+            _pair(one): one.get("path", "") or one.findtext("path", "") for one in loader.iterfind("zgroups/zgroup")
+        }
     except (ValueError, TypeError) as error:
         raise DataError(f"{path}: damaged ({error}); expected setups, time points and registrations") from error
     if not setups or not times:
