@@ -210,12 +210,10 @@ def _affine(bdv: _Dataset, time: int, setup: _Setup) -> np.ndarray:
     if not len(setup.spacing) or not lengths.all():
         return matrix
     if np.array_equal(matrix[:3, :3], np.eye(3)):
-        matrix = np.diag([*spacing, 1.0]) @ matrix
-        return matrix
+        return np.asarray(np.diag([*spacing, 1.0]) @ matrix)
     ratio = spacing / lengths
     if np.ptp(ratio) <= ALIKE * ratio.max():
-        matrix = np.diag([ratio.mean()] * 3 + [1.0]) @ matrix
-        return matrix
+        return np.asarray(np.diag([ratio.mean()] * 3 + [1.0]) @ matrix)
     steps, stated = (" ".join(f"{n:.4g}" for n in some) for some in (lengths, spacing))
     warnings.warn(
         f"{bdv.source}: setup {setup.number} is registered with voxels of {steps}, which are taken, not its voxel size "
