@@ -289,7 +289,7 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look; errors are those of `function_of`."""
-    levels = [look.iso] if isinstance(look.iso, str | Real) else look.iso
+    levels: Sequence[object] = [look.iso] if isinstance(look.iso, str | float | Real) else list(look.iso)
     return replace(
         source,
         tf=with_levels(function_of(look.function), levels, look.labels),
