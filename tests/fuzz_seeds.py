@@ -250,14 +250,16 @@ def vdb() -> list[Seed]:
 
 
 def numpy_files() -> list[Seed]:
-    plain, several, packed = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    plain, several, packed, placed = (io.BytesIO() for _ in range(4))
     np.save(plain, VALUES)
     np.savez(several, first=VALUES, second=FLOATS)
     np.savez_compressed(packed, values=np.asfortranarray(FLOATS))
+    np.savez(placed, values=FLOATS, x=np.arange(5.0), y=np.arange(4), zs=np.arange(3), positions=FLOATS[:, 0, :3])
     return [
         Seed("a.npy", plain.getvalue(), READ),
         Seed("b.npz", several.getvalue(), volume_reader(array="second")),
         Seed("c.npz", packed.getvalue(), READ),
+        Seed("d.npz", placed.getvalue(), READ),
     ]
 
 

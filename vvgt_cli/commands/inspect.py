@@ -33,9 +33,8 @@ from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.blocks import Packed
-from vvgt_cli.volume.registry import contents
+from vvgt_cli.volume.registry import contents, is_recognised
 from vvgt_cli.volume.space import axis_facts
-from vvgt_cli.volume.vtk import is_index as is_vtk_index
 
 if TYPE_CHECKING:
     from vvgt_cli.field.layered import Content
@@ -100,7 +99,7 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         return {"kind": f"index of {index['kind']}", "name": name.name, **about, "clouds": index["files"]}
     if is_table(name):
         return _table(file)
-    if is_vtk_index(head) or name.suffix.lower() == ".p3d":  # JSON of ParaView's
+    if is_recognised(head) or name.suffix.lower() == ".p3d":  # JSON and XML that are no transfer functions
         return _volume(file, read)
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:

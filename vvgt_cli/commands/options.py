@@ -358,8 +358,8 @@ _options = {
     ),
     "level": click.option(
         "--level", metavar="full|N", callback=_number_or("full", "the number of a level (0, 1, ...)"),
-        help="Resolution level of an OME-Zarr, N5 or Imaris image in blocks, 0 the finest. Default: the coarsest "
-        "sufficient for --size.",
+        help="Resolution level of an OME-Zarr, N5, Imaris or BigDataViewer image in blocks, 0 the finest. Default: the "
+        "coarsest sufficient for --size.",
     ),
 }  # fmt: skip
 _shard_option = {

@@ -44,7 +44,7 @@ MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a t
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
-INDEXES = (".pvti", ".pvd", ".series")  # files that name other files
+INDEXES = (".pvti", ".pvd", ".series", ".xml")  # files that name other files
 PACKED = (
     ".h5",
     ".hdf5",
@@ -238,9 +238,8 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     shapes = level_shapes(path, read)
     if not shapes:
         if options.level is not None:
-            raise UsageError(
-                f"{path}: has no resolution levels; expected OME-Zarr, N5 or Imaris: omit --level {options.level}"
-            )
+            kinds = "OME-Zarr, N5, Imaris or BigDataViewer"
+            raise UsageError(f"{path}: has no resolution levels; expected {kinds}: omit --level {options.level}")
         return read, None
     if options.level is not None:
         return replace(read, level=0 if options.level == "full" else int(options.level)), None

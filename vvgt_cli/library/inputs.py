@@ -26,6 +26,7 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.arrays.beside import Neighbour, with_neighbours
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
 from vvgt_cli.volume.labelled import axis, labelled_volume
@@ -100,7 +101,7 @@ class Look:
     def asked(self) -> dict[str, Any]:
         """Return all but the layers, as attributes of a request; raise DataError for an invalid function or table."""
         distance = self.opacity_unit_distance
-        levels: Any = [self.iso] if isinstance(self.iso, str | Real) else self.iso
+        levels: Sequence[object] = [self.iso] if isinstance(self.iso, str | float | Real) else list(self.iso)
         return {
             "tf": with_levels(function_of(self.tf), levels, self.labels),
             "tf_range": self.tf_range if isinstance(self.tf_range, str) else _numbers(self.tf_range),
@@ -412,14 +413,20 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
     """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
-    axes = []
+    axes, stated = [], dict(data.coords)  # `data.coords.get` makes up numbers
     for dim, size in zip(data.dims, data.shape, strict=True):
-        coordinate = data.coords.get(dim)
+        coordinate = stated.get(dim)
         centres = None
         if coordinate is not None and coordinate.dtype.kind in "iuf":
             centres = np.asarray(coordinate.values, np.float64)
         axes.append(axis(str(dim), size, centres, getattr(coordinate, "attrs", None)))
     label = str(data.name or name)
+    beside = {
+        str(key): Neighbour.of(one.shape, lambda one=one: (one.values, one.attrs), str(one.dims[0]))
+        for key, one in stated.items()
+        if one.ndim == 1
+    }
+    axes = with_neighbours(axes, beside, label, options.spacing is not None)
     if data.chunks is None:
         return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
     read = Chunks(data.data, label)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -125,3 +126,9 @@ def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | N
 def printable(text: str) -> str:
     """Return ``text`` as a message can hold it: what cannot be printed (a line break, say) is a question mark."""
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def text_of(value: Any) -> str:
+    """Return an attribute as text, the first of several."""
+    value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

@@ -228,6 +228,11 @@ def _recognised(path: Path, head: bytes) -> tuple[Reader | None, bytes]:
     return next((r for r in READERS if r.sniff is not None and r.sniff(head)), None), head
 
 
+def is_recognised(head: bytes) -> bool:
+    """Tell whether a file that begins so has the format of some reader."""
+    return any(reader.sniff is not None and reader.sniff(head) for reader in READERS)
+
+
 def _by_name(path: Path) -> Reader | None:
     name = path.name.lower()
     fits = [(len(s), r) for r in READERS for s in r.suffixes if name.endswith(s)]

@@ -7,8 +7,11 @@ unpickles.
 
 from __future__ import annotations
 
+import base64
 import json
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -45,8 +49,9 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
         array = _array(zarr, place)
-        attributes = dict(array.attrs)
+        attributes = _marked(array)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
+        axes = with_neighbours(axes, _beside(zarr, path, place), str(place), options.spacing is not None)
         volume = labelled_volume(
             lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
             name_in(path, place), array.chunks,
@@ -80,6 +85,21 @@ def _array(zarr: Any, place: Path) -> Any:
     if server:
         server.allow(min(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize, MAX_CHUNK))
     return array
+
+
+def _marked(array: Any) -> dict[str, Any]:
+    """Return an array's attributes with its ``_FillValue`` where xarray puts it.
+
+    That is the fill value of a version 2 array with named dimensions, where it is not 0, Zarr's default, for values
+    that are not packed; version 3 has floats of 8 bytes as base64.
+    """
+    attributes = dict(array.attrs)
+    if "_ARRAY_DIMENSIONS" in attributes and (array.fill_value or "scale_factor" in attributes):
+        attributes.setdefault("_FillValue", array.fill_value)
+    text = attributes.get("_FillValue")
+    if isinstance(text, str) and len(text) == 12:
+        attributes["_FillValue"] = np.frombuffer(base64.b64decode(text), "<f8")
+    return attributes
 
 
 def name_in(path: Path, place: Path) -> str:
@@ -135,6 +155,7 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
     here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
+        on_grids({here.name: (facts["shape"], _type(facts))}, str(path))
         return here, facts
     level = _multiscale(here)
     if number is not None and not level:
@@ -146,10 +167,17 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
         if place.resolve().is_relative_to(path.resolve()):
             return place, _metadata(place)
     fits = _arrays(here if facts else path)
-    names = [p.relative_to(path).as_posix() for p, _ in fits]
+    shown = {p.relative_to(path).as_posix(): (p, f) for p, f in fits}
+    names = on_grids({name: (f["shape"], _type(f)) for name, (_, f) in shown.items()}, str(path))
+    fits = [shown[name] for name in names]
     rows = [f"{name} {facts['shape']}" for name, (_, facts) in zip(names, fits, strict=True)]
     how = f"choose one as {path}:/PATH (or with --array)"
     return fits[choose(names, rows, None if facts else wanted, str(path), how=how)]
+
+
+def _type(facts: dict[str, Any]) -> str:
+    """Return the type of an array's values, as either version names it."""
+    return str(facts.get("data_type", facts.get("dtype")))
 
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
@@ -209,10 +237,26 @@ def _axes(
             axes.append(axis(name, size))
             continue
         _check_codecs(beside, coordinate)
-        centres = np.asarray(_array(zarr, beside)[:size])
-        numbers = centres.dtype.kind in "iuf"
-        axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
+        stored = _array(zarr, beside)
+        centres = np.asarray(stored[:size]) if stored.dtype.kind in "iuf" else None
+        axes.append(axis(name, size, centres, _marked(stored)))
     return axes
+
+
+def _beside(zarr: Any, path: Path, place: Path) -> dict[str, Neighbour]:
+    """List the arrays along one axis in the group of another; none where a server does not list folders."""
+
+    def line(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
+        array = _array(zarr, folder)
+        return np.asarray(array[:]), _marked(array)
+
+    found = {}
+    with suppress(OSError, NotImplementedError):
+        for folder in place.parent.iterdir() if place != path else ():
+            facts = _metadata(folder) if folder.is_dir() and not folder.is_symlink() and folder != place else {}
+            if facts.get("node_type") == "array":
+                found[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
+    return found
 
 
 def _ome(group: Path) -> dict[str, Any]:

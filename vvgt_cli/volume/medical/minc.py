@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import magnitude, select_component
+from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, volume_name
