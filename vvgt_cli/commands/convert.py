@@ -95,7 +95,6 @@ def command(
       vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
-    from vvgt_cli.commands.options import convert_request
     from vvgt_cli.conversion.convert_batch import convert_files
     from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.errors import UsageError
@@ -103,10 +102,9 @@ def command(
     given = {parameter.name for parameter in typed(click.get_current_context())}
     options["fit"]["rule"] = options.pop("rule")
     options["fit"] |= {name: None for name in ("max_gaussians", "size", "rule") if name not in given}
-    functions = options["optics"].pop("tf")
-    options["optics"]["tf"] = functions[0] if functions else None
     line = command_line(click.get_current_context(), ASIDE, folders=False)
-    request = convert_request(volume, **options)
+    request = shared.convert_request(volume, **options)
+    functions = options["optics"]["tf"] or tuple(filter(None, [request.source.tf]))
     if not is_page(request.output) and not (slices and live is not False):
         raise UsageError(f"--no-live and --no-slices are for a page; got -o {request.output}; expected -o OUT.html")
     editor = live is None and is_page(request.output)

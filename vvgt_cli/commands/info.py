@@ -23,7 +23,8 @@ from vvgt_cli.progress import Console
 @shared.placed_read_options
 @shared.common_options
 def command(
-    file: str | None, machine: bool, sharing: bool, as_json: bool, tf: str | None, layers: tuple[str, ...],
+    file: str | None, machine: bool, sharing: bool, as_json: bool, tf: str | None, iso: tuple[str, ...],
+    layers: tuple[str, ...],
     tf_range: str, opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
 ) -> None:  # fmt: skip
     """Describe FILE: a volume, transfer function, label table, view set, .ply of Gaussians, or index of several.
@@ -47,7 +48,7 @@ def command(
         raise UsageError("--machine describes this machine, --sharing a file; expected one of them")
     if machine == (file is not None):
         raise UsageError("expected a file, or --machine")
-    look, how = live_look(Look(tf, tf_range, opacity_unit_distance, layers=layers)), ReadOptions(**read)
+    look, how = live_look(Look(tf, tf_range, opacity_unit_distance, layers=layers, iso=iso)), ReadOptions(**read)
     if sharing and (look, how) != (None, ReadOptions()):
         raise UsageError("--sharing describes the file as it is; omit --tf and reading options")
     if file is None:

@@ -35,13 +35,12 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
       vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G
     """
-    from vvgt_cli.commands.options import block_options_of, convert_request
     from vvgt_cli.conversion.convert import initialise_only
     from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
     from vvgt_cli.field.open import automatic
 
-    request = convert_request(volume, **options)
-    found = block_options_of(blocks) or automatic(request.source, console)
+    request = shared.convert_request(volume, **options)
+    found = shared.block_options_of(blocks) or automatic(request.source, console)
     request = replace(request, blocks=found, fit=replace(request.fit, steps=0))
     if writes_streaming(request):
         convert_in_batches(request, console)

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
     from vvgt_cli.field.settings import BlockOptions
     from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.library.inputs import Reading
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK")
@@ -139,36 +140,23 @@ TF_HELP = (
 )
 
 
-def iso_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add ``--iso``, which gives the value of ``--tf``."""
-
-    @click.option(
-        "--iso", metavar="LEVEL[,COLOR]", multiple=True,
-        help="Show the isosurface at LEVEL, a data value or standard deviations above the mean (3sigma), instead of a "
-        "function (--tf). Repeatable: outer ones are translucent. ',above' or ',below' says which values are inside.",
-    )  # fmt: skip
-    @functools.wraps(function)
-    def wrapper(*args: Any, iso: tuple[str, ...], **kwargs: Any) -> Any:
-        from vvgt_cli.look.isosurfaces import with_levels
-
-        given = kwargs.get("optics", kwargs)
-        tf = with_levels(given["tf"], iso, given.get("labels"))
-        given["tf"] = (tf,) if given["tf"] == () and iso else tf
-        return function(*args, **kwargs)
-
-    return wrapper
+iso_option = click.option(
+    "--iso", metavar="LEVEL[,COLOR]", multiple=True,
+    help="Show the isosurface at LEVEL, a data value or standard deviations above the mean (3sigma), instead of a "
+    "function (--tf). Repeatable: outer ones are translucent. ',above' or ',below' says which values are inside.",
+)  # fmt: skip
 
 
 def optics_options(more: str = "", multiple: bool = False) -> Decorator:
     """Return the options of a look; ``--tf`` has ``more`` help, and several values if ``multiple``."""
-    options = group(
+    return group(
         "optics",
         tf=click.option("--tf", metavar="TF", multiple=multiple, help=TF_HELP + more),
+        iso=iso_option,
         tf_range=tf_range_option,
         opacity_unit_distance=unit_distance_option,
         **LABELS,
     )
-    return lambda function: options(iso_option(function))
 
 
 tf_options = optics_options()
@@ -497,19 +485,13 @@ ply_options = group(
 )  # fmt: skip
 
 
-def source_request(
-    volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
-) -> SourceRequest:
-    """Return the source that the shared options of `options.py` describe."""
-    from vvgt_cli.field.source import SourceRequest, parse_layer
-    from vvgt_cli.look.lighting import LightOptions
-    from vvgt_cli.volume import ReadOptions
+def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any]) -> SourceRequest:
+    """Return the source that shared options describe, under the first function of several."""
+    from vvgt_cli.library.inputs import Look, source_of
 
-    return SourceRequest(
-        volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"],
-        light=LightOptions(**(light or {})), labels=optics["labels"],
-        layers=tuple(parse_layer(text, read.get("space")) for text in optics["layers"]),
-    )  # fmt: skip
+    tf = optics["tf"]
+    first = next(iter(tf), None) if isinstance(tf, tuple) else tf
+    return source_of(volume, Look(**optics | {"tf": first}, light=light), cast("Reading", read))
 
 
 def convert_request(

@@ -21,6 +21,7 @@ def recolor(
     ply: PathLike, tf: FunctionLike | None = None, output: PathLike | None = None, *,
     tf_range: str | Sequence[float] = "data", opacity_unit_distance: str | float | None = None,
     labels: LabelsLike | None = None, light: LightLike = None, layers: Sequence[str] | Mapping[int | str, Any] = (),
+    iso: float | str | Sequence[float | str] = (),
     overwrite: bool = False, progress: bool | Console = False,
 ) -> Result:  # fmt: skip
     """Show a live ``.ply`` under another function, without its volume: ``vvgt recolor``.
@@ -33,6 +34,7 @@ def recolor(
         opacity_unit_distance: as in `Look`.
         labels: table of a label map as in `Look`; None: the file's own.
         light: as in `Look`; None: that of the function's file, else that of the file.
+        iso: levels in place of a function, as in `Look`.
         layers: for several layers or channels, values of ``--layer``, or functions or label tables by number or name.
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
@@ -54,7 +56,7 @@ def recolor(
     from vvgt_cli.library.outputs import written
 
     name, listed = os.fspath(ply), () if isinstance(layers, Mapping) else layers
-    look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed)) or FunctionRequest()
+    look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed, iso)) or FunctionRequest()
 
     def make(run: Run) -> Result:
         with run.stage("read") as stage:

@@ -113,9 +113,9 @@ def command(
 
     if layout["half"] and layout["format"] == "png":
         raise UsageError("--half applies to EXR, which --format png does not write; give only one of the two")
-    source = shared.source_request(volume, read, optics | {"tf": None}, light)
+    source = shared.source_request(volume, read, optics, light)
     request = ViewsRequest(
-        source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
+        source, optics["tf"] or tuple(filter(None, [source.tf])), output, CameraRequest(**cameras), Layout(**layout),
         shard=parse_shard(shard), overwrite=overwrite, blocks=shared.block_options_of(blocks), device=device, **rays,
     )  # fmt: skip
     render_view_sets(request, console)

@@ -72,7 +72,6 @@ def command(
     """
     from vvgt_cli.commands import report_runs
     from vvgt_cli.commands.peers import Peer
-    from vvgt_cli.library.inputs import Look, source_of
 
     if compare:
         other = [p.opts[-1] for p in typed(ctx) if p.name not in COMPARE_PARAMETERS]
@@ -86,7 +85,7 @@ def command(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
         shared.block_options_of(options["blocks"]), peers=tuple(map(Peer.of, options["peers"])),
     )  # fmt: skip
-    source = source_of(paths[0], Look(**options["optics"], light=options["light"]), options["read"])
+    source = shared.source_request(paths[0], options["read"], options["optics"], options["light"])
     report_runs.report(
         source, output, runs, picture_size=options["picture_size"], overwrite=options["overwrite"],
         command_line=command_line(ctx), console=console,
