@@ -17,7 +17,7 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.commands.view_sets import check_folder, draw_in_blocks
+from vvgt_cli.commands.view_sets import draw_in_blocks
 from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
@@ -39,7 +39,7 @@ from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
 from vvgt_cli.gaussians.formats.page_live import shared_facts
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
-from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
+from vvgt_cli.gaussians.outputs import Output, check_folder, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
 from vvgt_cli.library.inputs import PathLike

@@ -136,16 +136,13 @@ def suggest_functions(
     Example:
       vvgt tf suggest head.nrrd -n 10 -o bands
     """
-    from vvgt_cli.gaussians.outputs import write_text
+    from vvgt_cli.gaussians.outputs import check_folder, write_text
     from vvgt_cli.look.suggest import fitting, suggest
     from vvgt_cli.score.record import ConversionReport, Run
     from vvgt_cli.volume import ReadOptions, read_volume, statistics
 
     folder = Path(output)
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"-o {folder}: is a file; expected a directory for the functions")
-    if not folder.parent.is_dir():
-        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
+    check_folder(folder, "functions")
     paths = [folder / f"band_{k:0{len(str(number))}d}.json" for k in range(1, number + 1)]
     for path in paths:
         if path.exists() and not overwrite:

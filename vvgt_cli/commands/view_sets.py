@@ -37,6 +37,7 @@ from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load_all
 from vvgt_cli.files import atomic_write, claim
+from vvgt_cli.gaussians.outputs import check_folder
 from vvgt_cli.images import write_png
 from vvgt_cli.jit.ahead import VIEWS, for_blocks
 from vvgt_cli.progress import Console
@@ -166,14 +167,6 @@ class ViewsRequest:
                 raise UsageError(f"--tf {names[name]} and --tf {tf} would both go to {root / name}; rename one")
             names[name] = tf
         return [root / name for name in names]
-
-
-def check_folder(folder: Path, content: str) -> None:
-    """Raise UsageError unless a folder for ``content`` is there or can be made."""
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
-    if not folder.parent.is_dir():
-        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
 
 
 def function_name(tf: str) -> str:

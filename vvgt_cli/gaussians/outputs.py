@@ -104,6 +104,14 @@ def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: 
         yield
 
 
+def check_folder(folder: Path, content: str) -> None:
+    """Raise UsageError unless a folder for ``content`` is there or can be made."""
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
+
+
 def write_text(path: str | os.PathLike[str], text: str, overwrite: bool) -> None:
     """Write text to a file, atomically, or to standard output."""
     if path == STDOUT:
