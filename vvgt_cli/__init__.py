@@ -43,14 +43,6 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
-    "commands.check": ("check",),
-    "commands.evaluate": ("evaluate",),
-    "commands.infer": ("infer",),
-    "commands.optimize": ("optimize",),
-    "commands.recolor": ("recolor",),
-    "commands.render": ("render",),
-    "commands.synth": ("synth",),
-    "commands.view": ("view",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
@@ -62,6 +54,10 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
+    **{
+        f"commands.{name}": (name,)
+        for name in ("check", "evaluate", "infer", "optimize", "recolor", "render", "synth", "view")
+    },
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
