@@ -13,7 +13,7 @@ from vvgt_cli.errors import DataError, UsageError
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-PACKAGES = {"numba_cuda": "numba-cuda", "torch": "torch", "gsplat": "gsplat"}  # modules, and what installs them
+PACKAGES = {"numba_cuda": "numba-cuda"}  # modules, and what installs them
 FREE = 0.5  # of a GPU's memory, below which "auto" leaves it to others
 
 

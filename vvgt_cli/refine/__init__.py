@@ -42,7 +42,6 @@ def optimize(
 
     Raises:
         DataError: no views, or images or weights that do not fit their cameras.
-        UsageError: weights of training views on another device than the CPU.
     """
     from vvgt_cli.refine.loop import run
 

@@ -23,7 +23,7 @@ _jit = inlined(error_model="numpy")  # a division that could raise is none of ve
 
 
 @_jit
-def _clip(value: float, bound: float) -> float:
+def clip(value: float, bound: float) -> float:
     """Limit ``value`` to +-``bound``."""
     return min(max(value, -bound), bound)
 
@@ -115,11 +115,11 @@ def move_one(
     r0, r1, r2 = rates
     c0, c1 = clips
     p0, p1, p2 = _gain(m[0], m[3], m[6], spread), _gain(m[1], m[4], m[7], spread), _gain(m[2], m[5], m[8], spread)
-    d0, d1, d2 = _clip(way[0] * r0 * p0, c0), _clip(way[1] * r0 * p1, c0), _clip(way[2] * r0 * p2, c0)
+    d0, d1, d2 = clip(way[0] * r0 * p0, c0), clip(way[1] * r0 * p1, c0), clip(way[2] * r0 * p2, c0)
     e = (
-        _clip(way[3] * r1 * min(p0 * p0, FOUR), c1), _clip(way[4] * r1 * min(p1 * p1, FOUR), c1),
-        _clip(way[5] * r1 * min(p2 * p2, FOUR), c1), _clip(way[6] * r2 * min(p0 * p1, FOUR), c1),
-        _clip(way[7] * r2 * min(p0 * p2, FOUR), c1), _clip(way[8] * r2 * min(p1 * p2, FOUR), c1),
+        clip(way[3] * r1 * min(p0 * p0, FOUR), c1), clip(way[4] * r1 * min(p1 * p1, FOUR), c1),
+        clip(way[5] * r1 * min(p2 * p2, FOUR), c1), clip(way[6] * r2 * min(p0 * p1, FOUR), c1),
+        clip(way[7] * r2 * min(p0 * p2, FOUR), c1), clip(way[8] * r2 * min(p1 * p2, FOUR), c1),
     )  # fmt: skip
     back = (
         m[0] * d0 + m[1] * d1 + m[2] * d2, m[3] * d0 + m[4] * d1 + m[5] * d2, m[6] * d0 + m[7] * d1 + m[8] * d2
@@ -186,7 +186,7 @@ def own_axes(
                 colors[k, axis] = max(colors[k, axis] - tint, least)
             for entry in range(9):
                 factors[k, entry // 3, entry % 3] = buf[at + PLACE + U(entry) * _P1]
-            logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
+            logits[k] -= clip(buf[at + U(9) * _P1] * by_logit, farthest)
 
 
 @parallel_kernel("f4:2 f4:2 f4:2 f8 f8 i8 i8 f4:2 f4:2", error_model="numpy")

@@ -205,7 +205,7 @@ def slope_one(
     place: tuple[float, ...], sums: tuple[float, ...], conic: tuple[float, ...], pose: tuple[float, ...],
     lens: tuple[float, ...], dilation: float, compensate: float,
 ) -> tuple[float, ...]:  # fmt: skip
-    """Return the gradients of d (3) and E (6), from the first six of the sums of `splat.backward` and the conic as drawn."""
+    """Return the gradients of d (3) and E (6), by the first six sums of `splat.backward` and the conic as drawn."""
     fx, fy = lens[0], lens[1]
     x, y, z = _centre(place, pose)
     du, dv, h00, h01, h11 = screen_slope(
