@@ -13,6 +13,7 @@ from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.checkpoint import fingerprint, resume, save

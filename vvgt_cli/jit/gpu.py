@@ -27,9 +27,10 @@ def _kept() -> Any:
     """Return numba-cuda's cache of a kernel, by the sources of all that it calls: numba looks at its own alone."""
     from numba.cuda.dispatcher import CUDACache
 
-    class Kept(CUDACache):  # type: ignore[misc]
+    class Kept(CUDACache):
         def _index_key(self, sig: Any, codegen: Any) -> Any:
-            return *super()._index_key(sig, codegen), _digest(self._py_func)
+            key: Any = super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+            return *key, _digest(self._py_func)
 
     return Kept
 

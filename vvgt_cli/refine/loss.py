@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 if TYPE_CHECKING:
     from vvgt_cli.refine.options import OptimizeOptions
+
+f32: Any = np.float32
 
 
 def picture_slope(
@@ -42,7 +44,8 @@ def picture_slope(
 @inlined()
 def error_slope(r: float, l1: float, l2: float) -> float:
     """Return the derivative of ``l1 |r| + l2 r^2``."""
-    return np.float32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else np.float32(0))
+    slope: float = f32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else f32(0))
+    return slope
 
 
 @parallel_kernel("f4:3 f4:3 f4 f4 f4 f4:3 f8:1")
@@ -50,8 +53,8 @@ def loss_gradient(
     thread: ThreadSlice,
     image: np.ndarray,
     target: np.ndarray,
-    l1: np.float32,
-    l2: np.float32,
+    l1: Any,
+    l2: Any,
     alpha_weight: np.float32,
     grad: np.ndarray,
     squares: np.ndarray,

@@ -454,9 +454,10 @@ class OwnAxesOnDevice:
                 self.drawn[key] = Splatter(len(self.held), *key, self.stream)
             splatter, view = self.drawn[key], sent(view_numbers(camera), self.stream)
             tiles = None if blocks is None else sent(np.asarray(blocks.numbers, np.int64), self.stream)
-            splatter.draw(*self.sent[:4], view, tiles)
+            means, factors, logits, colors = self.sent[:4]
+            splatter.draw(means, factors, logits, colors, view, tiles)
             while not splatter.fits():
-                splatter.draw(*self.sent[:4], view, tiles)
+                splatter.draw(means, factors, logits, colors, view, tiles)
             image: np.ndarray = splatter.image.copy_to_host(stream=self.stream)
         if blocks is not None:
             image[~blocks.mask()] = 0

@@ -58,7 +58,8 @@ def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, plan
 def smooth_share(red: float, green: float, blue: float, squares: float) -> float:
     """Return C / (C + v), from the means of a view's channels under the window, and of the sum of their squares."""
     variance = max(squares - (red * red + green * green + blue * blue), f32(0)) * f32(1 / 3)  # mean of the channels
-    return f32(SMOOTH) / (f32(SMOOTH) + variance)
+    share: float = f32(SMOOTH) / (f32(SMOOTH) + variance)
+    return share
 
 
 @parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")

@@ -178,7 +178,8 @@ def sort_tiles(start, keys):  # type: ignore[no-untyped-def]
 @cuda.jit(device=True)
 def fetch_key(key, i, extent, flat, colors, ox, oy, fetched):  # type: ignore[no-untyped-def]
     """Copy the Gaussian of a key, its colour clamped at 0, into place i of ``fetched``; return its number."""
-    k, at = np.int64(key & np.uint64(0xFFFFFFFF)), U(i) * FIELDS
+    k: Any = np.int64(key & np.uint64(0xFFFFFFFF))
+    at = U(i) * FIELDS
     fetch_one(k, at, extent, flat, ox, oy, fetched)
     fetched[at + RED], fetched[at + GREEN] = max(colors[k, 0], ZERO), max(colors[k, 1], ZERO)
     fetched[at + BLUE] = max(colors[k, 2], ZERO)
