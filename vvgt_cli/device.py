@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import threading
 from collections.abc import Callable
@@ -89,12 +90,13 @@ def on_device(scene: Scene, device: str, report: Callable[[str], None]) -> Scene
 
 
 def load_ahead() -> None:
-    """Begin to load what steps need, in the background: it takes as long as a closed form."""
+    """Begin to load the kernels of steps, in the background: the first picture waits for the rest."""
 
-    def load() -> None:
-        import torch
-        from gsplat.cuda._backend import _C  # noqa: F401 # built at its first import
+    def run() -> None:
+        from vvgt_cli.jit.gpu import load
+        from vvgt_cli.refine.on_device import KERNELS
 
-        torch.eye(2, device="cuda") @ torch.eye(2, device="cuda")  # the context, and the library of products
+        with contextlib.suppress(Exception):  # of the driver or the compiler: whoever takes a step meets it again
+            load(KERNELS)
 
-    threading.Thread(target=load, daemon=True).start()
+    threading.Thread(target=run, daemon=True).start()

@@ -6,7 +6,7 @@ What kernels of the CPU call, functions marked `inlined`, kernels of a device ca
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from numba import cuda as numba_cuda
 
 from vvgt_cli.jit.cache import source_digest
+from vvgt_cli.jit.compile import usual_types
 
 cuda: Any = numba_cuda  # which numba-cuda replaces
 config: Any = numba.config
@@ -38,10 +39,11 @@ def _kept() -> Any:
 _digest = cache(source_digest)
 
 
-def gpu_kernel(**options: Any) -> Callable[[Callable[..., None]], Any]:
+def gpu_kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., None]], Any]:
     """Compile a function for the device, where it is called as ``function[blocks, threads, stream](...)``.
 
     Args:
+        usual: types of its arguments, for `load`, as of `vvgt_cli.jit.decorators.kernel`.
         **options: of ``numba.cuda.jit``.
     """
 
@@ -50,9 +52,16 @@ def gpu_kernel(**options: Any) -> Callable[[Callable[..., None]], Any]:
         with contextlib.suppress(RuntimeError):  # there is no folder to keep it in
             if not SIMULATED:
                 made._cache = _kept()(function)
+        made.usual, made.tuples = usual, {}
         return made
 
     return wrap
+
+
+def load(kernels: Iterable[Any]) -> None:
+    """Load kernels for their usual types from disk; compile what is not there."""
+    for kernel in kernels:
+        kernel.compile(usual_types(kernel, ""))
 
 
 class Recorded:

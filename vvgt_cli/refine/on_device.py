@@ -30,7 +30,8 @@ from vvgt_cli.refine.steps import COUNT, EPSILON, FEATURES, KNOWN, RUN, adam_par
 from vvgt_cli.refine.texture import smooth_share
 from vvgt_cli.splat.buffer import ZERO, f32
 from vvgt_cli.splat.lanes import LANES
-from vvgt_cli.splat.on_device import PAIRS, THREADS, VIEW, Splatter, view_numbers
+from vvgt_cli.splat.on_device import KERNELS as splatting
+from vvgt_cli.splat.on_device import PAIRS, THREADS, VIEW, Splatter, sort_block, view_numbers
 
 A_GAUSSIAN, A_PIXEL = 700, 60  # bytes: with moments, features, slopes and lists of pairs; with slopes
 NOW = 4
@@ -59,7 +60,7 @@ def sum_block(value, sums):  # type: ignore[no-untyped-def]
     return total
 
 
-@gpu_kernel()
+@gpu_kernel("f4:3 f4:4 f4:3 f8:1 f4:1 f4:3")
 def find_texture(image, targets, weights, now, window, fine):  # type: ignore[no-untyped-def]
     """Write the errors less their blur, weighted as `texture.weigh` does, into ``fine`` (h, w, 3), a thread a pixel."""
     p, (height, width), view = cuda.grid(1), fine.shape[:2], int(now[PLACE])
@@ -88,7 +89,7 @@ def find_texture(image, targets, weights, now, window, fine):  # type: ignore[no
     fine[y, x, 2] = share * (own * (image[y, x, 2] - targets[view, y, x, 2]) - e2)
 
 
-@gpu_kernel()
+@gpu_kernel("f4:3 f4:4 f4:3 f8:1 f4:1 f4:3 f4:1 f4:3 f8:1")
 def grade(image, targets, weights, now, window, fine, losses, grad, squares):  # type: ignore[no-untyped-def]
     """Write the slope of the loss by the picture into ``grad`` (h, w, 4), and r^2 of each block into ``squares``.
 
@@ -121,25 +122,7 @@ def grade(image, targets, weights, now, window, fine, losses, grad, squares):  #
         squares[cuda.blockIdx.x] = total
 
 
-@cuda.jit(device=True)
-def sort_few(few):  # type: ignore[no-untyped-def]
-    """Sort `FEW` numbers with all threads of the block (a bitonic network)."""
-    size = 2
-    while size <= FEW:
-        stride = size // 2
-        while stride > 0:
-            cuda.syncthreads()
-            for i in range(cuda.threadIdx.x, FEW // 2, cuda.blockDim.x):
-                low = (i // stride) * 2 * stride + i % stride
-                high = low + stride if stride < size // 2 else low // size * size + size - 1 - low % size
-                if few[high] < few[low]:
-                    few[high], few[low] = few[low], few[high]
-            stride //= 2
-        size *= 2
-    cuda.syncthreads()
-
-
-@gpu_kernel()
+@gpu_kernel("f4:2 f4:2 f4:2 f8:1 f4:1 i8 f8 f4:2 f4:2 f4:1")
 def direct(rows, first, second, now, betas, every, weakest, towards, sizes, floors):  # type: ignore[no-untyped-def]
     """Do what `OwnAxes.common` does for a field, a block each: its divisors' floor, and directions of the sample."""
     row, i, count = cuda.blockIdx.x, cuda.threadIdx.x, sizes.shape[1]
@@ -157,7 +140,7 @@ def direct(rows, first, second, now, betas, every, weakest, towards, sizes, floo
         few[n] = size if size > ZERO else f32(math.inf)
         positive += 1.0 if size > ZERO else 0.0
     seen = int(sum_block(positive, sums))
-    sort_few(few)
+    sort_block(few, 0, FEW)
     bound, total = ZERO, 0.0
     if seen > 0:
         bound = f32(OUTLIER) * (f32(0.5) * (few[(seen - 1) // 2] + few[seen // 2]))
@@ -172,7 +155,7 @@ def direct(rows, first, second, now, betas, every, weakest, towards, sizes, floo
         towards[row, n] = way if abs(way) < f32(math.inf) else ZERO
 
 
-@gpu_kernel()
+@gpu_kernel("f4:2 f4:2 f4:2")
 def regress(solver, towards, plain):  # type: ignore[no-untyped-def]
     """Write ``plain`` (KNOWN, FEATURES), as `steps.regress` does without its gain, a block a feature."""
     f, i = cuda.blockIdx.x, cuda.threadIdx.x
@@ -190,7 +173,7 @@ def regress(solver, towards, plain):  # type: ignore[no-untyped-def]
         plain[row, f] = total
 
 
-@gpu_kernel()
+@gpu_kernel("f8:1 f8 f8:1 f8:1 i8:1 i8 f4:2 f8:1 f4:2 f8:1")
 def set_pace(squares, pixels, now, ranges, status, room, plain, last, weights, course):  # type: ignore[no-untyped-def]
     """Go on with the running error and the pace, and with what `SharedSteps` remembers, one block.
 
@@ -226,7 +209,7 @@ def set_pace(squares, pixels, now, ranges, status, room, plain, last, weights, c
             last[shared] = min(max(factor, BOUNDS[0]), BOUNDS[1])
 
 
-@gpu_kernel()
+@gpu_kernel("f4:2 f4:2 f4:2 f8:1 f4:1 f4:1 i1:3 f4:2 f8:1 f8:1 f8 i8:1 i8 f8:1 u1:1 f4:2 f4:3 f4:1 f4:2")
 def move(  # type: ignore[no-untyped-def]
     rows, first, second, now, betas, floors, features, weights, rates, clips, spread, status, room, course, held,
     means, factors, logits, colors,
@@ -272,6 +255,9 @@ def move(  # type: ignore[no-untyped-def]
         colors[k, axis] = max(colors[k, axis] - way[10 + axis] * f32(rates[4] * pace), ZERO)
 
 
+KERNELS = *splatting, find_texture, grade, direct, regress, set_pace, move
+
+
 def unfit(gaussians: Gaussians, options: OptimizeOptions) -> str | None:
     """Return why descent from Gaussians by such options is the CPU's; None where a device does it."""
     if options.method != "frame":
@@ -307,7 +293,7 @@ class _Views:
         )
         self.blocks = -(-height * width // THREADS), THREADS, stream
         self.squares = cuda.device_array(self.blocks[0], np.float64, stream=stream)
-        self.pixels = (3 + state.options.alpha) * height * width
+        self.pixels = float((3 + state.options.alpha) * height * width)
         self.here: set[int] = set()
         self.stream, self.launch = stream, partial(state.launch, self)
         self.again = Recorded(self.launch, stream)

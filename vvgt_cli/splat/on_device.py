@@ -48,7 +48,8 @@ SCANNERS, SORTERS = 1024, 512  # of the blocks that add up tiles, and that sort 
 NEARBY = 4096  # keys that are sorted in the block's own memory; more of them where they lie
 GROUP = 8  # Gaussians whose sums over a tile's pixels are formed together
 LANE = AREA // GROUP  # threads that form the sums of each
-BATCH, FETCHED = AREA * int(FIELDS), GROUP * int(FIELDS)  # of the memory that a block shares
+FETCH = 8 * GROUP  # Gaussians that are fetched together
+BATCH, FETCHED = AREA * int(FIELDS), FETCH * int(FIELDS)  # of the memory that a block shares
 TERMS, SLOPES, PARTS = (3, GROUP * AREA), (3, AREA), AREA * SUMS
 POSE = 12  # numbers in front of the lens in a view
 VIEW = POSE + 6
@@ -63,7 +64,7 @@ def pose_in(view):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@gpu_kernel()
+@gpu_kernel("f4:2 f4:3 f4:1 f8:1 f8:1 i8 f4:2 f4:1 i4:2 i8:1 i8:1 i8:1")
 def project(means, factors, logits, view, rule, tiles_x, flat, depth, extent, first, counts, status):  # type: ignore[no-untyped-def]
     """Project a Gaussian, count it in its tiles (``counts``), and take places for its pairs."""
     k, i = cuda.grid(1), cuda.threadIdx.x
@@ -93,7 +94,7 @@ def project(means, factors, logits, view, rule, tiles_x, flat, depth, extent, fi
                 cuda.atomic.add(counts, ty * tiles_x + tx, 1)
 
 
-@gpu_kernel()
+@gpu_kernel("i8:1 i8:1 i8:1 i8:1 i8")
 def add_up(counts, start, cursor, status, room):  # type: ignore[no-untyped-def]
     """Turn counts into places, ``start`` and a copy of it, one block; sets the counts back to 0."""
     i, tiles = cuda.threadIdx.x, counts.shape[0]
@@ -123,7 +124,7 @@ def add_up(counts, start, cursor, status, room):  # type: ignore[no-untyped-def]
         status[PAIRS], status[COUNTED] = pairs, 0
 
 
-@gpu_kernel()
+@gpu_kernel("i4:1 i4:2 i8 i8:1 i8 i8:1 u8:1")
 def file_pairs(depth, extent, tiles_x, status, room, cursor, keys):  # type: ignore[no-untyped-def]
     """Put a Gaussian's key into each of its tiles' lists, in no order; ``depth`` as int32, whose bits sort alike."""
     k = cuda.grid(1)
@@ -141,25 +142,26 @@ def sort_block(keys, base, count):  # type: ignore[no-untyped-def]
 
     Of a length that is no power of two the rest would be the greatest keys, which no exchange moves.
     """
-    size = 2
+    size = np.int32(2)
     while size < 2 * count:
-        half = size // 2
+        half = size >> 1
         stride = half
         while stride > 0:
-            i = cuda.threadIdx.x
-            low = 0
+            i, low = np.int32(cuda.threadIdx.x), np.int32(0)
             while low < count:
-                low = (i // stride) * 2 * stride + i % stride
-                high = low + stride if stride < half else low // size * size + size - 1 - low % size
-                if high < count and keys[base + high] < keys[base + low]:
-                    keys[base + high], keys[base + low] = keys[base + low], keys[base + high]
+                low = ((i & -stride) << 1) | (i & (stride - 1))
+                high = low | stride if stride < half else low ^ (size - 1)
+                if high < count:
+                    one, other = keys[base + low], keys[base + high]
+                    if other < one:
+                        keys[base + low], keys[base + high] = other, one
                 i += cuda.blockDim.x
             cuda.syncthreads()
-            stride //= 2
-        size *= 2
+            stride >>= 1
+        size <<= 1
 
 
-@gpu_kernel()
+@gpu_kernel("i8:1 u8:1")
 def sort_tiles(start, keys):  # type: ignore[no-untyped-def]
     """Sort a tile's keys, a block a tile."""
     near = cuda.shared.array(NEARBY, np.uint64)
@@ -186,7 +188,7 @@ def fetch_key(key, i, extent, flat, colors, ox, oy, fetched):  # type: ignore[no
     return k
 
 
-@gpu_kernel(fastmath=True)
+@gpu_kernel("i8:1 i8:1 u8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3", fastmath=True)
 def blend(tiles, start, keys, extent, flat, colors, tiles_x, rule, image):  # type: ignore[no-untyped-def]
     """Blend front to back into ``image`` (height, width, 4), a block each of ``tiles``, a thread a pixel."""
     fetched = cuda.shared.array(BATCH, np.float32)
@@ -240,7 +242,7 @@ def sum_columns(terms, slopes, n, lane, u, v, parts):  # type: ignore[no-untyped
     parts[at + 4], parts[at + 5], parts[at + 6], parts[at + 7], parts[at + 8] = s2 * dx, s3, s4, s5, s6
 
 
-@gpu_kernel(fastmath=True)
+@gpu_kernel("i8:1 u8:1 i8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3 f4:3 f4:2", fastmath=True)
 def moments(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad, pairs):  # type: ignore[no-untyped-def]
     """Write each pair's nine `SUMS`, as `backward.moments` does, a block a tile, a thread a pixel.
 
@@ -248,7 +250,7 @@ def moments(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad
     of a column.
     """
     fetched = cuda.shared.array(FETCHED, np.float32)  # one a line, by which the simulator tells them apart
-    places = cuda.shared.array(GROUP, np.int64)
+    places = cuda.shared.array(FETCH, np.int64)
     terms = cuda.shared.array(TERMS, np.float32)
     slopes = cuda.shared.array(SLOPES, np.float32)
     parts = cuda.shared.array(PARTS, np.float32)
@@ -266,16 +268,18 @@ def moments(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad
         for f in range(3):
             slopes[f, i] = grad[oy + y, ox + x, f]
             behind += image[oy + y, ox + x, f] * slopes[f, i]
-    begin, end = start[tile], start[tile + 1]
-    while begin < end:
-        count, ended = min(GROUP, end - begin), cuda.syncthreads_and(np.int32(t <= ZERO))
-        if i < count:
-            k = fetch_key(keys[begin + i], i, extent, flat, colors, ox, oy, fetched)
-            x0, y0, x1, _ = tiles_of(extent, k)
-            places[i] = first[k] + (ty - y0) * (x1 - x0) + tx - x0
+    begin, end, ended = start[tile], start[tile + 1], 0
+    for entry in range(begin, end, GROUP):
+        count, ahead = min(GROUP, end - entry), (entry - begin) % FETCH  # of those that were fetched together
+        if ahead == 0:
+            ended = cuda.syncthreads_and(np.int32(t <= ZERO))
+            if i < min(FETCH, end - entry):
+                k = fetch_key(keys[entry + i], i, extent, flat, colors, ox, oy, fetched)
+                x0, y0, x1, _ = tiles_of(extent, k)
+                places[i] = first[k] + (ty - y0) * (x1 - x0) + tx - x0
         cuda.syncthreads()
         for n in range(count):
-            at, g, weight, moved = U(n) * FIELDS, ZERO, ZERO, ZERO
+            at, g, weight, moved = U(ahead + n) * FIELDS, ZERO, ZERO, ZERO
             if not ended and fetched[at + FIRST_ROW] <= row < fetched[at + END_ROW]:
                 dx, dy, opacity = col - fetched[at + U(3)], row + HALF - fetched[at + U(4)], fetched[at + U(5)]
                 h, q = fetched[at + U(1)] * dy, fetched[at + U(2)] * dy * dy
@@ -286,19 +290,18 @@ def moments(start, keys, first, extent, flat, colors, tiles_x, rule, image, grad
                 g, moved = (raw + opacity * way[4]) * slope, raw * slope
             terms[0, n * AREA + i], terms[1, n * AREA + i], terms[2, n * AREA + i] = g, weight, moved
         cuda.syncthreads()
-        n = i // LANE
+        n, at = i // LANE, U(ahead + i // LANE) * FIELDS
         if n < count:
-            sum_columns(terms, slopes, n, i % LANE, fetched[U(n) * FIELDS + U(3)], fetched[U(n) * FIELDS + U(4)], parts)
+            sum_columns(terms, slopes, n, i % LANE, fetched[at + U(3)], fetched[at + U(4)], parts)
         cuda.syncthreads()
         if i < count * SUMS:
             total = ZERO
             for lane in range(LANE):
                 total += parts[(i // SUMS * LANE + lane) * SUMS + i % SUMS]
-            pairs[places[i // SUMS], i % SUMS] = total
-        begin += GROUP
+            pairs[places[ahead + i // SUMS], i % SUMS] = total
 
 
-@gpu_kernel()
+@gpu_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:1 f8:1 i8:1 f4:2")
 def own_axes(first, pairs, extent, flat, means, factors, colors, view, rule, status, rows):  # type: ignore[no-untyped-def]
     """Write a Gaussian's gradients along its own axes into its column of ``rows`` (13, K), as `backward.own_axes`."""
     k = cuda.grid(1)
@@ -318,6 +321,9 @@ def own_axes(first, pairs, extent, flat, means, factors, colors, view, rule, sta
         for f in range(3):
             if colors[k, f] >= ZERO:
                 rows[10 + f, k] = sums[6] if f == 0 else sums[7] if f == 1 else sums[8]
+
+
+KERNELS = project, add_up, file_pairs, sort_tiles, blend, moments, own_axes
 
 
 def view_numbers(camera: Camera) -> np.ndarray:
