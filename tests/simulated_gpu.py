@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import default_views, look_at
+from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, RULES
 from vvgt_cli.refine import OptimizeOptions
@@ -44,8 +45,9 @@ def cases() -> dict[str, tuple[Gaussians, OptimizeOptions, np.ndarray | None, bo
 
 
 def take(state: Any, case: str, targets: list[np.ndarray], weights: list[np.ndarray] | None) -> dict[str, np.ndarray]:
-    """Take the case's steps, and return what is saved, and the picture before them."""
-    before = state.picture(CAMERAS[0], INRIA)
+    """Take the case's steps, and return what is saved, and pictures before them."""
+    before = {"picture": state.picture(CAMERAS[0], INRIA)}
+    before["part"] = state.picture(CAMERAS[0], INRIA, Blocks(19, 13, np.array([1])))
     for n in range(STEPS[case]):
         i = n % 3
         state.step(CAMERAS[i], targets[i], n / 8, 1.0, None if weights is None else weights[i])
@@ -53,7 +55,7 @@ def take(state: Any, case: str, targets: list[np.ndarray], weights: list[np.ndar
     state.restore(kept)
     again = state.saved()
     assert all(np.array_equal(kept[name], again[name]) for name in kept)
-    return kept | {"picture": before}
+    return kept | before
 
 
 def main(given: Path, out: Path) -> None:

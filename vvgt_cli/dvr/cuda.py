@@ -186,5 +186,6 @@ class DeviceRays:
         render = plain_pixels if self.scene.light is None else lit_pixels
         blocks = -(-len(places) // THREADS)
         render[blocks, THREADS](data, there[0], step, mask.shape[1], *there[1:], pixels)
-        share = len(offsets) / (known + len(offsets))
-        out[mask] = (1 - share) * out[mask] + share * pixels.copy_to_host()
+        rows, share = out.reshape(-1, 4), np.float32(len(offsets) / (known + len(offsets)))
+        drawn = pixels.copy_to_host()
+        rows[places] = drawn if known == 0 else (1 - share) * rows[places] + share * drawn

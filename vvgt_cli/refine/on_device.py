@@ -445,8 +445,6 @@ class OwnAxesOnDevice:
             while not splatter.fits():
                 splatter.draw(means, factors, logits, colors, view, tiles)
             image: np.ndarray = splatter.image.copy_to_host(stream=self.stream)
-        if blocks is not None:
-            image[~blocks.mask()] = 0
         return image
 
     def _fetch(self) -> OwnAxes:

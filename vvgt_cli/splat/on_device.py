@@ -351,7 +351,7 @@ class Splatter:
         self.counts, self.cursor = sent((np.zeros(self.tiles, np.int64), np.zeros(self.tiles, np.int64)), stream)
         self.start, self.status = sent((np.zeros(self.tiles + 1, np.int64), np.zeros(2, np.int64)), stream)
         self.every = sent(np.arange(self.tiles), stream)
-        self.image = sent(np.zeros((height, width, 4), np.float32), stream)
+        self.image, self.blank = sent(2 * (np.zeros((height, width, 4), np.float32),), stream)
         self._make_room(4 * count + self.tiles)
 
     def _array(self, shape: tuple[int, ...], kind: Any) -> Any:
@@ -370,8 +370,10 @@ class Splatter:
         self.pairs = self._array((pairs if self.summed else 1, SUMS), np.float32)
 
     def draw(self, means: Any, factors: Any, logits: Any, colors: Any, view: Any, tiles: Any = None) -> None:
-        """Draw into ``image``, all tiles or those whose numbers ``tiles`` (n,) int64 holds."""
+        """Draw into ``image``, all tiles or those whose numbers ``tiles`` (n,) int64 holds, 0 elsewhere."""
         chosen, stream = self.every if tiles is None else tiles, self.stream
+        if tiles is not None:
+            self.image.copy_to_device(self.blank, stream)
         blocks = -(-self.count // THREADS), THREADS, stream
         project[blocks](
             means, factors, logits, view, self.rule, self.across, self.flat, self.depth, self.extent, self.first,
