@@ -60,7 +60,7 @@ PROCESSES ?= $(shell OMP_NUM_THREADS= nproc)
 model: $(VENV)/bin/pytest
 	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,train]'
 	$(VENV)/bin/python benchmarks/training.py data out/model/data
-	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" torchrun --standalone --nproc-per-node $(PROCESSES) -m vvgt_cli.cli.main train \
+	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" torchrun --standalone --nproc-per-node $(PROCESSES) -m vvgt_cli.commands.main train \
 		--data out/model/data --config examples/vvgt-small.yaml -o out/model/run --threads 1
 	$(VENV)/bin/vvgt export out/model/run/best.pt -o out/model/vvgt-small --overwrite
 

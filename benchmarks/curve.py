@@ -84,7 +84,7 @@ def measure(
             for label, checkout in [("after", str(Path.cwd())), *(state.split("=", 1) for state in states)]:
                 file = (Path(folder) / f"{name}.{label}.{count}.ply").resolve()
                 options = ["--steps", str(count), "--up", "none", "--threads", "1", "--overwrite", "-q", *more]
-                convert = ["-m", "vvgt_cli.cli.main", "convert", *call, *options, "-o", str(file)]
+                convert = ["-m", "vvgt_cli.commands.main", "convert", *call, *options, "-o", str(file)]
                 file.with_suffix(".txt").write_text(f"{timed(convert, checkout, 1)['processor']:.4g}")
 
 

@@ -20,10 +20,9 @@ import numpy as np
 from dvr_scenes import write_rows
 
 from vvgt_cli.commands.check import check
-from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats import read_columns
 from vvgt_cli.gaussians.formats.splats import Splats, opacities_of, ply_bytes
-from vvgt_cli.progress import Console
+from vvgt_cli.library.inputs import Look
 
 ROWS = 100  # that are damaged
 
@@ -72,12 +71,12 @@ def main(
     assert file
     assert volume
     assert output
-    source, columns, found = SourceRequest(volume, tf=tf, unit_distance=distance), read_columns(file), []
+    look, columns, found = Look(tf, opacity_unit_distance=distance), read_columns(file), []
     with tempfile.TemporaryDirectory() as folder:
         for damage, change in {"as it is": lambda same: same, **DAMAGES}.items():
             path = Path(folder) / f"{name}.ply"
             path.write_bytes(ply_bytes(change(columns)))
-            outcomes = check(source, None, Console(quiet=True), str(path)).outcomes
+            outcomes = check(path, look, volume=volume).outcomes
             fails = [o for o in outcomes if not o.passed]
             for o in fails:
                 measured = "" if o.value is None else f"{o.value:.3g} {o.what}"

@@ -20,7 +20,7 @@ import numpy as np
 from closed_form import scene_rows
 from dvr_scenes import print_table, write_rows
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.images import read_png, write_png
 from vvgt_cli.images.metrics import psnr
 

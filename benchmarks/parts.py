@@ -23,7 +23,7 @@ import click
 from closed_form import scene_rows
 from dvr_scenes import commit, write_rows
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 NONE = 10**12
 PARTS: dict[str, dict[str, Any]] = {

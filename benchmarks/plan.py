@@ -31,7 +31,7 @@ def conversion(source: list[str], options: tuple[str, ...]) -> dict[str, Any]:
     """Predicted and measured seconds, memory and size of one conversion."""
     with tempfile.TemporaryDirectory() as folder:
         out, report = Path(folder) / "out.ply", Path(folder) / "out.json"
-        command = [sys.executable, "-m", "vvgt_cli.cli.main", "convert", *source, *options]
+        command = [sys.executable, "-m", "vvgt_cli.commands.main", "convert", *source, *options]
         subprocess.run([*command, "-o", str(out), "--report", str(report), "-q"], check=True)
         found = json.loads(report.read_text())
     plan, memory = found["plan"], found["machine"]["peak_memory_bytes"]

@@ -98,7 +98,7 @@ def main(paths, output, only, to, options):
     for name, volume, reading, function in scene_rows(scenes):
         if (only and name not in only) or (folder / name / "report.json").exists():
             continue
-        call = [sys.executable, "-m", "vvgt_cli.cli.main", "report", str(data / volume), *reading.split()]
+        call = [sys.executable, "-m", "vvgt_cli.commands.main", "report", str(data / volume), *reading.split()]
         call += ["--tf", str(functions / function), "--opacity-unit-distance", "mean-spacing"]
         print(name, file=sys.stderr)
         subprocess.run([*call, "-o", str(folder / name), "--overwrite", *options], check=True)

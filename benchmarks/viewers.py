@@ -18,7 +18,7 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.boxed import render_in_box
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import upright_axes
 from vvgt_cli.dvr import render_view

@@ -89,7 +89,7 @@ def commands(
 ) -> list[tuple[str, str, list[str]]]:
     """What is run of a scene, from which checkout, and the arguments for Python."""
     here = str(Path.cwd())
-    vvgt = ["-m", "vvgt_cli.cli.main"]
+    vvgt = ["-m", "vvgt_cli.commands.main"]
     end = ["--threads", str(threads), "-q"]
     convert = [*vvgt, "convert", *call, *end, "-o"]
     many = ["--views", str(VIEWS), "--test-views", "0", "--size", str(SIZE), "--format", "png", "--no-points"]

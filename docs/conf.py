@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-from vvgt_cli.cli.main import cli  # noqa: E402
-from vvgt_cli.cli.sections import SECTIONS  # noqa: E402
+from vvgt_cli.commands.main import cli  # noqa: E402
+from vvgt_cli.commands.words import SECTIONS  # noqa: E402
 from vvgt_cli.conversion.batch import CANNOT  # noqa: E402
 from vvgt_cli.version import VERSION  # noqa: E402
 

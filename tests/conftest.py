@@ -12,7 +12,7 @@ import hypothesis
 import pytest
 
 from tests.spared import spare
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.resources import set_memory
 
 SLOWEST = (

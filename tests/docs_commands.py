@@ -4,8 +4,9 @@ import re
 import sys
 from pathlib import Path
 
+from tests.processes import replaced
 from tests.spared import spare
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 SIZES = {"convert": "--max-gaussians 200 --size 48", "init": "--max-gaussians 200", "render": "--size 48"}
 SIZES |= {"render-views": "--views 8 --test-views 2 --size 32", "evaluate": "--size 48 --no-conditions --step 1"}
@@ -20,10 +21,11 @@ def blocks(page: Path, *languages: str) -> list[tuple[str, str]]:
 
 
 def small(words: list[str]) -> list[str]:
-    """A command line at small sizes: of an option given twice the last counts; real volumes become small ones."""
+    """A command line at small sizes, of small volumes."""
     line = ["example:marschner-lobb:16" if word in ("example:frog", "example:channels") else word for word in words]
-    line += [word for word in SIZES.get(line[0], "").split() if line[0] != "optimize" or "--steps" in line]
-    return [*line, "--steps", "24"] if line[0] == "convert" and not OWN_BUDGET & set(line) else line
+    if line[0] != "optimize" or "--steps" in line:
+        line = replaced(line, *SIZES.get(line[0], "").split())
+    return replaced(line, "--steps", "24") if line[0] == "convert" and not OWN_BUDGET & set(line) else line
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import microscopes as written
+import test_volume_bigdataviewer as views
 from fuzz import Seed
 from fuzz_seeds import FIXTURES, READ, volume_reader
 
@@ -15,7 +16,7 @@ def microscopes() -> dict[str, list[Seed]]:
     one, several = written.cells(channels=1), written.cells(times=2)
     chosen = volume_reader(component=1, time=1)
     in_blocks = volume_reader(component=0, time=1, stored=True)
-    found = {"N5": n5()}
+    found = {"N5": n5(), "BigDataViewer": bigdataviewer()}
     with tempfile.TemporaryDirectory() as folder:
         ims, czi, packed = (Path(folder) / name for name in ("a.ims", "a.czi", "b.czi"))
         written.write_ims(ims, several)
@@ -38,6 +39,19 @@ def microscopes() -> dict[str, list[Seed]]:
         Seed("d.nd2", written.nd2(several, packed=True), chosen),
     ]
     return found
+
+
+def bigdataviewer() -> list[Seed]:
+    """The XML, whose data stay whole: two channels at two time points, and one view of two tiles."""
+    seeds = []
+    for kind, tiles in (("hdf5", False), ("n5", True)):
+        with tempfile.TemporaryDirectory() as folder:
+            xml = Path(views.write(Path(folder), kind, tiles=tiles)).read_bytes()
+            files = [path for path in Path(folder).rglob("*") if path.is_file() and path.suffix != ".xml"]
+            beside = {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+        chosen = {"array": "1"} if tiles else {"component": 1}
+        seeds += [Seed("a.xml", xml, volume_reader(time=1, stored=tiles, **chosen), beside)]
+    return seeds
 
 
 def n5() -> list[Seed]:

@@ -110,6 +110,17 @@ def inviwo() -> list[Seed]:
     return [Seed("a.dat", text, READ, beside), Seed("b.dat", series, volume_reader(component=2), beside)]
 
 
+def vgi() -> list[Seed]:
+    text = (
+        b"{volume1}\n[representation]\nsize = 5 4 3\n[file1]\nSkipHeader = 2\nFileFormat = raw\nSize = 5 4 2\n"
+        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n[file2]\nSize = 5 4 1\n"
+        b"Name = w.raw\nDatatype = signed integer\nBitsPerElement = 16\n{volumeprimitive1}\n[geometry]\n"
+        b"resolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
+    )
+    beside = {"v.raw": b"xx" + VALUES[:2].tobytes(), "w.raw": VALUES[2:].tobytes()}
+    return [Seed("a.vgi", text, READ, beside)]
+
+
 def slc() -> list[Seed]:
     head = b"11111\n5 4 3 8\n1.0 2.0 3.0\n1 0 0\n%d\n2 2 X" + bytes(12)
     values = VALUES.astype(np.uint8)
@@ -239,14 +250,16 @@ def vdb() -> list[Seed]:
 
 
 def numpy_files() -> list[Seed]:
-    plain, several, packed = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    plain, several, packed, placed = (io.BytesIO() for _ in range(4))
     np.save(plain, VALUES)
     np.savez(several, first=VALUES, second=FLOATS)
     np.savez_compressed(packed, values=np.asfortranarray(FLOATS))
+    np.savez(placed, values=FLOATS, x=np.arange(5.0), y=np.arange(4), zs=np.arange(3), positions=FLOATS[:, 0, :3])
     return [
         Seed("a.npy", plain.getvalue(), READ),
         Seed("b.npz", several.getvalue(), volume_reader(array="second")),
         Seed("c.npz", packed.getvalue(), READ),
+        Seed("d.npz", placed.getvalue(), READ),
     ]
 
 
@@ -293,7 +306,7 @@ def colormaps() -> list[Seed]:
 
 
 def label_tables() -> list[Seed]:
-    from test_labels import FREESURFER, JSON, SEGMENTS, SLICER, SNAP
+    from test_labels import CATEGORICAL, DECATHLON, FREESURFER, JSON, NAMES, NNUNET, SEGMENTS, SLICER, SNAP
     from test_look_tables import BIDS, FASTSURFER, ROWS, SLICER_CSV
 
     from vvgt_cli.look.label_files import read_labels
@@ -311,7 +324,36 @@ def label_tables() -> list[Seed]:
         Seed("b.csv", SLICER_CSV.replace("lung,", "lung").replace(",", ";").encode("utf-8-sig"), read),
         Seed("dseg.tsv", BIDS.encode(), read),
         Seed("f.tsv", FASTSURFER.encode(), read),
+        *(Seed("b.json", json.dumps(one).encode(), read) for one in (NNUNET, DECATHLON, {"total": NAMES}, CATEGORICAL)),
     ]
+
+
+def label_headers() -> list[Seed]:
+    """Tables in the headers of label maps: whole files, and the tables alone."""
+    import test_masks as made
+
+    from vvgt_cli.look.label_files import labels_of
+    from vvgt_cli.volume.medical.mgh import table_entries
+    from vvgt_cli.volume.segments import segments_in, segments_of_xml
+
+    def files(path: Path) -> list[Seed]:
+        read = lambda path: labels_of(read_volume(str(path)).segments or (), "x")  # noqa: E731
+        packed = {name: gzip.decompress(Path(make(path)).read_bytes()) for name, make in made.PACKED.items()}
+        seeds = [Seed(name, data, read, pack=gzip.compress) for name, data in packed.items()]
+        made.ome(path, place="a")
+        store = {p.relative_to(path / "x.zarr" / "a").as_posix(): p for p in (path / "x.zarr" / "a").rglob("*")}
+        inside = {name: p.read_bytes() for name, p in store.items() if p.is_file()}
+        attributes = inside.pop(".zattrs")
+        seeds.append(Seed(".zattrs", attributes, lambda path: read(path.parent), inside))
+        return [*seeds, Seed("x.am", Path(made.am(path)).read_bytes(), read)]
+
+    def alone(path: Path) -> None:
+        data = path.read_bytes()
+        parse = segments_of_xml if path.suffix == ".xml" else table_entries
+        labels_of(segments_in(lambda: parse(data), "x"), "x")
+
+    with tempfile.TemporaryDirectory() as folder:
+        return [*files(Path(folder)), Seed("x.xml", made.CARET.encode(), alone), Seed("x.bin", made.TABLE[8:], alone)]
 
 
 def cameras() -> list[Seed]:
@@ -380,10 +422,12 @@ def readers() -> dict[str, list[Seed]]:
     from fuzz_seeds_scans import scans
 
     return {
-        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), **scans(), **hospital(),
+        "raw": raw(), "NRRD": nrrd(), "MetaImage": metaimage(), "Inviwo": inviwo(), "VGStudio": vgi(), **scans(),
+        **hospital(),
         "SLC": slc(), "TIFF": tiff(), "VTK legacy": vtk_legacy(), "VTK XML": vti(), "OpenVDB": vdb(),
         "NumPy": numpy_files(), "transfer function": transfer(), "colour map": colormaps(),
-        "label table": label_tables(), "Gaussians": ply(), "Gaussians of others": others(), "SOG": sog(),
+        "label table": label_tables(), "label header": label_headers(), "Gaussians": ply(),
+        "Gaussians of others": others(), "SOG": sog(),
         "view set": cameras(), "model card": model_card(), "manifest of views": manifest(),
         "checkpoint": checkpoint(),
     }  # fmt: skip

@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2, help="mutants at a time (2)")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)")
     args = parser.parse_args()
-    subprocess.run([sys.executable, "-m", "vvgt_cli.cli.main", "warmup"], cwd=ROOT, env=environment(), check=True)
+    subprocess.run([sys.executable, "-m", "vvgt_cli.commands.main", "warmup"], cwd=ROOT, env=environment(), check=True)
     tests = Tests(args.out / "map")
     tests.learn(args.processes)
     kept = args.out / "mutants.json"

@@ -1,8 +1,10 @@
 """Python in processes of its own, which tests/conftest.py tells where the package is."""
 
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 VVGT = ("-m", "tests.spared")
@@ -20,3 +22,13 @@ def python(*words: object, code: int = 0, given: Any = None, **how: Any) -> tupl
     out, err = process.communicate(given, timeout=900)
     assert process.returncode == code, err
     return out, err
+
+
+def replaced(line: Sequence[object], *change: object) -> list[object]:
+    """A command line in which the options of ``change`` take the place of those of the same names."""
+    words = [part for word in line for part in (word.split() if str(word).startswith("--") else [word])]
+    kept, keep = [], True
+    for word in words:
+        keep = word not in change if re.match("--?[a-z]", str(word)) else keep
+        kept += [word] if keep else []
+    return [*kept, *change]

@@ -6,14 +6,14 @@ from functools import cache
 from pathlib import Path
 
 from tests.processes import python
-from vvgt_cli.cli.main import COMMANDS
+from vvgt_cli.commands.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
-    *("conversion", "checks", "commands", "library", "integrations", "cli"),
+    *("conversion", "checks", "library", "integrations", "commands"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
@@ -179,7 +179,7 @@ def test_rooms_and_commands_do_not_import_kernels_at_module_level():
     heavy = set(kernels)
     while grown := {module for module, used in uses.items() if used & heavy} - heavy:
         heavy |= grown  # what imports a kernel at its top is heavy too
-    rooms = ("cli", "library", "conversion", "commands")
+    rooms = ("library", "conversion", "commands")
     doors = {module for module in uses if module.endswith("__init__") or module.split(".")[1] in rooms}
     assert kernels
     assert not heavy & doors, f"importing {sorted(heavy & doors)} compiles or loads kernels"
@@ -201,7 +201,6 @@ def test_every_module_says_what_it_is(path):
 
 # The worker that compiles is a program of its own; talk is what `Console` is for.
 PROGRAMS = {
-    "commands/converter_process.py": {"os._exit"},
     "field/runners.py": {"os._exit", "signal.signal"},
     "integrations/catalyst.py": {"print"},
     "integrations/paraview_job.py": {"print"},
@@ -215,7 +214,7 @@ ENDINGS = {"print", "sys.exit", "os._exit", "exit", "quit", "signal.signal", "cl
 @of_every_file(FILES)
 def test_nothing_below_the_commands_prints_exits_or_handles_signals(path):
     own = path.relative_to(PACKAGE).as_posix()
-    if own.startswith("cli/"):
+    if own.startswith("commands/"):
         return
     calls = {ast.unparse(node.func) for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)}
     assert not calls & ENDINGS - PROGRAMS.get(own, set())
@@ -229,7 +228,7 @@ def loaded(*code: str) -> set[str]:
 
 def test_help_loads_click_and_nothing_heavier():
     calls = (f"assert run({[*command, '--help']}) == 0" for command in ([], *([name] for name in COMMANDS)))
-    modules = loaded("from vvgt_cli.cli.main import run", *calls)
+    modules = loaded("from vvgt_cli.commands.main import run", *calls)
     assert "click" in modules
     assert not modules & (HEAVY | {"numpy"})
 

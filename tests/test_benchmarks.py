@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from report_runs import document
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.images import read_png, write_png
@@ -304,7 +304,7 @@ def test_reports(bench, scenes, tmp_path, monkeypatch):
     for _ in range(2):  # the second finds all there
         call(module.main, *scenes, "-o", tmp_path / "out", "--", "--picture-size", 160)
     (command,) = called
-    assert command[:4] == [sys.executable, "-m", "vvgt_cli.cli.main", "report"]
+    assert command[:4] == [sys.executable, "-m", "vvgt_cli.commands.main", "report"]
     assert command[-2:] == ["--picture-size", "160"]
     assert "[blob](blob/report.html)" in (tmp_path / "out" / "index.md").read_text()
     call(module.main, *scenes, "-o", tmp_path / "out", "--publish", tmp_path / "docs")

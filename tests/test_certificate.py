@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.certify import Verdict, position_error, preview_psnr
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError

@@ -57,7 +57,7 @@ def test_what_is_wrong_fails_with_one_line(problem):
 
 
 def test_failures_end_with_status_1_and_are_named(vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.commands.check.self_test_cases", lambda: iter([PASSING, *FAILING.values()]))
+    monkeypatch.setattr("vvgt_cli.checks.self_test.self_test_cases", lambda: iter([PASSING, *FAILING.values()]))
     result = vvgt("check")
     assert result.code == 1
     assert "4 of 5 cases failed (stage: off; stage: nan; other: broken and 1 more)" in result.error

@@ -30,7 +30,7 @@ EDGE = 24  # voxels
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A volume that looks the same from nowhere else, its function, and a conversion."""
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     made = tmp_path_factory.mktemp("splats")
     z, y, x = np.indices((EDGE,) * 3)

@@ -153,7 +153,7 @@ def test_pipes(folder, vvgt):
 
 
 def test_evaluate_scores_every_condition(converted, vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.commands.evaluate.viewing_conditions", viewing_conditions)
+    monkeypatch.setattr("vvgt_cli.commands.evaluation.viewing_conditions", viewing_conditions)
     ply = converted[0] / "a.ply"
     options = ("evaluate", ply, "--volume", SOURCE, "--step", 0.5)
     document = json.loads(vvgt(*options, "--json").out)
@@ -193,7 +193,7 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
 
 
 def test_rules_are_the_tables():
-    from vvgt_cli.cli.fit import RULES as NAMES
+    from vvgt_cli.commands.options import RULES as NAMES
     from vvgt_cli.gaussians.rules import RULES
 
     assert tuple(RULES) == NAMES

@@ -8,7 +8,7 @@ import pytest
 from network_models import FED, TINY, as_rows, scene
 
 from tests.refused import refused
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network.prepare import prepare
 from vvgt_cli.network.runtime import Model

@@ -5,8 +5,8 @@ import re
 import click
 import pytest
 
-from vvgt_cli.cli.main import cli
-from vvgt_cli.cli.sections import SECTIONS, SectionedCommand
+from vvgt_cli.commands.main import COMMANDS, cli
+from vvgt_cli.commands.words import SECTIONS, SectionedCommand
 
 
 def options(command: str) -> list[click.Option]:
@@ -31,3 +31,28 @@ def test_help_lists_every_option_once_and_the_main_ones_first(command, vvgt):
 def test_every_name_in_the_sections_is_an_option():
     names = {option.name for command in ("convert", "init", "render-views", "evaluate") for option in options(command)}
     assert not set(" ".join(SECTIONS.values()).split()) - names
+
+
+def every_command() -> dict[str, click.Command]:
+    group = click.Context(cli)
+    found = {name: cli.get_command(group, name) for name in COMMANDS}
+    inner = {f"tf {name}": one for name, one in found.pop("tf").commands.items()}
+    return found | inner
+
+
+@pytest.mark.parametrize("command", every_command())
+def test_an_option_of_one_value_is_given_once(command, vvgt):
+    """Also by its short and its long name; options that are repeatable and flags may be given again."""
+    given = [option for option in every_command()[command].params if isinstance(option, click.Option)]
+    for option in given:
+        words = [[name, *([] if option.is_flag else [value] * option.nargs)] for name, value in
+                 ((option.opts[0], "1"), (option.opts[-1], "2"))]  # fmt: skip
+        result = vvgt(*command.split(), *words[0], *words[1])
+        names = "/".join([*option.opts, *option.secondary_opts])
+        values = " ".join(["1"] * option.nargs), " ".join(["2"] * option.nargs)
+        one = not (option.multiple or option.is_flag)
+        assert (f"{names}: given 2 times, {values[0]} and {values[1]}; expected one" in result.err) == one
+        if one:
+            assert result.code == 2
+            assert "\n" not in result.error
+    assert "given 2 times, --live and --no-live" in vvgt("convert", "v", "--live", "--no-live").error

@@ -9,8 +9,8 @@ import pytest
 from network_models import as_rows
 from onnx_models import write_model
 
-from vvgt_cli.cli.main import run
 from vvgt_cli.commands.infer import divide
+from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import Network

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.processes import replaced
 from vvgt_cli import Look
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
@@ -162,7 +163,7 @@ def test_files_are_lit_by_default_in_memory_in_blocks_and_live(vvgt, tmp_path) -
 
 
 def test_a_network_leaves_harmonics_as_they_are(folder, vvgt):
-    call = ("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--steps", "8")
+    call = ("convert", SOURCE, *tf(folder), *replaced(SMALL, "--light", "headlight", "--steps", "8"))
     vvgt.ok(*call, "-o", folder / "plain.ply")
     vvgt.ok(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
     stages = {stage["name"]: stage for stage in json.loads((folder / "m.json").read_text())["stages"]}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vvgt_cli.cli.numbers import expand
+from vvgt_cli.commands.words import expand
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.plain.raw import guess_dims
 from vvgt_cli.volume.shapes import blob

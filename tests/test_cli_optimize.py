@@ -11,7 +11,7 @@ import pytest
 
 from tests.processes import start
 from vvgt_cli.cameras.files import read_cameras
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.commands.optimize import load_sets
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images import write_exr
@@ -145,7 +145,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(case, folder, tmp_path, monk
 
 
 def test_ctrl_c_writes_what_there_is(folder, tmp_path):
-    code = "import sys; from vvgt_cli.cli.main import main; main()"
+    code = "import sys; from vvgt_cli.commands.main import main; main()"
     args = [folder / "in.ply", "--views", folder / "views", "--steps", 10**7, "-o", tmp_path / "out.ply"]
     child = start("-c", code, "optimize", *args)
     said = [child.stderr.readline(), child.stderr.readline()]  # read, views: the descent begins

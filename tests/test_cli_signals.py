@@ -14,7 +14,7 @@ LONG = """
 import signal, sys, threading
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
 from vvgt_cli.conversion.stages import ClosedFormStage
-from vvgt_cli.cli import main
+from vvgt_cli.commands import main
 from vvgt_cli.files import atomic_write
 from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.closed_form.visibility import visibility
@@ -35,7 +35,7 @@ main.main()
 # The handler alone, where nobody else listens.
 ALONE = """
 import os, signal, sys, time
-from vvgt_cli.cli.process import end_on_signals
+from vvgt_cli.commands.process import end_on_signals
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
 end_on_signals()
 os.kill(os.getpid(), signal.SIGHUP)
@@ -48,7 +48,7 @@ OFTEN = """
 import os, random, signal, sys, threading, time, types
 import click, numpy as np
 from vvgt_cli.cameras import default_views
-from vvgt_cli.cli import main, process
+from vvgt_cli.commands import main, process
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 
@@ -71,7 +71,7 @@ camera = default_views("test", 1, size=16)[0]
 render(gaussian, camera)  # loads the kernels
 ready, rng, number = threading.Event(), random.Random(0), getattr(signal, sys.argv[1])
 main.COMMANDS.append("often")
-sys.modules["vvgt_cli.cli.often"] = types.SimpleNamespace(command=command)
+sys.modules["vvgt_cli.commands.often"] = types.SimpleNamespace(command=command)
 process._listen = lambda reader: None  # nothing but what is raised ends a run
 signal.signal(signal.SIGINT, signal.default_int_handler)
 process.end_on_signals()

@@ -24,7 +24,7 @@ def shell(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[s
     """A line for bash, in which ``vvgt`` is this program, and ``small`` as well, for small conversions."""
     define = "".join(
         f'{name}() {{ "{sys.executable}" -m {module} "$@"; }}\n'
-        for name, module in (("vvgt", "vvgt_cli.cli.main"), ("small", "tests.spared"))
+        for name, module in (("vvgt", "vvgt_cli.commands.main"), ("small", "tests.spared"))
     )
     run = ["bash", "-c", define + line]
     return subprocess.run(run, cwd=folder, env=os.environ | more, capture_output=True, text=True, timeout=900)

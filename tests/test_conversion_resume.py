@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.processes import replaced
 from vvgt_cli.conversion import convert as conversion
 from vvgt_cli.conversion.stages import scores, views
 from vvgt_cli.dvr import RenderSettings
@@ -74,7 +75,7 @@ def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vv
 
 @pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
 def test_stages_that_cut_the_pyramid_again_have_it(more, folder, vvgt, monkeypatch):
-    line = (*LINE, *more, "--overwrite", "-o")
+    line = (*replaced(LINE, *more), "--overwrite", "-o")
     vvgt.ok(*line, "whole.ply")
     with monkeypatch.context() as patch:
         ended(patch, "scores.score_test_views", 0)
@@ -107,5 +108,5 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
 )
 def test_a_conversion_that_cannot_resume_is_reported(more, told, tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert told in vvgt.fails(2, *LINE, "-o", "a.ply", "--checkpoint", "kept", *more)
+    assert told in vvgt.fails(2, *replaced((*LINE, "-o", "a.ply", "--checkpoint", "kept"), *more))
     assert not list(tmp_path.iterdir())

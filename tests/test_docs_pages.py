@@ -9,7 +9,7 @@ import click
 import pytest
 
 from tests.test_architecture import ROOMS
-from vvgt_cli.cli.main import COMMANDS, cli
+from vvgt_cli.commands.main import COMMANDS, cli
 from vvgt_cli.conversion.batch import CANNOT
 
 ROOT = Path(__file__).parent.parent

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mrcfile
 import nibabel
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tests import anatomy, vtk_files
 from tests.docs_commands import blocks, small
 from tests.headers import uncertified
 from tests.test_look_formats import mrml
+from tests.vdb_files import plume, vdb
 
 ROOT = Path(__file__).parent.parent
 
@@ -68,6 +70,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     nibabel.save(nibabel.Nifti1Image((data.T // 400).astype(np.uint8), affine), tmp_path / "atlas.nii.gz")
     for frame in range(3):
         anatomy.vti(tmp_path / f"run_{frame}.vti", (data // (frame + 1)).astype("<i2"), affine)
+    vdb(tmp_path / "fire.vdb", plume(16))
+    with mrcfile.new(tmp_path / "emd_1234.map", (data / 9000).astype(np.float32)) as file:
+        file.voxel_size = 1.5
     cells = np.stack([[data, data[::-1]], [data, data // 2]]).astype("<u2")  # T C Z Y X
     sizes = {"PhysicalSizeX": 0.2, "PhysicalSizeY": 0.2, "PhysicalSizeZ": 0.5, "Channel": {"Name": ["DAPI", "GFP"]}}
     tifffile.imwrite(tmp_path / "cells.ome.tif", cells, ome=True, metadata={"axes": "TCZYX", **sizes})

@@ -97,7 +97,7 @@ def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatc
         [
             "import resource, sys, tempfile",
             "import vvgt_cli.conversion.gaussian_files as render",
-            "from vvgt_cli.cli.main import run",
+            "from vvgt_cli.commands.main import run",
             f"tempfile.tempdir = {str(elsewhere)!r}",
             "find = tempfile.gettempdir",
             "def lifted():",

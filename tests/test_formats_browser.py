@@ -15,7 +15,7 @@ from browser import page_picture
 
 from tests.test_formats_server import shown
 from vvgt_cli.cameras import orbit_views
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.gaussians.formats.page_file import policy

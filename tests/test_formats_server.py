@@ -142,7 +142,7 @@ def test_two_servers_have_two_ports_and_two_words():
 def shown(*args: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`vvgt view`, and its address."""
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    code += "from vvgt_cli.cli.main import main; main()"
+    code += "from vvgt_cli.commands.main import main; main()"
     child = start("-c", code, "view", "--no-browser", *args, cwd=folder)
     try:
         yield child, child.stdout.readline().strip()

@@ -10,8 +10,8 @@ from test_live import HI, LO, RAMP, cloud, statistics
 
 import vvgt_cli as vvgt_library
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cli.main import run
-from vvgt_cli.commands import render
+from vvgt_cli.commands import pictures as render
+from vvgt_cli.commands.main import run
 from vvgt_cli.dvr import reference
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians

@@ -10,7 +10,7 @@ import pytest
 from browser import PAGES, browser, packages
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr

@@ -53,7 +53,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     for name, (options, _) in FILES.items():
         write_ply(folder / name, grid(), options)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    vvgt = [sys.executable, "-m", "vvgt_cli.cli.main"]
+    vvgt = [sys.executable, "-m", "vvgt_cli.commands.main"]
     subprocess.run([*vvgt, "view", folder / "z.ply", "-o", folder / "z.spz"], env=environment, check=True)
     views = dict.fromkeys([*FILES, "z.spz"]) | {"z.ply": [(10, -120, 30), CENTRE, 40]}
     (folder / "views.json").write_text(json.dumps(views))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.vtk_scenes import LUMP, camera_at, lump, places, psnr
-from vvgt_cli.cli.main import run as vvgt
+from vvgt_cli.commands.main import run as vvgt
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians.rules import rule_of
 from vvgt_cli.integrations import command, paraview_job, paraview_view
@@ -24,7 +24,7 @@ from vvgt_cli.splat import render
 
 ROOT = Path(__file__).parent.parent
 ROOM = ROOT / "vvgt_cli" / "integrations"
-STARTS = f"env PYTHONPATH={ROOT} NUMBA_NUM_THREADS=1 {sys.executable} -m vvgt_cli.cli.main"
+STARTS = f"env PYTHONPATH={ROOT} NUMBA_NUM_THREADS=1 {sys.executable} -m vvgt_cli.commands.main"
 SYSTEM = "/usr/bin/python3"
 MPI = ("mpirun", "--allow-run-as-root", "--oversubscribe", "--mca", "mpi_yield_when_idle", "1", "-n", "2")
 FEW = ("MaximumGaussians=10000", "Steps=40")

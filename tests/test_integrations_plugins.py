@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vvgt_cli.integrations.plugins import FOLDER, PLUGINS, plugin
+from vvgt_cli.commands.plugin import FOLDER, PLUGINS, plugin
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,7 +32,7 @@ def test_an_unknown_one_is_refused(vvgt) -> None:
 
 def test_adapters_are_listed_and_packaged() -> None:
     stated = [path for path in FOLDER.rglob("*.py") if "\nEnable:\n" in path.read_text("utf-8")]
-    assert sorted(stated) == sorted(plugin(name).path for name in PLUGINS)
+    assert sorted(stated) == sorted(plugin(name)[0] for name in PLUGINS)
     for path in stated:
         assert len(path.read_text("utf-8").splitlines()) <= 150
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cli.slicer import FIELDS
+from vvgt_cli.commands.slicer import FIELDS
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.rules import INRIA
@@ -67,7 +67,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     if python is None:
         pytest.skip("no 3D Slicer: set SLICER_PYTHON to a Python with slicer-core (pip install slicer-core)")
     folder = tmp_path_factory.mktemp("slicer")
-    words = f"env PYTHONPATH={ROOT} {sys.executable} -m vvgt_cli.cli.main"
+    words = f"env PYTHONPATH={ROOT} {sys.executable} -m vvgt_cli.commands.main"
     done = subprocess.run(
         [python, ROOT / "tests" / "slicer_scene.py", folder], env=os.environ | {"VVGT": words}, capture_output=True,
         text=True, check=False,

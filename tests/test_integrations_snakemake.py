@@ -20,7 +20,8 @@ def test_a_page_is_made_once_and_the_same_again(tmp_path: Path) -> None:
     command = tmp_path / "bin" / "vvgt"
     command.parent.mkdir()
     command.write_text(
-        f'#!/bin/sh\necho run >> {tmp_path}/runs\nPYTHONPATH={ROOT} exec {sys.executable} -m vvgt_cli.cli.main "$@"\n'
+        f"#!/bin/sh\necho run >> {tmp_path}/runs\n"
+        f'PYTHONPATH={ROOT} exec {sys.executable} -m vvgt_cli.commands.main "$@"\n'
     )
     command.chmod(0o755)
     values = np.indices((20, 22, 24)).sum(axis=0).astype(np.uint8)

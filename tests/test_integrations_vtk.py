@@ -255,7 +255,7 @@ def test_the_command_is_found_by_variable_and_path(monkeypatch, tmp_path):
 
 
 def test_a_kept_process_reads_a_file_again_and_ends_where_a_message_is_not_taken(monkeypatch, tmp_path, capsys):
-    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.commands.main")
     kept, file = command.Kept(), tmp_path / "a.npy"
     for size in (24, 36):
         np.save(file, np.full((size, size, size), size, np.float32) * np.linspace(0, 1, size, dtype=np.float32))
@@ -266,7 +266,7 @@ def test_a_kept_process_reads_a_file_again_and_ends_where_a_message_is_not_taken
     with pytest.raises(ZeroDivisionError):
         kept.run(["--version"])
     monkeypatch.undo()
-    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.commands.main")
     with pytest.raises(RuntimeError, match=r"^no such file"):  # not the status of the one before
         kept.run(["info", "no such file"])
     kept.close()
@@ -274,7 +274,7 @@ def test_a_kept_process_reads_a_file_again_and_ends_where_a_message_is_not_taken
 
 def test_a_kept_process_runs_commands_one_after_another(monkeypatch, capsys):
     """Each with its own messages and error, also after the process was killed."""
-    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.cli.main")
+    monkeypatch.setenv("VVGT", f"{sys.executable} -m vvgt_cli.commands.main")
     kept = command.Kept()
     kept.run(["--version"])
     first = kept.process

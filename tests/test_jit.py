@@ -125,7 +125,7 @@ def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
 def test_warmup_without_a_place_is_an_error(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     few = "from vvgt_cli.jit import ahead; ahead.ALL = ahead.BACK_PROJECT[1:]"
-    quick = f"{few}; from vvgt_cli.cli.main import main; main()"
+    quick = f"{few}; from vvgt_cli.commands.main import main; main()"
     done = python("-c", quick, "warmup", cwd=tmp_path, code=1, folder=tmp_path / "file")
     assert "no folder can keep" in done.stderr
 
@@ -133,7 +133,7 @@ def test_warmup_without_a_place_is_an_error(tmp_path):
 SPY = """
 import importlib, json, os, sys
 from tests.spared import spare
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.jit import ahead, compile
 from vvgt_cli.jit.cache import KernelCache
 inner, asked, odd = KernelCache.load_overload, set(), set()

@@ -24,7 +24,7 @@ def some(count: int = 60, degree: int = 0) -> Gaussians:
 
 def as_python(*line: object) -> subprocess.CompletedProcess[str]:
     """A command with numba off."""
-    command = [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, line)]
+    command = [sys.executable, "-m", "vvgt_cli.commands.main", *map(str, line)]
     return subprocess.run(command, env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True)
 
 

@@ -115,7 +115,11 @@ def test_recognised_by_type_name_and_number() -> None:
         (Volume(balls(), name="segment"), True),
         (Volume(balls(), name="sega"), False),
         (Volume(balls(), name="frog_tissues"), False),
-        (Volume(balls().astype(np.float32), name="labels"), False),
+        (Volume(balls().astype(np.float32), name="labels"), True),
+        (Volume(balls() + np.float32(0.5), name="labels"), False),
+        (Volume(np.where(balls(), 7, 0), name="liver_mask"), True),
+        (Volume(balls(), name="brainmask"), False),  # FreeSurfer's holds grey values
+        (Volume(balls().astype(np.float64), name="t1_masked"), False),
         (Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), name="labels"), False),
     ):
         assert recognised(volume) is expected, volume.name
@@ -320,7 +324,9 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
         colors = read_ply(str(tmp_path / row["file"]))[0].colors
         assert np.median(colors @ color) > 0.7
         assert np.abs(colors[:, np.array(color) == 0]).max() < 1e-6
-    assert json.loads(vvgt("info", path, "--json").out)["segment_layers"] == 2
+    facts = json.loads(vvgt("info", path, "--json").out)
+    assert facts["segment_layers"] == 2
+    assert [row["name"] for row in facts["segments"]] == ["liver", "lesion", "vein"]
     vvgt.ok("init", "example:blob:8", "--layer", path, *SMALL[:4], "-o", tmp_path / "l.ply")
     for options in (("--tf", "gray"), ("--labels", "none")):
         assert "2 layers of segments that overlap" in vvgt.fails(2, "init", path, *options, "-o", tmp_path / "n.ply")
@@ -328,7 +334,8 @@ def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
     series = vvgt("convert", tmp_path / "*.seg.nrrd", *SMALL, "-o", tmp_path / "s_{}.ply")
     assert "convert such frames one by one" in series.error
     path.write_bytes(path.read_bytes().replace(b"Segment0_Layer:=0", b"Segment0_Layer:=7"))
-    assert "layer 0: no labels" in vvgt("init", path, "-o", tmp_path / "n.ply").error
+    vvgt.ok("init", path, *SMALL[:4], "-o", tmp_path / "n.ply")
+    assert json.loads(read_ply(str(tmp_path / "n.ply"))[1].legend)["labels"][0][0] == "x.seg 0"
 
 
 def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> None:
@@ -355,7 +362,7 @@ def test_tables_are_listed_and_distinguished_from_functions(vvgt, tmp_path: Path
             ("init", "example:blob:8", "--tf", path, "-o", "b.ply"),
         ):
             assert "a table of labels; expected a transfer function: give the table to --labels" in vvgt(*call).error
-    refused(DataError, "not a transfer function", library.convert, balls(), table(tmp_path, '{"range": 1}', "b.json"))
+    refused(DataError, "not a transfer function", library.convert, balls(), table(tmp_path, '{"range": 0.5}', "b.json"))
     (tmp_path / "notes.txt").write_text("nothing of the kind")
     assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
 
@@ -379,3 +386,68 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     assert read_ply(str(tmp_path / "s.ply"))[1].optics is None  # of scalars the header is what it was
     header = read_ply(str(ply))[1]
     assert layout_of(header).optics == header.optics
+
+
+NNUNET = {"channel_names": {"0": "CT"}, "labels": {"background": 0, "skin": 1, "core": 3}}
+DECATHLON = {"modality": {"0": "CT"}, "labels": {"0": "background", "1": "skin", "3": "core"}}
+CATEGORICAL = [{"Name": "organs", "IndexedColors": [1, 0.2, 0, 0, 0, 1], "Annotations": ["1", "skin", "3", "core"]}]
+NAMES = {"1": "skin", "3": "core"}
+
+
+@pytest.mark.parametrize(
+    ("table_json", "pick"),
+    [
+        (NNUNET, ""), (DECATHLON, ""), (NAMES, ""), ({"skin": 1, "core": 3}, ""), ({"total": NAMES}, ""),
+        ({"total": NAMES, "lung": {"1": "lung"}}, "#total"), (CATEGORICAL, ""), (CATEGORICAL[0], ""),
+        ([*CATEGORICAL, {"Name": "other", "IndexedColors": [0, 0, 0]}], "#organs"),
+    ],
+)  # fmt: skip
+def test_names_in_json(vvgt, tmp_path: Path, seg: Path, table_json, pick: str) -> None:
+    path = table(tmp_path, json.dumps(table_json), "names.json")
+    found = read_labels(path + pick).structures
+    assert [(e.number, e.name) for e in found] == [(1, "skin"), (3, "core")]
+    if "IndexedColors" in str(table_json):
+        assert [e.color for e in found] == [(1, 0.2, 0), (0, 0, 1)]
+    else:
+        assert [e.color for e in found] == [e.color for e in distinct([1, 3]).labels]
+    vvgt.ok("init", seg, "--labels", path + pick, *SMALL[:4], "-o", tmp_path / "x.ply")
+    assert [name for name, _ in json.loads(read_ply(str(tmp_path / "x.ply"))[1].legend)["labels"]] == ["skin", "core"]
+    if not pick:
+        assert json.loads(vvgt("info", path, "--json").out)["kind"] == "table of labels"
+        said = vvgt.fails(1, "init", seg, "--tf", path, "-o", tmp_path / "y.ply")
+        assert "a table of labels; expected a transfer function: give the table to --labels" in said
+
+
+def test_regions_are_groups_and_dataset_json_is_offered(vvgt, tmp_path: Path) -> None:
+    regions = {"labels": {"background": 0, "whole": [1, 2, 3], "core": [2, 3], "enhancing": [3]}}
+    path = table(tmp_path, json.dumps(regions), "dataset.json")
+    found = [(e.number, e.name, e.parents) for e in read_labels(path).structures]
+    assert found == [(1, "whole", ()), (2, "core", ("whole",)), (3, "enhancing", ("whole", "core"))]
+    (tmp_path / "labelsTr").mkdir()
+    np.save(case := tmp_path / "labelsTr" / "case_1.npy", balls())
+    with pytest.warns(UserWarning, match=r"dataset\.json may name its labels \(try --labels"):
+        vvgt.ok("init", case, "--labels", "auto", *SMALL[:4], "-o", tmp_path / "x.ply")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"skin": 1, "core": 1}', "label 1 is 'core' and 'skin'|label 1 is 'skin' and 'core'"),
+        ('{"1": "skin", "1": "core"}', "'1' twice"),
+        ('{"1": "skin", "01": "core"}', r"label 1 twice \(skin, core\)"),
+        ('{"labels": {}}', "no labels"),
+        ('{"labels": 1}', "no object"),
+        ('{"skin": 1.5}', "'skin'"),
+        ('{"skin": []}', "'skin'"),
+        ('{"skin": true}', "'skin'"),
+        ('{"a": {"1": "x"}, "b": {"1": "y"}}', "one of a, b"),
+        ('[{"IndexedColors": [0, 0, 0]}]', "no Annotations"),
+        ('[{"IndexedColors": [0, 0], "Annotations": ["1", "a"]}]', "IndexedColors"),
+        ('[{"IndexedColors": [0, 0, 2], "Annotations": ["1", "a"]}]', r"\[0, 1\]"),
+        ('[{"IndexedColors": [0, 0, 0], "Annotations": ["low", "a"]}]', "no Annotations"),
+        ('[{"IndexedColors": [0, 0, 0], "Annotations": ["1", "a", "1", "b"]}]', "label 1 twice"),
+        ('{"labels": {"skin": 1', "not JSON"),
+    ],
+)
+def test_faulty_names_in_json(tmp_path: Path, text: str, said: str) -> None:
+    refused(DataError, said, read_labels, table(tmp_path, text, "a.json"))

@@ -286,6 +286,51 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     assert "gray" in vvgt.ok("init", tmp_path / "a.ome.tif", *how).err
 
 
+@pytest.mark.parametrize(
+    ("asked", "numbers"),
+    [
+        *(("DAPI,RFP", [0, 2]), ("2,0", [2, 0]), ("RFP,0", [2, 0]), ("0,DAPI,0,1", [0, 1])),
+        *(("GFP, membrane", [1]), ("RFP,GFP, membrane", [2, 1]), ("GFP, membrane,DAPI,2", [1, 0, 2])),
+    ],
+)
+def test_several_channels_by_names_and_numbers(vvgt, tmp_path: Path, asked: str, numbers: list[int]) -> None:
+    """A name may hold a comma, and each channel has the colour that it has among all."""
+    path = tmp_path / "a.ome.tif"
+    values = np.random.default_rng(0).integers(0, 999, (6, 3, 8, 10)).astype(np.uint16)
+    names = ["DAPI", "GFP, membrane", "RFP"]
+    tifffile.imwrite(path, values, ome=True, metadata={"axes": "ZCYX", "Channel": {"Name": names}})
+    every, some = (open_content(str(path), ReadOptions(component=word)) for word in (ALL, asked))
+    for volume, number in zip(some.volumes, numbers, strict=True):
+        np.testing.assert_array_equal(volume.data, values[:, number])
+    if len(numbers) > 1:
+        assert list(some.colors) == [every.colors[k] for k in numbers]
+        rows = json.loads(vvgt("info", path, "--channel", asked, "--json").out)["choices"]
+        assert [(row["choice"], row["name"]) for row in rows] == [(f"--channel {k}", names[k]) for k in numbers]
+
+
+def test_several_channels_in_python_and_of_a_layer(tmp_path: Path) -> None:
+    write_ome(tmp_path / "a.ome.tif")
+    goal = {"max_gaussians": 50, "size": 32, "steps": 0}
+    made = [library.convert(tmp_path / "a.ome.tif", goal=goal, component=how) for how in (["cyan", 0], "1,red")]
+    np.testing.assert_array_equal(made[0].gaussians.means, made[1].gaussians.means)
+    assert library.read_volume(tmp_path / "a.ome.tif", component=["cyan"]).data.max() == 3000
+    source = load(replace(parse_layer(f"{tmp_path / 'a.ome.tif'},channel=cyan,0")))
+    assert [layer.tf.name for layer in source.layers] == ["channel 1 cyan", "channel 0 red"]
+
+
+@pytest.mark.parametrize("asked", ["DAPI,XY", "0,3", "XY,DAPI", "DAPI,", "all,XY"])
+def test_channels_that_are_not_there(tmp_path: Path, asked: str) -> None:
+    path, shape = str(tmp_path / "a.ome.tif"), (6, 3, 8, 10)
+    for names, said in (
+        (["DAPI", "GFP", "RFP"], "no channel '.*'; it has 0 'DAPI', 1 'GFP', 2 'RFP'$"),
+        (["A,B"], "1 channel .*0 'A,B'"),
+    ):
+        meta = {"axes": "ZCYX", "Channel": {"Name": names}}
+        tifffile.imwrite(path, np.zeros(shape, np.uint16)[:, : len(names)], ome=True, metadata=meta)
+        refused(UsageError, said, open_content, path, ReadOptions(component=asked))
+    assert open_content(path, ReadOptions(component="A,B")).single_volume
+
+
 # ---- layers
 
 

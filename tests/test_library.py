@@ -4,6 +4,8 @@ import doctest
 import html
 import json
 import re
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
 import nibabel
@@ -17,6 +19,7 @@ import vvgt_cli as vvgt
 from tests.headers import uncertified
 from tests.processes import python
 from tests.refused import refused
+from vvgt_cli.commands.main import COMMANDS
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
 
@@ -51,7 +54,7 @@ def saved(result: vvgt.Result, path: Path) -> bytes:
 
 
 def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     field.tofile(tmp_path / "a.raw")
     (tmp_path / "tf.json").write_text(json.dumps(TF))
@@ -160,7 +163,7 @@ def test_results_are_drawn_scored_and_shown(field, converted):
 
 
 def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     grid = pyvista.ImageData(dimensions=field.shape[::-1], spacing=SPACING)
     grid["values"] = field.ravel()
@@ -222,11 +225,29 @@ def test_the_library_goes_through_blocks_too(tmp_path):
     np.testing.assert_allclose(blocks.preview(48)[:, :48], whole.preview(48)[:, :48], atol=0.01)
 
 
-@pytest.mark.parametrize("module", [vvgt, functions])
+@pytest.mark.parametrize("module", [vvgt, functions, import_module("vvgt_cli.commands.synth")])
 def test_the_examples_in_docstrings_run(module):
     result = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
-    assert result.attempted >= 3
+    assert result.attempted >= 2
     assert result.failed == 0
+
+
+SHARED = [name for name in vvgt.__all__ if name in COMMANDS and name != "convert"]
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_a_command_and_its_function_have_the_same_names_and_defaults(name):
+    """Except for groups of options, each of which is one argument."""
+    command = import_module(f"vvgt_cli.commands.{name}").command
+    options = {option.name: option for option in command.params}
+    arguments = dict(signature(getattr(vvgt, name)).parameters)
+    grouped = {key for key in ("look", "reading", "blocks", "light", "progress") if arguments.pop(key, None)}
+    assert len(SHARED) > 7
+    assert "progress" in grouped
+    assert set(arguments) <= set(options)
+    for key, argument in arguments.items():
+        if not options[key].required:
+            assert (options[key].to_info_dict()["default"] or None) == (argument.default or None), key
 
 
 def test_importing_costs_nothing_and_is_quiet():

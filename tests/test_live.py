@@ -283,7 +283,7 @@ def test_bytes_for_pages_lose_little() -> None:
 
 @pytest.fixture(scope="module")
 def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     folder = tmp_path_factory.mktemp("live")
     (folder / "tf.json").write_text(json.dumps(TF))
@@ -417,7 +417,7 @@ def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".json", ".ply", ".ply"]
 
 
-def test_the_library_recolors_results_and_files(live_file) -> None:
+def test_the_library_recolors_results_and_files(live_file, tmp_path, vvgt) -> None:
     result = vvgt_library.convert("example:blob:12", goal={"max_gaussians": 100, "size": 48}, live=True)
     assert result.gaussians.live is not None
     other = result.recolor("viridis")
@@ -425,7 +425,9 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     assert len(other.gaussians) <= 100
     assert result.ply.legend != other.ply.legend
     assert json.loads(other.ply.legend)["nodes"][0][2] == "440154"  # viridis begins with it
-    magma = vvgt_library.recolor(live_file, "magma")
+    magma = vvgt_library.recolor(live_file, "magma", tmp_path / "magma.ply")
+    vvgt.ok("recolor", live_file, "--tf", "magma", "-o", tmp_path / "command.ply")
+    assert (tmp_path / "magma.ply").read_bytes() == (tmp_path / "command.ply").read_bytes()
     assert len(magma.gaussians) > 100
     assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
     refused(vvgt_library.DataError, "carry no values", other.recolor, "magma")

@@ -11,7 +11,7 @@ from browser import page_picture
 from test_live_layers import pair  # noqa: F401
 
 from vvgt_cli.cameras import orbit_views
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_png

@@ -188,7 +188,7 @@ def test_cells_do_not_straddle_labels() -> None:
 
 @pytest.fixture(scope="module")
 def label_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     folder = tmp_path_factory.mktemp("labels")
     np.save(folder / "map_label.npy", halves().data)

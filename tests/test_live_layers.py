@@ -113,7 +113,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball left and one right, the right one on a grid of its own, smaller and shifted; and a label map."""
     import nibabel
 
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     folder = tmp_path_factory.mktemp("pair")
     z, y, x = np.mgrid[:20, :20, :20] - 9.5

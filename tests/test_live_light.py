@@ -83,7 +83,7 @@ def test_a_light_turns_with_its_gaussians() -> None:
 
 @pytest.fixture(scope="module")
 def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     path = tmp_path_factory.mktemp("lit") / "live.ply"
     tail = ["-q", "-o", str(path), *map(str, SMALL)]

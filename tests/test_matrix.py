@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from tests.processes import replaced
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.images import read_exr, read_png
@@ -99,7 +100,7 @@ ROWS = {
 def converted(vvgt, volume, options, out: Path, *more):
     """The report of a conversion."""
     report = out.with_suffix(".report.json")
-    vvgt.ok("convert", volume, *SMALL, *options, *more, "-o", out, "--report", report, "--overwrite")
+    vvgt.ok("convert", volume, *replaced(SMALL, *options, *more), "-o", out, "--report", report, "--overwrite")
     return json.loads(report.read_text())
 
 

@@ -8,11 +8,10 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
-from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look import from_histogram
-from vvgt_cli.network.card import find_model
+from vvgt_cli.network.card import SHIPPED, find_model
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.splat import render
 from vvgt_cli.volume import statistics

@@ -13,8 +13,9 @@ from tifffile import imwrite
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.commands import render as command
-from vvgt_cli.commands.render import write_movie
+from vvgt_cli.commands import pictures as command
+from vvgt_cli.commands.pictures import write_movie
+from vvgt_cli.commands.render import render as write_views
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
@@ -24,7 +25,6 @@ from vvgt_cli.gaussians.frames import rescale, upright_matrix
 from vvgt_cli.gaussians.rules import rule_of
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.progress import Console
 from vvgt_cli.splat import render
 
 
@@ -157,9 +157,7 @@ def test_a_frame_is_opened_for_its_own_views_after_the_one_before_is_gone(run, t
         return draw, by
 
     monkeypatch.setattr(command, "_volume", watched)
-    source = SourceRequest(str(run / "run_*.npy"), tf="viridis")
-    request = command.RenderRequest(source, str(tmp_path / "a.gif"), orbit=7, size=16)
-    command.render_file(request, Console(quiet=True))
+    assert write_views(run / "run_*.npy", tmp_path / "a.gif", "viridis", orbit=7, size=16) == 7
     names = [camera.name for camera in orbit_views(7)]
     assert opened == [names[:2], "closed", names[2:4], "closed", names[4:], "closed"]
 

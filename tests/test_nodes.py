@@ -17,7 +17,6 @@ from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.look.labels import Label, LabelTable
-from vvgt_cli.look.terms import codes_of_tags
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
 
@@ -229,7 +228,7 @@ def test_slicers_terms_are_groups(tmp_path) -> None:
     (tmp_path / "s.seg.nrrd").write_text("\n".join(lines) + "\n\n")
     labels = read_labels(str(tmp_path / "s.seg.nrrd")).labels
     assert [label.parents for label in labels] == [parents for *_, parents in segments]
-    assert dict((part, code) for part, code, _ in codes_of_tags(segments[1][1]))["type_modifier"] == "SCT:7771000"
+    assert dict((part, code) for part, code, _ in labels[1].codes)["type_modifier"] == "SCT:7771000"
     columns = ",".join(
         f"{part}_{field}" for part in ("Category", "Type", "TypeModifier", "Region", "RegionModifier")
         for field in ("CodingScheme", "CodeValue", "CodeMeaning")

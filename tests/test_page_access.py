@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from test_page_where import DESK, PHONE, Person, marked  # noqa: F401
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.images.metrics import psnr
 
 pytestmark = pytest.mark.long

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.test_page_where import DESK, Person
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 pytestmark = pytest.mark.long
 SMALL = ["--max-gaussians", "300", "--size", "100", "--quiet"]

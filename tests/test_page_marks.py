@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_page_where import CENTRE, DOTS, SCALE, Person, dots, found, marked, person  # noqa: F401
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 
 pytestmark = pytest.mark.long

@@ -13,7 +13,7 @@ import pytest
 from browser import PAGES, browser, packages
 from PIL import Image
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.images import read_png
 

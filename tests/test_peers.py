@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands import report
+from vvgt_cli.commands import report_runs as report
 from vvgt_cli.commands.peers import Peer
 from vvgt_cli.errors import UsageError
 from vvgt_cli.score.charts import draw
@@ -33,7 +33,7 @@ def cold(monkeypatch):
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
     """What the trainer that stands for others leaves: our closed form."""
-    from vvgt_cli.cli.main import run as vvgt
+    from vvgt_cli.commands.main import run as vvgt
 
     made = tmp_path_factory.mktemp("peers")
     args = ["init", "example:blob:10", "--tf", "viridis", "--size", "24", "--max-gaussians", "60"]

@@ -41,7 +41,7 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(volume: Path) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     out = volume.parent / "out"
     assert run(["convert", str(volume), *FIT, *STEPS, "--blocks", "64", "-o", str(out / "lod-meta.json")]) == 0

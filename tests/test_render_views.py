@@ -6,11 +6,12 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.processes import replaced
 from tests.refused import refused
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
 from vvgt_cli.cameras import look_at
 from vvgt_cli.cameras.files import camera_to_opengl, read_cameras, transforms_json
-from vvgt_cli.commands.render_views import CameraRequest, function_name
+from vvgt_cli.commands.view_sets import CameraRequest, function_name
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
@@ -160,7 +161,7 @@ def test_load_views_prefers_exr_and_falls_back_to_png(copied, expected):
 
 
 def test_half_rounds_to_half(vvgt, tmp_path, expected):
-    vvgt.ok(*BASE, "--test-views", 0, "--half", "--format", "exr", "-o", tmp_path / "h")
+    vvgt.ok(*replaced(BASE, "--test-views", 0), "--half", "--format", "exr", "-o", tmp_path / "h")
     camera, image = expected["train"][1]
     read, _ = read_exr(tmp_path / "h" / "train" / f"{camera.name}.exr")
     np.testing.assert_array_equal(read, image.astype(np.float16).astype(np.float32))

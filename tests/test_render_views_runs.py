@@ -6,8 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
-from vvgt_cli.commands.render_views import CameraRequest
+from vvgt_cli.commands.view_sets import CameraRequest
 from vvgt_cli.conversion.manifest import Manifest, Shard, read_manifest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import cameras_digest, volume_digest
@@ -115,7 +116,7 @@ def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
 def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, message):
     before = stamps(made)
     base = ["render-views", VOLUME, *SMALL, "--background", 1, 0, 0.5]
-    result = vvgt.fails(2, *base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
+    result = vvgt.fails(2, *replaced([*base, "--tf", TF], *change), "-o", made)
     assert message in result
     assert "--overwrite" in result
     assert stamps(made) == before

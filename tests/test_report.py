@@ -13,7 +13,7 @@ import pytest
 from tests.onnx_models import write_model
 from tests.refused import refused
 from tests.report_runs import document, run, runs
-from vvgt_cli.commands.report import RunOptions, plan_runs, random_points
+from vvgt_cli.commands.report_runs import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
 from vvgt_cli.score.charts import FILES, draw, log_ticks
@@ -61,7 +61,7 @@ class Reader(HTMLParser):
 @pytest.fixture(scope="module")
 def scene_report(tmp_path_factory):
     """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
-    from vvgt_cli.cli.main import run as vvgt
+    from vvgt_cli.commands.main import run as vvgt
 
     folder = tmp_path_factory.mktemp("report")
     step = np.zeros(14)
@@ -104,7 +104,7 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
 
 
 def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.commands.report.warm_up", lambda *_: None)
+    monkeypatch.setattr("vvgt_cli.commands.report_runs.warm_up", lambda *_: None)
     folder, found = scene_report
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     assert "in blocks of 16" in vvgt.ok("report", *args, "-o", tmp_path / "out").err

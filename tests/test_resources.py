@@ -172,7 +172,7 @@ def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_or_read_not_
         (group / "memory.limit_in_bytes").write_text(str(2 * GIB))
         path = big(tmp_path)
         join = f"open({str(group / 'cgroup.procs')!r}, 'w').write('0')"
-        code = f"{join}\nfrom vvgt_cli.cli.main import main\nmain()\n"
+        code = f"{join}\nfrom vvgt_cli.commands.main import main\nmain()\n"
         python("-c", code, "info", path)
         _, told = python("-c", code, "convert", path, "-o", tmp_path / "a.ply", code=1)
         assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in told
@@ -202,7 +202,7 @@ print(kept >> 20, (free_memory() - ((2 << 30) - before)) >> 20)
 def test_a_process_ends_after_its_exit_functions_and_threads(threads):
     text = f"""
 import atexit, threading, time
-from vvgt_cli.cli.process import leave
+from vvgt_cli.commands.process import leave
 atexit.register(print, "end", flush=True)
 for _ in range({threads}):
     threading.Thread(target=lambda: (time.sleep(0.2), print("thread", flush=True))).start()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians.formats import SUFFIXES
 
 SMALL = ("--size", "32", "--max-gaussians", "200", "--steps", "2")

@@ -16,7 +16,7 @@ import pytest
 from tests import processes
 from tests.headers import uncertified
 from tests.test_scale import FIT, bodies
-from vvgt_cli.cli.main import run as command
+from vvgt_cli.commands.main import run as command
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 

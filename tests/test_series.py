@@ -2,18 +2,24 @@
 
 import json
 import re
+import warnings
 from pathlib import Path
 
 import nibabel as nib
 import numpy as np
 import pytest
+import pyvista
 import tifffile
+import xarray
 from PIL import Image
 
+import vvgt_cli as library
 from tests.headers import uncertified
+from tests.processes import replaced
 from tests.test_streamed import contents as files_in
+from vvgt_cli.commands import main
 from vvgt_cli.conversion.frames import merge_statistics
-from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS, frame_facts, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.gaussians.formats.sog import images_of
@@ -205,7 +211,8 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
 def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path, stand_in: list) -> None:
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     vvgt.ok(*run)
-    assert "holds frames of another run: max gaussians 60 there, 50 here" in vvgt(*run, "--max-gaussians", "50").error
+    other = vvgt(*replaced(run, "--max-gaussians", "50")).error
+    assert "holds frames of another run: max gaussians 60 there, 50 here" in other
     np.save(series / "run_12.npy", np.zeros((8, 10, 12), np.float32))
     assert "another volume, frames 4 there, 5 here" in vvgt(*run).error
     vvgt.ok(*run, "--overwrite")
@@ -249,11 +256,126 @@ def test_names_of_frames() -> None:
     assert put_name("-o", "a_{:04d}.ply", FRAMES, "7") == "a_0007.ply"
     assert put_name("-o", "a_{}.ply", FUNCTIONS, "7") == "a_7.ply"
     assert [is_pattern(name) for name in ("a.ply", "{}.ply", "{:3d}.ply", "{x}.ply", "{0.__class__}.ply")] == [
-        False, True, True, False, False
+        False, True, True, True, True
     ]  # fmt: skip
-    for pattern, kind in (("{}/{:d}.ply", FRAMES), ("a{x}_{}.ply", FUNCTIONS), ("{:d}.ply", FUNCTIONS)):
+    facts = {"step": "0100", "time": 0.05, "stem": "run_0100"}
+    for pattern, name in (
+        *(("{step}.ply", "0100.ply"), ("{step:d}_{}.ply", "100_7.ply"), ("{stem}.ply", "run_0100.ply")),
+        *(("{time}/{:03d}.ply", "0.05/007.ply"), ("{time:.3f}.ply", "0.050.ply")),
+    ):
+        assert put_name("-o", pattern, FRAMES, "7", facts) == name
+    with pytest.raises(UsageError, match="the input of frame 7 states no time; expected another place"):
+        put_name("-o", "{time}.ply", FRAMES, "7", {"step": "1"})
+    wrong = ("{x}_{}.ply", "{0.__class__}.ply", "{stem:d}.ply", "{step}{step}.ply", "{{}.ply")
+    for pattern, kind in (
+        *(
+            *((name, FRAMES) for name in wrong),
+            ("{}/{:d}.ply", FRAMES),
+            ("a{x}_{}.ply", FUNCTIONS),
+            ("{:d}.ply", FUNCTIONS),
+        ),
+        *(("{step}.ply", FUNCTIONS), ("{stem}.ply", LABELS)),
+    ):
         with pytest.raises(UsageError, match="expected one place for the"):
             put_name("-o", pattern, kind, "1")
+
+
+@pytest.mark.parametrize(
+    ("names", "steps"),
+    [
+        (["run_0050.vti", "run_0100.vti"], ["0050", "0100"]),
+        (["a/t1_c2.nii.gz", "a/t5_c2.nii.gz"], ["1", "5"]),  # the number that differs
+        (["v2/0010/f3.npy", "v2/0020/f3.npy"], ["0010", "0020"]),
+        (["x_9.h5", "x_10_b.h5"], ["9", "10"]),
+        (["a_1.compressed.ply", None], ["1", None]),
+        (["one_7.vti"], ["7"]),
+        (["a.vti", "b.vti"], [None, None]),
+    ],
+)
+def test_the_step_is_the_number_in_a_name(names: list, steps: list) -> None:
+    assert [row.get("step") for row in frame_facts(names)] == steps
+
+
+def test_outputs_keep_step_time_and_stem_of_their_inputs(vvgt, series: Path, stand_in: list, monkeypatch) -> None:
+    monkeypatch.chdir(series)
+    for k, time in ((50, 0.05), (100, 0.1), (200, 0.2)):
+        image = pyvista.ImageData(dimensions=(9, 8, 7))
+        image["v"], image.field_data["TimeValue"] = np.random.default_rng(k).random(504), [time]
+        image.save(f"vtk_{k:04d}.vti")
+    axes = {"time": ("time", [0.0, 1.5], {"units": "seconds since 2000-01-01"})}
+    xarray.Dataset({"v": (("time", "z", "y", "x"), np.ones((2, 3, 4, 5), "f4"))}, coords=axes).to_netcdf("t.nc")
+    for volume, pattern, names in (
+        ("vtk_*.vti", "a/{step}.ply", ("0050", "0100", "0200")),
+        ("vtk_*.vti", "b/{time}.ply", ("0.05", "0.1", "0.2")),
+        ("vtk_*.vti", "c/{stem}.ply", ("vtk_0050", "vtk_0100", "vtk_0200")),
+        ("t.nc", "d/{time}.ply", ("0", "1.5")),
+        ("t.nc", "e/{step}.ply", ("0", "1")),
+    ):
+        folder = Path(pattern).parent
+        folder.mkdir()
+        run = ("convert", volume, "--tf", "gray", "-o", pattern, "--report", folder / "r_{stem}_{}.json", *SMALL[:-1])
+        vvgt.ok(*run)
+        assert {path.stem for path in folder.glob("*.ply")} == set(names)
+        rows = json.loads((folder / "index.json").read_text())["files"]
+        assert [row["file"] for row in rows] == [f"{name}.ply" for name in names]
+        assert f"0 frames converted, {len(names)} were complete before" in vvgt.ok(*run).err
+        if volume != "t.nc":
+            vvgt.ok("render", volume, "--size", 16, "-o", pattern.replace(".ply", ".png"))
+            assert {path.stem for path in folder.glob("*.png")} == set(names)
+    before = len(stand_in)
+    assert "f/t.ply would hold several frames" in vvgt("convert", "t.nc", "-o", "f/{stem}.ply").error
+    assert "frame 0 states no time" in vvgt("convert", "run_*.npy", "-o", "{time}.ply").error
+    assert "{step} or {time} that its input states" in vvgt("convert", "t.nc", "-o", "{when}.ply").error
+    assert len(stand_in) == before
+    clouds = library.convert("vtk_*.vti", "gray", {"max_gaussians": 50, "size": 32, "steps": 0})
+    assert isinstance(clouds, library.Clouds)
+    clouds.save("lib_{step}_{time}.ply")
+    assert sorted(path.name for path in series.glob("lib*.ply"))[0] == "lib_0050_0.05.ply"
+
+
+def test_a_note_of_all_frames_is_printed_once(vvgt, series: Path, monkeypatch) -> None:
+    """Whether it is a warning of a reader or a message of a conversion, and of functions and layers too."""
+    monkeypatch.chdir(series)
+    monkeypatch.setattr(warnings, "showwarning", main._note)  # as `main.main` does
+    sheared, loud = np.eye(4), SMALL[:-1]
+    sheared[0, 1] = 0.3
+    for k in (1, 2, 3):
+        image = pyvista.ImageData(dimensions=(9, 8, 7))
+        image["v"], image["w"] = np.random.default_rng(k).random((2, 504))
+        image.set_active_scalars("v")
+        image.save(f"two_{k}.vti")
+        nib.save(nib.Nifti1Image(np.random.default_rng(k).random((9, 8, 7)).astype("f4"), sheared), f"s_{k}.nii")
+    how = ("--tf", "gray", "--steps", 0, *loud)
+    for call, text, first in (
+        (("two_*.vti", "-o", "out/{}.ply"), "--array takes another: w", "two_1.vti"),
+        (("two_*.vti", "-o", "a.html"), "--array takes another: w", "two_1.vti"),
+        (("two_1.vti", "--layer", "two_2.vti", "--layer", "two_3.vti", "-o", "b.ply"), "--array takes", "two_1.vti"),
+        (("s_*.nii", "-o", "out/s{}.ply", "--overwrite"), "index axes 73.3 degrees apart", "s_1"),
+        (("s_1.nii", "--tf", "hot", "--tf", "bone", "-o", "f_{}.ply"), "index axes 73.3 degrees apart", "s_1"),
+    ):
+        told = vvgt.ok("convert", *call, *how).err
+        assert (told.count(text), told.count(f"{first}: the same holds 3 times")) == (1, 1), told
+        for k in (1, 2, 3) if "{}.ply" in call[-1] and call[0] == "two_*.vti" else ():
+            assert f"frame {k} of 3" in told
+    assert "the same holds" not in vvgt.ok("convert", "s_1.nii", "-o", "c.ply", *how).err
+
+
+def test_a_function_that_fits_is_named_where_none_is_given(vvgt, series: Path, monkeypatch) -> None:
+    monkeypatch.chdir(series)
+    values = np.full((30, 30, 30), -1000, np.int16)
+    values[3:27, 3:27, 3:27], values[8:16, 8:16, 8:16] = 40, 900
+    for k in (1, 2):
+        noise = np.random.default_rng(k).integers(-9, 9, values.shape)
+        nib.save(nib.Nifti1Image((values + noise).astype(np.int16), np.diag([4, 4, 4, 1])), f"ct_{k}.nii")
+    small = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--overwrite")
+    said = "no look is given; --tf ct-bone is made for such data"
+    for call, count in (
+        *((("ct_1.nii",), 1), (("ct_1.nii", "--blocks", 16), 1), (("ct_*.nii",), 1)),
+        *((("ct_1.nii", "--tf", "gray"), 0), (("ct_1.nii", "--labels", "auto"), 0), (("ct_1.nii", "-q"), 0)),
+    ):
+        output = "out/{}.ply" if call[0] == "ct_*.nii" else "a.ply"
+        assert vvgt.ok("convert", *call, *small, "-o", output).err.count(said) == count, call
+    assert "tf             ct-bone" in vvgt("info", "ct_1.nii").out.decode()
 
 
 def test_statistics_together() -> None:
@@ -293,12 +415,14 @@ def test_frames_of_colours(vvgt, series: Path) -> None:
     assert "components 4; expected the 3 of rgb_0.tif" in vvgt("convert", series / "rgb_*.tif", "-o", out, *SMALL).error
 
 
-def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand_in: list) -> None:
+@pytest.mark.parametrize("channels", ["all", "A,B", "1,A"])
+def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand_in: list, channels: str) -> None:
     """The ramp of a channel follows from all frames: the brightest one is not as bright in the first."""
     rng = np.random.default_rng(0)
     values = rng.random((3, 6, 2, 8, 10)) * np.array([1, 2, 4])[:, None, None, None, None] * 1000
-    tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata={"axes": "TZCYX"})
-    run = ("convert", series / "t.ome.tif", "--channel", "all", "-o", series / "out" / "{}.ply", *SMALL[:-1])
+    meta = {"axes": "TZCYX", "Channel": {"Name": ["A", "B"]}}
+    tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata=meta)
+    run = ("convert", series / "t.ome.tif", "--channel", channels, "-o", series / "out" / "{}.ply", *SMALL[:-1])
     assert "3 of 10 x 8 x 6" in vvgt.ok(*run).err
     layers = [load(request.source).layers for request in stand_in]
     nodes = [[layer.tf.node_range() for layer in frame] for frame in layers]

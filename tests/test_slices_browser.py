@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_page_where import CENTRE, MARK, MIDDLE, Person, found, marked, person  # noqa: F401
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 pytestmark = pytest.mark.long
 SAID = "document.querySelector('#slices output').textContent"

@@ -49,9 +49,9 @@ class Row:
     def converted(self, live=False, light="none", blocks=None):
         """Return the pictures of a conversion."""
         unit = float(np.mean(self.edge))
-        kind = {"labels": self.function} if self.labels else {"function": self.function}
+        kind = {"labels": self.function} if self.labels else {"tf": self.function}
         result = vvgt_cli.convert(
-            Volume(self.data, self.edge), vvgt_cli.Look(**kind, light=light, unit_distance=unit),
+            Volume(self.data, self.edge), vvgt_cli.Look(**kind, light=light, opacity_unit_distance=unit),
             {"max_gaussians": BUDGET, "size": SIZE, "steps": None if live else 8}, live=live, blocks=blocks,
         )  # fmt: skip
         if live:

@@ -14,7 +14,7 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.view import streamed_resources
+from vvgt_cli.commands.viewer import streamed_resources
 from vvgt_cli.conversion.convert_batch import convert_files
 from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -47,7 +47,7 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(volume: Path) -> Path:
-    from vvgt_cli.cli.main import run
+    from vvgt_cli.commands.main import run
 
     out = volume.parent / "out"
     assert run(["init", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0

@@ -10,7 +10,7 @@ import pytest
 import vvgt_cli
 from tests.refused import refused
 from vvgt_cli.cameras import default_views
-from vvgt_cli.cli.fit import TARGETS as NAMES
+from vvgt_cli.commands.options import TARGETS as NAMES
 from vvgt_cli.conversion.place import headset_axes
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stages import ViewingConditions

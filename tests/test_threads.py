@@ -7,7 +7,7 @@ import time
 import pytest
 
 from tests.processes import VVGT, python, start
-from vvgt_cli.cli.options import THREAD_VARIABLES
+from vvgt_cli.commands.options import THREAD_VARIABLES
 
 
 def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):

@@ -15,7 +15,7 @@ import vvgt_cli as vvgt
 from tests.test_formats_browser import shoot
 from tests.test_formats_server import shown
 from vvgt_cli.cameras import orbit_views
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.images import read_png

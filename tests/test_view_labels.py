@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.test_view_volume import controller, send  # noqa: F401
-from vvgt_cli.cli.main import run
 from vvgt_cli.commands.converter import Converted, Message, Scored
 from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
 from vvgt_cli.commands.live_site import PageController, ServedCloud, parse_labels
+from vvgt_cli.commands.main import run
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.live_facts import LABEL_ROW

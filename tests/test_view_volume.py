@@ -24,7 +24,7 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands import view
+from vvgt_cli.commands import viewer as view
 from vvgt_cli.commands.converter import Converter, Failed, Setup
 from vvgt_cli.commands.live_site import PageController, ServedCloud, parse_function, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
@@ -417,7 +417,7 @@ def test_names_to_save_under() -> None:
 def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, monkeypatch) -> None:
     shown: list[tuple[list[str], list[float]]] = []
 
-    def serve(run, request, clouds, announce) -> None:
+    def serve(run, clouds, *how) -> None:
         shown.append(([name for name, _ in clouds], [float(read_ply(f)[0].means[:, 0].mean()) for _, f in clouds]))
 
     x = np.indices((12, 12, 24))[2]

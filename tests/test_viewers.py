@@ -8,7 +8,7 @@ import pytest
 from browser import shoot
 
 from vvgt_cli.cameras import Camera, default_views, look_at
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.images.metrics import psnr

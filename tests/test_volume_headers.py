@@ -304,6 +304,57 @@ def test_inviwo_lies(tmp_path: Path, fields: dict, message: str) -> None:
     refused(DataError, message, read_volume, write(tmp_path / "v.dat", dat(fields)))
 
 
+VGI = (
+    "{volume1}\n[representation]\nsize = 5 4 3\nmirror = 0 0 0 0\ndatatype = unsigned integer\nbitsperelement = 8\n"
+    "[file1]\nRegionOfInterestStart = 0 0 0\nRegionOfInterestEnd = 4 3 2\nSkipHeader = 2\nFileFormat = raw\n"
+    "Size = 5 4 3\nName = C:\\CT\\v.vol\nDatatype = signed integer\ndatarange = -1 -1\nBitsPerElement = 16\n"
+    "{volumeprimitive1}\n[geometry]\nresolution = 9 9 9\nunit = m\n[volume]\nvolume = volume7\n"
+    "{volumeprimitive2}\n[geometry]\nposition = 1 2 3\nresolution = 0.05 0.1 0.2\nunit = mm\n"
+    "[volume]\nvolume = volume1\n"
+)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_vgi(tmp_path: Path, newline: str) -> None:
+    """The files' own type counts: that of the representation is VGStudio's in memory."""
+    source = write(tmp_path / "v.vgi", VGI.replace("\n", newline).encode())
+    (tmp_path / "v.vol").write_bytes(b"xx" + VALUES.tobytes())
+    volume = read_volume(source)
+    np.testing.assert_array_equal(volume.data, VALUES)
+    assert isinstance(volume.data, np.memmap)
+    assert (volume.spacing, volume.unit, volume.name) == ((0.05, 0.1, 0.2), "mm", "v")
+    parts = VGI.replace("Size = 5 4 3", "Size = 5 4 2").replace("[file1]", "[file2]\nSize = 5 4 1\nName = w.vol\n"
+                        "Datatype = signed integer\nBitsPerElement = 16\n[file1]").encode()  # fmt: skip
+    (tmp_path / "v.vol").write_bytes(b"xx" + VALUES[:2].tobytes())
+    (tmp_path / "w.vol").write_bytes(VALUES[2:].tobytes())
+    np.testing.assert_array_equal(read_volume(write(tmp_path / "v.vgi", parts)).data, VALUES)
+    second = b"{volume2}\n[file1]\nSize = 5 4 1\nName = w.vol\nDatatype = float\nBitsPerElement = 16\n"
+    two = write(tmp_path / "v.vgi", parts.replace(b"{volumeprimitive1}", second + b"{volumeprimitive1}"))
+    refused(UsageError, "volume1; volume2; choose one with --array", read_volume, two)
+    np.testing.assert_array_equal(read_volume(two, ReadOptions(array="volume1")).data, VALUES)
+    refused(DataError, "'float' of 16 bits; expected raw", read_volume, two, ReadOptions(array="volume2"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("size = 5 4 3", "size = 5 4 2", "files of .*expected all of it"),
+        ("BitsPerElement = 16", "BitsPerElement = 32", "has 122 bytes; expected 242"),
+        ("Datatype = signed integer", "Datatype = colour", "'colour' of 16 bits; expected raw"),
+        ("FileFormat = raw", "FileFormat = tiff", "FileFormat tiff"),
+        ("Size = 5 4 3", "Size = 5 4", "expected raw, three numbers"),
+        ("v.vol", "x.vol", "does not exist beside it"),
+        ("[file1]", "[file2]", "no volume of numbers"),
+        ("SkipHeader = 2", "SkipHeader = -2", "expected raw"),
+        ("resolution = 0.05 0.1", "resolution = 0,05 0,1", "decimal points"),
+    ],
+)
+def test_vgi_lies(tmp_path: Path, old: str, new: str, message: str) -> None:
+    (tmp_path / "v.vol").write_bytes(b"xx" + VALUES.tobytes())
+    assert old in VGI
+    refused(DataError, message, read_volume, write(tmp_path / "v.vgi", VGI.replace(old, new).encode()))
+
+
 @pytest.mark.parametrize("kind", ["nrrd", "mha"])
 def test_vtk_writes_what_we_read(tmp_path: Path, kind: str) -> None:
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy

@@ -101,14 +101,20 @@ def csa(**tags: list[str]) -> bytes:
     return out
 
 
-def mosaic(slices: int, normal: float | None = None, private: bool = True, **changes: Any) -> Dataset:
-    """Tiles of 4 rows and 6 columns, each of its own number; ``normal``: 1 or -1 times that of rows and columns."""
+def mosaic(
+    slices: int, normal: float | None = None, private: bool = True, padding: tuple[int, int] = (0, 0), **changes: Any
+) -> Dataset:
+    """Tiles of 4 rows and 6 columns, each of its own number, and ``padding`` below and on the right of them.
+
+    ``normal`` is 1 or -1 times that of rows and columns.
+    """
     edge = int(np.ceil(np.sqrt(slices)))
     tiles = np.zeros((edge, 4, edge, 6), "<i2")
     for k in range(slices):
         tiles[k // edge, :, k % edge] = 100 * (k + 1) + np.arange(24).reshape(4, 6)
     kind = ["ORIGINAL", "PRIMARY", "M", "ND", "MOSAIC"]
-    file = image(tiles.reshape(4 * edge, 6 * edge), (10, -20, 30), **{
+    picture = np.pad(tiles.reshape(4 * edge, 6 * edge), [(0, n) for n in padding], constant_values=7)
+    file = image(picture, (10, -20, 30), **{
         "Manufacturer": "SIEMENS", "ImageType": kind, "SpacingBetweenSlices": 2.5, "ImageOrientationPatient": OBLIQUE,
         **changes,
     })  # fmt: skip
@@ -135,6 +141,22 @@ def test_mosaics_as_in_dcm2niix(tmp_path: Path, slices: int, normal: float | Non
         check_same(ours, by_dcm2niix(tmp_path / "in", tmp_path / "out")[0])
 
 
+@pytest.mark.parametrize(("slices", "padding"), [(7, (2, 2)), (13, (0, 3)), (4, (1, 0))])
+def test_mosaics_with_padding_lie_where_nibabel_puts_them(
+    tmp_path: Path, slices: int, padding: tuple[int, int]
+) -> None:
+    """Tiles are whole pixels; nibabel (and dcm2niix) give their size and place, but do not read such pixels rightly."""
+    from nibabel.nicom.dicomwrappers import MosaicWrapper
+
+    save(mosaic(slices, 1.0, True, padding), tmp_path / "m.dcm")
+    ours, theirs = read_volume(str(tmp_path)), MosaicWrapper(pydicom.dcmread(tmp_path / "m.dcm"), n_mosaic=slices)
+    assert ours.dims == (*theirs.image_shape[1::-1], slices)
+    np.testing.assert_array_equal(
+        ours.data, 100 * np.arange(1, slices + 1)[:, None, None] + np.arange(24).reshape(4, 6)
+    )
+    np.testing.assert_allclose(ours.origin, theirs.image_position * [-1, -1, 1], atol=1e-4)
+
+
 def test_mosaics_over_time_are_a_series(tmp_path: Path) -> None:
     for t in range(3):
         file = mosaic(4, 1.0, InstanceNumber=t + 1, AcquisitionNumber=t + 1)
@@ -149,8 +171,8 @@ def test_a_mosaic_that_does_not_say_how_many_slices_it_has(tmp_path: Path) -> No
     save(mosaic(4, private=False), tmp_path / "m.dcm")
     with pytest.raises(DataError, match=r"does not say how many slices .*NumberOfImagesInMosaic: try dcm2niix"):
         read_volume(str(tmp_path / "m.dcm"))
-    save(mosaic(4, Rows=7, PixelData=None), tmp_path / "n.dcm")
-    with pytest.raises(DataError, match="a mosaic of 12 x 7 pixels with 4 slices; expected 2 tiles a side"):
+    save(mosaic(4, Rows=1, PixelData=None), tmp_path / "n.dcm")
+    with pytest.raises(DataError, match="a mosaic of 12 x 1 pixels with 4 slices; expected 2 tiles a side"):
         read_volume(str(tmp_path / "n.dcm"))
 
 

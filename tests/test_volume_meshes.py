@@ -126,6 +126,17 @@ def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.Mo
     refused(DataError, r"VTK's reader of VTK files broke down \(SIGSEGV\)", read_volume, str(path))
 
 
+def test_a_warning_of_vtk_is_a_message(tmp_path: Path) -> None:
+    legacy(rectilinear(), tmp_path / "v.vtk", binary=True)
+    body = (tmp_path / "v.vtk").read_bytes()
+    (tmp_path / "v.vtk").write_bytes(body.replace(b"Version 5.1", b"Version 9.9"))
+    how = ReadOptions(array="ramp", dims=(3, 3, 3))
+    with pytest.warns(UserWarning, match="VTK says: Reading file version: 9.9 with older reader"):
+        check_ramp(read_volume(str(tmp_path / "v.vtk"), how))
+    (tmp_path / "v.vtk").write_bytes(body[:-200])
+    refused(DataError, "whole", read_volume, str(tmp_path / "v.vtk"), how)
+
+
 def test_arrays_of_a_mesh_are_listed_with_their_options(tmp_path: Path, vvgt) -> None:
     mesh = tetrahedra()
     mesh.point_data["ramp"][:] = 7

@@ -323,6 +323,21 @@ def test_all_channels_in_the_colours_of_the_file(vvgt, tmp_path: Path, write: Ca
     np.testing.assert_allclose(len(first), len(second), rtol=0.05)
 
 
+@pytest.mark.parametrize(("write", "name"), EVERY, ids=[name for _, name in EVERY])
+@pytest.mark.parametrize("stored", [False, True])
+def test_channels_by_names_and_numbers(tmp_path: Path, write: Callable, name: str, stored: bool) -> None:
+    values = two_cells()
+    write(tmp_path / name, values)
+    content = open_content(str(tmp_path / name), ReadOptions(component="GFP,0", stored=stored))
+    assert (list(content.names), list(content.numbers)) == (["GFP", "DAPI"], [1, 0])
+    np.testing.assert_allclose(content.colors, COLORS[::-1])
+    for volume, number in zip(content.volumes, (1, 0), strict=True):
+        np.testing.assert_array_equal(volume.data[:, :, :], values[0, number])
+    for wrong in ("GFP,XY", "XY"):
+        said = "XY.*0 'DAPI', 1 'GFP'|0 'DAPI', 1 'GFP'.*XY"
+        refused(UsageError, said, open_content, str(tmp_path / name), ReadOptions(component=wrong, stored=stored))
+
+
 def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
     import vvgt_cli as library
 

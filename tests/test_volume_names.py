@@ -149,6 +149,17 @@ def test_files_that_vtk_opens_itself_need_their_own_case(tmp_path: Path) -> None
         ("2dseq", b"\0\1", ("Bruker", "brkraw")),
         ("v.7z", b"7z\xbc\xaf", ("archive", "unpack")),
         ("v.vol", b"\0\1", ("raw values", "--dims X Y Z --dtype TYPE")),
+        ("v.nii.gz", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", ("Git LFS", "git lfs pull")),
+        ("v.raw", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", ("Git LFS", "'v.raw'")),
+        ("v.nii", b"/annex/objects/MD5E-s123--abc.nii\n", ("git-annex", "git annex get 'v.nii'")),
+        ("v.nrrd", b"\n<!DOCTYPE html><html><title>404</title>", ("web server", "load the file again")),
+        ("v.mrc", b'<?xml version="1.0"?><Error><Code>NoSuchKey</Code></Error>', ("web server",)),
+        ("v.mih", b"mrtrix image\ndim: 4,4,4\n", ("MRtrix", "mrconvert 'v.mih' 'v.nii.gz'")),
+        ("v.mif.gz", gzip.compress(b"mrtrix image\ndim: 4,4,4\n"), ("MRtrix", "mrconvert 'v.mif.gz'")),
+        ("v.sgy", "C 1 CLIENT".ljust(3200).encode("cp500"), ("SEG-Y", "segyio.tools.cube('v.sgy')")),
+        ("v0.f00001", b"#std 4  8  8  8", ("Nek5000", "ParaView")),
+        ("v.nii", b"PK\3\4", ("archive", "unpack")),
+        ("v.tar.gz", gzip.compress(b"v.nii".ljust(257, b"\0") + b"ustar"), ("archive", "unpack")),
     ],
 )
 def test_formats_that_are_not_read_say_the_way_out(tmp_path: Path, name: str, head: bytes, texts) -> None:

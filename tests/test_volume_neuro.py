@@ -4,6 +4,8 @@ import re
 import sys
 from pathlib import Path
 
+import h5py
+import netCDF4
 import nibabel as nib
 import numpy as np
 import pytest
@@ -163,6 +165,42 @@ def test_minc_over_time(name: str) -> None:
     volume = read_volume(str(MINC / name), ReadOptions(time=1))
     np.testing.assert_allclose(volume.data, nib.load(MINC / name).get_fdata()[1], rtol=1e-6)
     refused(UsageError, "0 to 1", read_volume, str(MINC / name), ReadOptions(time=2))
+
+
+@pytest.mark.parametrize("axes", ["vzyx", "zyxv", "tzyxv", "vtzyx"])
+@pytest.mark.parametrize("version", [1, 2])
+def test_minc_vectors_are_components(tmp_path: Path, axes: str, version: int) -> None:
+    """A deformation grid of minctracc: x, y and z of a displacement along vector_dimension, which is first or last."""
+    sizes = {"v": 3, "t": 2, "z": 6, "y": 5, "x": 4}
+    names = {"v": "vector_dimension", "t": "time"} | {a: f"{a}space" for a in "xyz"}
+    values = np.random.default_rng(0).integers(-99, 99, [sizes[a] for a in axes]).astype("i2")
+    path, dimensions = tmp_path / "grid_0.mnc", ",".join(names[a] for a in axes)
+    if version == 1:
+        with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
+            for a in axes:
+                file.createDimension(names[a], sizes[a])
+                file.createVariable(names[a], "i4", ()).varid = "MINC standard variable"
+            image = file.createVariable("image", "i2", dimensions.split(","))
+            image.signtype, image.valid_range = "signed__", np.array([-100, 100], "i2")
+            image[:] = values
+            for name, end in (("image-min", -10), ("image-max", 10)):
+                file.createVariable(name, "f8", ())[...] = end
+    else:
+        with h5py.File(path, "w") as file:
+            group = file.create_group("minc-2.0/image/0")
+            file.create_group("minc-2.0/dimensions")
+            group["image"] = values
+            group["image"].attrs["dimorder"], group["image"].attrs["valid_range"] = dimensions, [-100.0, 100.0]
+            group["image-min"], group["image-max"] = -10.0, 10.0
+    time, order = (1 if "t" in axes else None), [axes.index(a) for a in "tvzyx" if a in axes]
+    expected = (values.transpose(order)[time or 0] if "t" in axes else values.transpose(order)) / 10
+    refused(UsageError, "each voxel has 3 components", read_volume, str(path), ReadOptions(time=time))
+    for stored in (False, True):
+        for k in range(3):
+            part = read_volume(str(path), ReadOptions(component=k, time=time, stored=stored))
+            np.testing.assert_allclose(part.data[:], expected[k], rtol=1e-6)
+        norm = read_volume(str(path), ReadOptions(component="magnitude", time=time, stored=stored))
+        np.testing.assert_allclose(norm.data[:], np.linalg.norm(expected, axis=0), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["minc1_1_scale.mnc", "minc2_1_scale.mnc"])

@@ -150,6 +150,20 @@ def test_vectors_over_time(tmp_path: Path, suffix: str) -> None:
     refused(UsageError, "3 components", read_volume, source, ReadOptions(time=1))
 
 
+@pytest.mark.parametrize(("intent", "version"), [("vector", 1), ("displacement vector", 2), (2006, 1)])
+def test_a_fourth_axis_of_vectors_is_not_time(tmp_path: Path, intent: str | int, version: int) -> None:
+    """FSL's warps (2006) and others of an intent that is a vector have their components along the fourth axis."""
+    values = np.random.default_rng(1).normal(size=(4, 5, 6, 3)).astype("f4")
+    image = (nib.Nifti1Image if version == 1 else nib.Nifti2Image)(values, np.eye(4))
+    image.header.set_intent(intent, allow_unknown=True)
+    nib.save(image, tmp_path / "v.nii")
+    refused(UsageError, "3 components", read_volume, str(tmp_path / "v.nii"))
+    norm = read_volume(str(tmp_path / "v.nii"), ReadOptions(component="magnitude"))
+    np.testing.assert_allclose(norm.data, np.linalg.norm(values, axis=3).T, rtol=1e-6)
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "v.nii"), ReadOptions(component=2)).data, values[..., 2].T)
+    refused(UsageError, "1 time step", read_volume, str(tmp_path / "v.nii"), ReadOptions(time=1))
+
+
 def test_pair(tmp_path: Path) -> None:
     nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4)).to_filename(tmp_path / "v.img")
     np.testing.assert_array_equal(data_values(read_volume(str(tmp_path / "v.hdr"))), VALUES)

@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 
 from tests.refused import refused
+from tests.vdb_files import plume, vdb
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.look import from_histogram
+from vvgt_cli.look.suggest import fitting
 from vvgt_cli.volume import ReadOptions, read_volume, statistics
 from vvgt_cli.volume.components import magnitude
 from vvgt_cli.volume.openvdb import codec
@@ -237,3 +240,40 @@ def test_a_grid_by_name_on_the_command_line(vvgt, folder: Path, tmp_path: Path) 
     assert b"--grid surface, dims 41 41 41, dtype float32, range -3 3" in told.out
     assert b"--grid fog, dims 35 35 35" in told.out
     assert "fog (float)" in vvgt("init", tmp_path / "sphere.vdb", "-o", tmp_path / "a.ply").error
+
+
+@pytest.mark.parametrize("peak", [1.0, 60.0])
+def test_density_is_taken_of_several_grids_and_shown_as_smoke(tmp_path: Path, peak: float) -> None:
+    grids = plume(24, peak)
+    path = str(vdb(tmp_path / "a.vdb", grids))
+    with pytest.warns(UserWarning, match=r"grid density; --grid, or a --layer with array=, takes another: flame"):
+        volume = read_volume(path, ReadOptions())
+    assert (volume.quantity, volume.preset) == ("density", "smoke")
+    numbers = statistics(volume)
+    shown = from_histogram(numbers, preset=volume.preset)
+    assert shown.name == "automatic (smoke)"
+    assert shown.lighting is not None
+    tau = -np.log1p(-shown.opacity(np.array([0, 0.1, 0.2, 0.4]) * peak))
+    np.testing.assert_allclose(tau[1:] / tau[1], [1, 2, 4], rtol=0.03)  # proportional to the density
+    assert tau[0] == 0
+    depth = 256 * tau[1] / (0.1 * peak) * np.asarray(volume.data).max(axis=None) * 0.4
+    assert 1 < depth < 20  # of a ray that crosses much of the densest smoke
+    assert read_volume(path, ReadOptions(array="flame")).preset == "fire"
+    assert fitting(numbers, volume) == "smoke"
+
+
+def test_smoke_of_nothing_is_shown_by_its_histogram(tmp_path: Path) -> None:
+    values = -plume(16)["density"]
+    volume = read_volume(str(vdb(tmp_path / "a.vdb", {"density": values})), ReadOptions())
+    assert from_histogram(statistics(volume), preset=volume.preset).name == "automatic (histogram)"
+
+
+def test_smoke_and_fire_are_two_layers(tmp_path: Path, vvgt) -> None:
+    path = vdb(tmp_path / "a.vdb", plume(16))
+    vdb(tmp_path / "b.vdb", {name: values for name, values in plume(16).items() if name == "flame"})
+    few = ("--max-gaussians", 100, "--size", 32, "--steps", 0)
+    with pytest.warns(UserWarning, match="grid density"):
+        made = vvgt("convert", path, "--layer", f"{path},array=flame", *few, "-o", tmp_path / "a.ply")
+    assert made.code == 0, made.err
+    assert "automatic (smoke)) + a (automatic (fire))" in made.err
+    assert "automatic (fire)" in vvgt("convert", tmp_path / "b.vdb", *few, "-o", tmp_path / "b.ply").err

@@ -203,22 +203,32 @@ def test_a_coding_without_a_decoder_names_the_package(tmp_path: Path, monkeypatc
     refused(DataError, r"coded as JPEG2000 need imagecodecs .*try: pip install imagecodecs", read_volume, str(path))
 
 
+def write_set(folder: Path, names: list[str], now: list[str], root: bool = True, companion: bool = False) -> None:
+    """Write the slices of one image over files that are called ``now``, in whose XML they have ``names``."""
+    planes = "".join(
+        f'<TiffData IFD="{z * len(names) % Z // len(names)}" FirstZ="{z}" PlaneCount="1"><UUID FileName="{name}">'
+        f"urn:uuid:{names.index(name)}</UUID></TiffData>" for z, name in enumerate(np.repeat(names, Z // len(names)))
+    )  # fmt: skip
+    image = (
+        f'<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="{X}" SizeY="{Y}" '
+        f'SizeZ="{Z}" SizeC="1" SizeT="1" PhysicalSizeX="2" PhysicalSizeY="2" PhysicalSizeZ="3">{planes}</Pixels>'
+        "</Image>"
+    )
+    deep = Z // len(names)
+    for k, name in enumerate(now):
+        uuid = f' UUID="urn:uuid:{k}"' if root else ""
+        inner = '<BinaryOnly MetadataFile="all.companion.ome" UUID="urn:uuid:9"/>' if companion else image
+        xml = f"<OME{uuid}>{inner}</OME>"
+        pages = VALUES[0, 0, deep * k : deep * (k + 1)]
+        tifffile.imwrite(folder / name, pages, description=xml, metadata=None, photometric="minisblack")
+    if companion:
+        (folder / "all.companion.ome").write_text(f'<OME UUID="urn:uuid:9">{image}</OME>')
+
+
 def test_sets_of_files(tmp_path: Path) -> None:
     """One OME-TIFF over two files: each names the other."""
     names = ["a.ome.tif", "b.ome.tif"]
-    planes = "".join(
-        f'<TiffData IFD="{z % 2}" FirstZ="{z}" PlaneCount="1"><UUID FileName="{names[z // 2]}">urn:uuid:{z // 2}</UUID>'
-        "</TiffData>" for z in range(Z)
-    )  # fmt: skip
-    for k, name in enumerate(names):
-        xml = (
-            f'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:{k}"><Image ID="Image:0">'
-            f'<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="{X}" SizeY="{Y}" SizeZ="{Z}" SizeC="1" '
-            f'SizeT="1" PhysicalSizeX="2" PhysicalSizeY="2" PhysicalSizeZ="3">{planes}</Pixels></Image></OME>'
-        )
-        tifffile.imwrite(
-            tmp_path / name, VALUES[0, 0, 2 * k : 2 * k + 2], description=xml, metadata=None, photometric="minisblack"
-        )
+    write_set(tmp_path, names, names)
     for name in names:
         volume = read_volume(str(tmp_path / name))
         np.testing.assert_array_equal(volume.data, VALUES[0, 0])
@@ -229,6 +239,54 @@ def test_sets_of_files(tmp_path: Path) -> None:
     xml_of(tmp_path / names[0], 'FileName="b.ome.tif"', 'FileName="/etc/pass"')
     with pytest.raises(DataError, match=r"names the file '/etc/pass'; expected names in its own folder"):
         read_volume(str(tmp_path / names[0]))
+
+
+@pytest.mark.parametrize(("files", "root", "companion"), [
+    (1, True, False), (1, False, False), (2, True, False), (1, True, True), (2, True, True), (1, False, True),
+])  # fmt: skip
+def test_renamed_files_are_known_by_their_uuid(tmp_path: Path, files: int, root: bool, companion: bool) -> None:
+    names, now = [f"old{k}.ome.tif" for k in range(files)], [f"new{k}.ome.tif" for k in range(files)]
+    write_set(tmp_path, names, now, root, companion)
+    for name in now:
+        volume = read_volume(str(tmp_path / name))
+        np.testing.assert_array_equal(volume.data, VALUES[0, 0])
+        assert volume.spacing == (2, 2, 3)
+        stored = read_volume(str(tmp_path / name), ReadOptions(stored=True))
+        np.testing.assert_array_equal(stored.data[:], VALUES[0, 0])
+    if files == 2:
+        (tmp_path / now[1]).unlink()
+        refused(
+            DataError, r"names the file old1\.ome\.tif, which is not beside it", read_volume, str(tmp_path / now[0])
+        )
+    if companion:
+        (tmp_path / "all.companion.ome").unlink()
+        refused(DataError, "is in all.companion.ome, which is not beside it", read_volume, str(tmp_path / now[0]))
+
+
+def test_a_copy_is_read_itself_and_a_foreign_name_is_said(tmp_path: Path) -> None:
+    """The original of a renamed copy may lie beside it, with other values."""
+    write_set(tmp_path, ["old.ome.tif"], ["new.ome.tif"])
+    tifffile.imwrite(tmp_path / "old.ome.tif", 0 * VALUES[0, 0])
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "new.ome.tif")).data, VALUES[0, 0])
+    (tmp_path / "old.ome.tif").unlink()
+    xml_of(tmp_path / "new.ome.tif", '<OME UUID="urn:uuid:0"', '<OME UUID="urn:uuid:8"')
+    with pytest.warns(UserWarning, match="names old.ome.tif, which is not here; its own pages are read"):
+        np.testing.assert_array_equal(read_volume(str(tmp_path / "new.ome.tif")).data, VALUES[0, 0])
+
+
+def test_images_of_the_xml_without_pages_leave_the_others_their_sizes(tmp_path: Path) -> None:
+    pixels = f'<Pixels DimensionOrder="XYZCT" Type="uint16" SizeX="{X}" SizeY="{Y}" SizeZ="{Z}" SizeC="1" SizeT="1" '
+    images = [
+        f'<Image Name="{name}">{pixels}PhysicalSizeX="{size}" PhysicalSizeY="2" PhysicalSizeZ="3"><TiffData IFD="{at}" '
+        f'PlaneCount="{Z}"/></Pixels></Image>' for name, size, at in (("far", 9, 100), ("near", 1, 0))
+    ]  # fmt: skip
+    for name, read in (("near", True), ("far", False)):
+        xml = f"<OME>{images[0]}{images[1].replace('near', name)}</OME>"
+        tifffile.imwrite(tmp_path / "a.ome.tif", VALUES[0, 0], description=xml, metadata=None)
+        if read:
+            assert read_volume(str(tmp_path / "a.ome.tif")).spacing == (1, 2, 3)
+        else:
+            refused(DataError, "OME-XML of 2 images, pages of 1", read_volume, str(tmp_path / "a.ome.tif"))
 
 
 @pytest.mark.parametrize(
@@ -244,7 +302,11 @@ def test_sets_of_files(tmp_path: Path) -> None:
         ("</Pixels>", "</Pixel>", "damaged OME-XML"),
         ("<Pixels", "<!DOCTYPE a [<!ENTITY b 'c'>]><Pixels", "declares entities"),
         ("<TiffData", '<x><AlongZ Start="0" End="1e9" Step="1e-9"/></x><TiffData', "AlongZ from 0"),
-        ("<Pixels", '<BinaryOnly MetadataFile="all.companion.ome"/><Pixels', "OME-XML is in all.companion.ome"),
+        (
+            "<Pixels",
+            '<BinaryOnly MetadataFile="all.companion.ome"/><Pixels',
+            "is in all.companion.ome, which is not beside",
+        ),
     ],
 )
 def test_xml_that_lies(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -1,6 +1,6 @@
 """A small folder of views that several tests look at."""
 
-from vvgt_cli.cli.main import run
+from vvgt_cli.commands.main import run
 
 VOLUME, TF = "example:blob:16", "viridis"
 SMALL = ("--views", 3, "--test-views", 2, "--size", 24)

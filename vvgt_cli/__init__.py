@@ -21,12 +21,20 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.commands.check import check
+    from vvgt_cli.commands.evaluate import evaluate
+    from vvgt_cli.commands.infer import infer
+    from vvgt_cli.commands.optimize import optimize
+    from vvgt_cli.commands.recolor import recolor
+    from vvgt_cli.commands.render import render
+    from vvgt_cli.commands.synth import synth
+    from vvgt_cli.commands.view import view
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, recolor, render_views
+    from vvgt_cli.library.functions import convert, read_ply, read_volume, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
@@ -35,10 +43,18 @@ if TYPE_CHECKING:
 
 _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
+    "commands.check": ("check",),
+    "commands.evaluate": ("evaluate",),
+    "commands.infer": ("infer",),
+    "commands.optimize": ("optimize",),
+    "commands.recolor": ("recolor",),
+    "commands.render": ("render",),
+    "commands.synth": ("synth",),
+    "commands.view": ("view",),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "recolor", "render_views"),
+    "library.functions": ("convert", "read_ply", "read_volume", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
@@ -67,17 +83,22 @@ __all__ = [
     "UsageError",
     "Volume",
     "VvgtError",
+    "check",
     "convert",
     "default_views",
     "evaluate",
     "export_plotter",
+    "infer",
     "optimize",
     "orbit_views",
     "read_ply",
     "read_transfer_function",
     "read_volume",
     "recolor",
+    "render",
     "render_views",
+    "synth",
+    "view",
 ]
 
 

@@ -47,6 +47,25 @@ def uninterrupted(message: Callable[[str], None]) -> Iterator[Callable[[], bool]
 Interruption = Callable[[Callable[[str], None]], AbstractContextManager[Callable[[], bool]]]
 
 
+class Once:
+    """Messages, each shown once, whatever it is about: the name before the first ": " does not count."""
+
+    def __init__(self) -> None:
+        """Start without messages."""
+        self._said: dict[str, tuple[str, int]] = {}
+
+    def first(self, line: str) -> bool:
+        """Return whether a message is new, and count it."""
+        name, _, text = line.partition(": ")
+        first, count = self._said.get(text or line, (name, 0))
+        self._said[text or line] = first, count + 1
+        return not count
+
+    def repeated(self) -> list[str]:
+        """Return a line for each message that came again."""
+        return [f"{name}: the same holds {count} times" for name, count in self._said.values() if count > 1]
+
+
 @dataclass
 class Console:
     """Messages on standard error; standard output is for data.
@@ -56,20 +75,27 @@ class Console:
         stream: destination, standard error by default.
         interruption: takes a function that prints a line, and returns a context manager within which a first Ctrl-C
             makes the yielded function return True; only the command line sets one, as libraries install no handlers.
+        once: messages so far, where each is shown once, as those of a batch are; None to show all.
     """
 
     quiet: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stderr)
     interruption: Interruption = uninterrupted
+    once: Once | None = None
 
     def message(self, line: str) -> None:
+        """Print one line, unless it was said of another item of a batch."""
+        if self.once is None or self.once.first(line):
+            self._print(line)
+
+    def _print(self, line: str) -> None:
         """Print one line; line breaks within it, such as those of a file name, become blanks."""
         if not self.quiet:
             print(" ".join(line.splitlines()), file=self.stream, flush=True)
 
     def stage(self, name: str, seconds: float, detail: str = "") -> None:
         """Print the line of a stage: name, wall seconds and details."""
-        self.message(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
+        self._print(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
 
     def bar(self, label: str) -> ProgressCallback | None:
         """Return a callback ``(done, total)`` that draws a bar, or without a terminal prints a line at times."""
@@ -84,7 +110,7 @@ class Console:
             if not terminal:
                 if done < total and now - last >= _LINES:
                     last = now
-                    self.message(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
+                    self._print(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
                 return
             if done >= total:
                 self.stream.write("\r\x1b[K")  # the line of the stage follows

@@ -1,1 +1,1 @@
-"""Work of the smaller commands."""
+"""The command line: a module a command, with the function that the library shares; numpy is imported when it runs."""

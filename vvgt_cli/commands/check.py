@@ -1,125 +1,106 @@
-"""`check`: self-test of an installation, cases and stiffness of one scene, or cases of a file of Gaussians."""
+"""`vvgt check`: this installation, cases and stiffness of one scene, or a file of Gaussians."""
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import asdict, dataclass, field
-from itertools import groupby
-from typing import Any
+import os
+from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.checks import Case, Outcome, run_case
-from vvgt_cli.checks.self_test import scene_cases, self_test_cases
-from vvgt_cli.checks.stiffness import Stiffness, measure_stiffness
-from vvgt_cli.commands.check_splats import open_splats
-from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import document
+import click
+
+from vvgt_cli.commands import options as shared
+from vvgt_cli.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.checks.report import CheckReport
+    from vvgt_cli.library.inputs import LookLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
 
 TOLERANCE = 0.002  # RMS of RGBA
 
 
-@dataclass
-class CheckReport:
-    """Outcomes of a check; docs/report.md describes `to_json`.
-
-    Attributes:
-        outcomes: one for each case.
-        volume, transfer_function: records of the scene, if one was given.
-        stiffness: of the scene; None for a file of Gaussians.
-        splats: name, number, size and rule of the file of Gaussians, if one was given.
-    """
-
-    outcomes: list[Outcome] = field(default_factory=list)
-    volume: dict[str, Any] | None = None
-    transfer_function: dict[str, Any] | None = None
-    stiffness: Stiffness | None = None
-    splats: dict[str, Any] | None = None
-
-    @property
-    def failed(self) -> list[Outcome]:
-        """Return the outcomes that did not pass."""
-        return [outcome for outcome in self.outcomes if not outcome.passed]
-
-    def to_json(self) -> str:
-        """Return JSON with machine and versions."""
-        counts = {"cases": len(self.outcomes), "failed": len(self.failed)}
-        return document("vvgt-check", counts | asdict(self))
-
-    def table(self) -> str:
-        """Return a table: a row for each case and each stage, and the scene's stiffness."""
-        stage, name = (max(len(getattr(o, key)) for o in self.outcomes) for key in ("stage", "name"))
-        lines = [f"{'':<6}{'stage':<{stage}}  {'case':<{name}}  {'measured':>9} {'limit':>9}  of what"]
-        for o in self.outcomes:
-            numbers = f"{_number(o.value)} {_number(o.limit)}"
-            row = f"{'ok' if o.passed else 'FAIL':<6}{o.stage:<{stage}}  {o.name:<{name}}  {numbers}"
-            lines.append(f"{row}  {o.what if o.passed else o.problem}".rstrip())
-        cases, failed = (Counter(o.stage for o in some) for some in (self.outcomes, self.failed))
-        lines += ["", *(f"{key:<{stage}}  {cases[key]:>4} cases, {failed[key] or 'none'} failed" for key in cases)]
-        if self.stiffness:
-            lines += ["", *_stiffness_lines(self.stiffness)]
-        return "\n".join(lines) + "\n"
-
-
-def _number(value: float | None) -> str:
-    return f"{'-' if value is None else f'{value:.3g}':>9}"
-
-
-def _stiffness_lines(found: Stiffness) -> list[str]:
-    needed = found.needed_step
-    steps = f"{needed:g} voxels" if needed is not None else f"less than {min(map(float, found.errors)):g} voxels"
-    rows = {
-        "largest optical depth of a step of 0.5": f"{found.depth_per_step:.4g}",
-        "largest change of extinction per voxel": f"{found.change_per_voxel:.4g} of the largest extinction",
-        "neighbours that differ by more than half of it": f"{100 * found.abrupt:.3g} % of the visible pairs",
-        "explicit Euler overshoots with steps above": f"{found.explicit_step:.3g} voxels (this renderer never does)",
-        "error by step in voxels (RMS of RGBA)": ", ".join(f"{k}: {v:.2g}" for k, v in found.errors.items()),
-        f"largest step with an error of at most {found.tolerance:g}": steps,
-    }
-    width = max(map(len, rows))
-    return [f"{key:<{width}}  {value}" for key, value in rows.items()]
-
-
 def check(
-    source: SourceRequest | None, tolerance: float | None, console: Console | None = None, splats: str | None = None
-) -> CheckReport:
-    """Check the installation; with a source that scene, with a file of Gaussians that file.
+    file: VolumeLike | None = None, look: LookLike = None, *, volume: VolumeLike | None = None,
+    tolerance: float | None = None, progress: bool | Console = False, **reading: Unpack[Reading],
+) -> CheckReport:  # fmt: skip
+    """Check this installation, the scene of a volume and its look, or a file of Gaussians: ``vvgt check``.
 
     Args:
-        source: volume and transfer function, None for the self-test or a file of Gaussians alone.
-        tolerance: RMS error in [0, 1] that a scene's views or the pictures of Gaussians may have; None: `TOLERANCE`, or
-            that of `check_splats`.
-        console: for messages.
-        splats: file of Gaussians, compared with the source if there is one.
+        file: a volume as in `convert`, or a file of Gaussians; None: the installation.
+        look: of the volume, as in `convert`.
+        volume: that the Gaussians were made from; None checks the file alone.
+        tolerance: RMS error in [0, 1] that a scene's views or pictures of Gaussians may have; None: 0.002, or 0.056.
+        progress: print messages and bars on standard error.
+        **reading: of the volume, as in `convert`.
 
     Raises:
-        UsageError, DataError: a source that cannot be read.
+        UsageError, DataError: a volume or Gaussians that cannot be read.
     """
-    console = console or Console()
-    if splats is not None:
-        with open_splats(splats, source, tolerance, console) as opened:
-            outcomes = _run_cases(opened.cases, console)
-        return CheckReport(outcomes, opened.volume, opened.function, splats=opened.about)
-    if source is None:
-        return CheckReport(_run_cases(list(self_test_cases()), console))
+    from vvgt_cli.checks.report import CheckReport, run_cases
+    from vvgt_cli.checks.self_test import scene_cases, self_test_cases
+    from vvgt_cli.checks.stiffness import measure_stiffness
+    from vvgt_cli.commands.check_splats import check_splats
+    from vvgt_cli.field.source import describe_source, load, tf_record, volume_record
+    from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import console_of, source_of
+
+    console = console_of(progress)
+    if isinstance(file, str | os.PathLike) and is_splats(os.fspath(file)):
+        compared = None if volume is None else source_of(volume, look, reading)
+        return check_splats(os.fspath(file), compared, tolerance, console)
+    if volume is not None:
+        raise UsageError(f"--volume {volume}: expected a file of Gaussians to compare it with, not {file or 'nothing'}")
+    if file is None:
+        return CheckReport(run_cases(list(self_test_cases()), console))
+    source = source_of(file, look, reading)
     loaded = load(source)
     console.message(describe_source(loaded))
     scene = loaded.scene()
     found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
-    outcomes = _run_cases(list(scene_cases(scene)), console)
+    outcomes = run_cases(list(scene_cases(scene)), console)
     return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 
 
-def _run_cases(cases: list[Case], console: Console) -> list[Outcome]:
-    """Run cases, with a line on the console for each stage."""
-    outcomes: list[Outcome] = []
-    bar = console.bar("check")
-    for stage, group in groupby(cases, lambda case: case.stage):
-        begin = len(outcomes)
-        for case in group:
-            outcomes.append(run_case(case))
-            if bar:
-                bar(len(outcomes), len(cases))
-        found = outcomes[begin:]
-        failed = sum(not o.passed for o in found)
-        console.stage(stage, sum(o.seconds for o in found), f"{len(found)} cases, {failed or 'none'} failed")
-    return outcomes
+@shared.command("check", short_help="Test this installation, how stiff a scene is, or a file of Gaussians.")
+@click.argument("file", metavar="VOLUME|GAUSSIANS", required=False)
+@click.option("--volume", metavar="VOLUME", help="Volume that GAUSSIANS were made from.")
+@click.option(
+    "--tolerance", type=click.FloatRange(0, 1, min_open=True), metavar="RMS",
+    help="RMS error of VOLUME's views (RGBA) that the sampling step is chosen for, default 0.002; or that the pictures "
+    "of GAUSSIANS may have, default 0.056 (25 dB).",
+)  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@shared.tf_options
+@shared.light_options
+@shared.read_options
+@shared.common_options
+def command(file: str | None, volume: str | None, as_json: bool, **options: Any) -> None:
+    """Test this installation and print a table; exit status 1 if a case fails.
+
+    Compiles missing kernels, compares renderer, splatter and gradients with float64 twins, converts three tiny volumes,
+    and writes and reads every format. Takes some seconds, a minute or two the first time.
+
+    With VOLUME, examines that scene: four cases, its stiffness, and the sampling step that its views need.
+
+    With GAUSSIANS (.ply, .spz, .sog, .glb, ... by any program), examines that file: its values; with --volume and
+    its look also position, orientation, errors of pictures, differences between viewers, and texture.
+
+    Examples:
+      vvgt check
+      vvgt check head.nrrd --tf bone.json --tolerance 0.001
+      vvgt check trained.ply --volume head.nrrd --tf bone.json
+      vvgt check trained.ply --json | jq '.outcomes[] | select(.passed | not)'
+    """
+    from vvgt_cli.gaussians.formats import is_splats
+
+    flags = {"lights": "light", "occlusion": "ambient-occlusion"}
+    asked = options["optics"] | options["read"] | options["light"]
+    given = [key for key, value in asked.items() if value and (key, value) != ("tf_range", "data")]
+    if given and volume is None and (file is None or is_splats(file)):
+        names = ", ".join(f"--{flags.get(key, key).replace('_', '-')}" for key in given)
+        raise UsageError(f"{names}: only with a volume; expected {'--volume' if file else 'VOLUME'} too")
+    report = check(file, volume=volume, **shared.arguments(**options))
+    click.echo(report.to_json() if as_json else report.table(), nl=False)
+    if report.failed:
+        names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])
+        more = f" and {len(report.failed) - 3} more" if len(report.failed) > 3 else ""
+        raise DataError(f"{len(report.failed)} of {len(report.outcomes)} cases failed ({names}{more})")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure
+from vvgt_cli.checks.report import CheckReport, run_cases
 from vvgt_cli.checks.splats import (
     ORIENTATION_SIZE,
     finite_rows,
@@ -21,7 +21,7 @@ from vvgt_cli.checks.splats import (
     row_cases,
     value_cases,
 )
-from vvgt_cli.commands.evaluate import EvaluateRequest, opened, shown
+from vvgt_cli.commands.evaluation import opened, shown
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.errors import DataError
@@ -51,36 +51,11 @@ TOLERANCE = 0.056  # RMS of pictures in [0, 1]: 25 dB
 VISIBLE = 0.5  # levels of 255 of texture above which a lattice becomes visible
 
 
-@dataclass(frozen=True)
-class OpenedSplats:
-    """A file of Gaussians to check.
+def check_splats(file: str, source: SourceRequest | None, tolerance: float | None, console: Console) -> CheckReport:
+    """Check a file of Gaussians, alone or against the volume and look of ``source``.
 
-    Attributes:
-        about: name, number, size and rule, for the report.
-        volume, function: their records; None without a volume.
-        cases: to run while the volume is open.
-    """
-
-    about: dict[str, Any]
-    volume: dict[str, Any] | None
-    function: dict[str, Any] | None
-    cases: list[Case]
-
-
-@contextmanager
-def open_splats(
-    file: str, source: SourceRequest | None, tolerance: float | None, console: Console
-) -> Iterator[OpenedSplats]:
-    """Open a file of Gaussians, and the volume to compare it with while the context lasts.
-
-    Args:
-        file: Gaussians in any format that can be read.
-        source: volume and look; None to check the file alone.
-        tolerance: RMS of pictures in [0, 1] that passes; None: `TOLERANCE`.
-        console: for messages.
-
-    Raises:
-        UsageError, DataError: not a file of Gaussians, or a volume that cannot be read.
+    Pictures pass with an RMS error in [0, 1] of at most ``tolerance``, None: `TOLERANCE`. Raise UsageError or DataError
+    for a file that does not hold Gaussians, or a volume that cannot be read.
     """
     columns = read_columns(file)
     good = finite_rows(columns)
@@ -96,13 +71,14 @@ def open_splats(
     about = {"file": file.rpartition("/")[2], "gaussians": len(columns), "size": size, "rule": file_rule(header).name}
     cases = list(row_cases(columns, good))
     if source is None:
-        yield OpenedSplats(about, None, None, [*cases, *value_cases(gaussians, None, size), *_order(gaussians, size)])
-        return
+        cases += [*value_cases(gaussians, None, size), *_order(gaussians, size)]
+        return CheckReport(run_cases(cases, console), splats=about)
     run = Run(console, ConversionReport("evaluate"))
-    with opened(run, EvaluateRequest(file, source, size), gaussians, header) as field:
+    with opened(run, source, gaussians, header, size) as field:
         current = shown(gaussians, header, field.source, source)
         cases += [*value_cases(gaussians, 2.0, size), *_against(field, current, header, size, tolerance or TOLERANCE)]
-        yield OpenedSplats(about, volume_record(field.source), tf_record(field.source, source), cases)
+        function = tf_record(field.source, source)
+        return CheckReport(run_cases(cases, console), volume_record(field.source), function, splats=about)
 
 
 def _rms(psnr: float, tolerance: float, more: str = "") -> Figure:

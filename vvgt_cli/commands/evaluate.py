@@ -1,316 +1,100 @@
-"""`evaluate`: scores of a `.ply` against its volume, on test views and under all viewing conditions."""
+"""`vvgt evaluate`: scores of Gaussians against their volume."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, Unpack
 
-import numpy as np
+import click
 
-from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.certify import verify
-from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import headset_axes, preview, to_box_frame, upright_axes
-from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
-from vvgt_cli.errors import UsageError
-from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
-from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
-from vvgt_cli.gaussians import Gaussians, PlyHeader
-from vvgt_cli.gaussians.outputs import Output, check_outputs
-from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.gaussians.targets import target_of
-from vvgt_cli.images.metrics import Texture
-from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
-from vvgt_cli.score.viewing import (
-    CLOSE,
-    ConditionPicture,
-    ViewingCondition,
-    condition_pictures,
-    condition_views,
-    eye_pictures,
-    near_cameras,
-    score_conditions,
-    score_texture,
-    texture_note,
-    viewing_conditions,
-    zoomed,
-)
-from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
+from vvgt_cli.commands import options as shared
 
-PICTURED = 4  # test view of the preview: from the side
-MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
+if TYPE_CHECKING:
+    from vvgt_cli.commands.evaluation import Evaluation
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
 
 
-@dataclass(frozen=True)
-class EvaluateRequest:
-    """File of Gaussians to score, and how.
+def evaluate(
+    ply: PathLike | Result, volume: VolumeLike, look: LookLike = None, *, size: int | None = None,
+    rule: str | None = None, target: str | None = None, conditions: bool = True, step: float = 0.125,
+    preview: PathLike | None = None, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
+    progress: bool | Console = False, **reading: Unpack[Reading],
+) -> Evaluation:  # fmt: skip
+    """Score Gaussians against their volume: ``vvgt evaluate``.
 
-    Attributes:
-        ply: Gaussians, "-" for standard input, or a stream of them.
-        source: volume and function that they were made from.
-        size: pixels along an image's edge; None: the size recorded in the file.
-        rule: one of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
-        step: sampling distance of the reference, in voxels.
+    Args:
+        ply: path, "-" for standard input, or result of `convert` or `optimize`.
+        volume: as in `convert`.
+        look: as in `convert`.
+        size: pixels along the edge of pictures; None: the file's.
+        rule: drawing rule; None: the file's.
+        target: device to score it on, as ``--for``.
         conditions: also score every rule at several sizes and close up, and texture on smooth areas.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
-        preview: PNG to write (reference, splats, difference of a test view and of a close-up), None for none.
-        overwrite: replace it if it exists.
-        target: name of the device to score it on, by its size and rule where none is given; None: as the file records.
-    """
-
-    ply: str | BinaryIO
-    source: SourceRequest
-    size: int | None = None
-    rule: str | None = None
-    step: float = 0.125
-    conditions: bool = True
-    blocks: BlockOptions | None = None
-    preview: str | None = None
-    overwrite: bool = False
-    target: str | None = None
-
-    def inputs(self) -> list[str]:
-        """Return the files that are read."""
-        return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
-
-
-@dataclass
-class Evaluation:
-    """Scores, what they were measured on, and whether the file's certificate holds (docs/report.md)."""
-
-    gaussians: int
-    size: int
-    rule: str
-    step: float
-    views: int
-    volume: dict[str, Any]
-    transfer_function: dict[str, Any]
-    reference_psnr: float
-    scores: dict[str, Any] = field(default_factory=dict)
-    conditions: list[dict[str, Any]] = field(default_factory=list)
-    texture: dict[str, Any] | None = None
-    certificate: dict[str, Any] | None = None
-    stages: list[StageRecord] = field(default_factory=list)
-    seconds: float = 0.0
-
-    def to_json(self) -> str:
-        """Return JSON with machine and versions."""
-        return document("vvgt-evaluation", asdict(self))
-
-    def table(self) -> str:
-        """Return a table: one score per row, then the viewing conditions by PSNR, worst first."""
-        lines = [f"made for {self.size} px, drawn as {self.rule}"]
-        for key, value in self.scores.items():
-            if key != "per_view":
-                lines.append(f"{key.replace('_', ' '):<24}{_cell(value):>12}")
-        lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view)")
-        if self.texture is not None:
-            lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
-        if self.certificate is not None:
-            lines.append(f"certificate {self.certificate['text']}")
-        if self.conditions:
-            lines.append(f"\n{'viewing condition':<32}{'psnr':>10}")
-        lines += [f"{ViewingCondition(**one).name():<32}{one['psnr']:>10.2f}" for one in self.conditions]
-        return "\n".join(lines) + "\n"
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4f}" if isinstance(value, float) else str(value)
-
-
-@contextmanager
-def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
-    """Open the volume, by default in the file's own anatomical space, light and unit distance."""
-    size, asked = request.size or header.screen_size or SIZE, request.source.light
-    dark = replace(request.source, light=LightOptions())
-    if dark.read.space is None and header.space == "LPS":
-        dark = replace(dark, read=replace(dark.read, space="LPS"))
-    other = header.live is not None and (
-        dark.tf is not None or dark.labels is not None
-    )  # not the function whose distance the header has
-    recorded = dark.unit_distance is None and header.unit_distance is not None and not other
-    if recorded:
-        dark = replace(dark, unit_distance=repr(header.unit_distance))
-
-    def lit(source: Source) -> Source:
-        preset = source.lighting if header.version is None else header.light
-        if other:
-            preset = source.lighting or header.light
-        first, *others = source.layers
-        if recorded:
-            first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
-        return replace(source, layers=(first, *others), lighting=asked.lighting(preset, source.volume.space))
-
-    kernels, options = for_degree(EVALUATE, gaussians.degree), request.blocks or automatic(dark, run.console)
-    if options is None:
-        with run.stage("read") as stage:
-            source = lit(load(dark))
-            stage.note = describe_source(source)
-        run.compile(source.kernels(kernels), source.kernel_type())
-        with run.stage("scene"):
-            resident = Resident.of(source)
-        yield resident
-        return
-    with store_beside(None) as store, blocked(run, dark, options, store, FieldNeeds(len(gaussians), size)) as found:
-        found.source = lit(found.source)
-        run.compile(for_blocks(found.source.kernels(kernels)), found.source.kernel_type())
-        yield found
-
-
-@contextmanager
-def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
-    """Draw the pictures requested within the block together if the volume is in blocks; forget them afterwards."""
-    field.views.expect(pictures)
-    yield
-    for picture in pictures:
-        field.views.forget(picture)
-
-
-def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
-    """Return live Gaussians under the requested function; without one, and for other files, the file's own look.
+        step: step of the reference, in voxels.
+        preview: PNG to write: volume, splats and difference.
+        blocks: as in `convert`.
+        overwrite: replace the preview if it exists.
+        progress: print messages and bars on standard error.
+        **reading: as in `convert`.
 
     Raises:
-        UsageError: labels are requested for values, or the reverse.
+        DataError, UsageError: see `convert`.
     """
-    if header.live is None or (request.labels is None and request.tf is None and not request.layers):
-        return gaussians
-    carried = ["labels" if one.labels else "values" for one in header.live.layers]
-    shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]
-    if carried != shown:
-        raise UsageError(
-            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
-            "the --tf, --labels or --layer of the conversion, or none of these options to score the file's own look"
-        )
-    looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
-    light = light_of(request.light, source.lighting, source.volume.space)
-    options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
+    from vvgt_cli.commands.evaluation import score
+    from vvgt_cli.library.inputs import blocks_of, console_of, ply_of, source_of
 
-
-def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
-    """Score a `.ply` against its volume.
-
-    Raises:
-        UsageError: both inputs are standard input, or the preview may not be written.
-        DataError: a file that is not valid.
-    """
-    if request.ply == STDIN == request.source.volume:
-        raise UsageError("both OUT.ply and --volume are '-'; standard input can only be one of them")
-    run = Run(console or Console(), ConversionReport("evaluate"))
-    if (target := target_of(request.target)) is not None:
-        if target.eye is not None and not request.conditions:
-            raise UsageError(
-                f"--no-conditions with --for {target.name}: its eyes are conditions; give one or the other"
-            )
-        request = replace(request, size=request.size or target.size, rule=request.rule or target.rule)
-    if request.preview:
-        check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
-    gaussians, header = open_gaussians(request.ply)
-    with opened(run, request, gaussians, header) as volume:
-        source = volume.source
-        gaussians = shown(gaussians, header, source, request.source)
-        gaussians = to_box_frame(gaussians, source.volume)
-        for remark in _doubts(request, header, source):
-            run.console.message(f"{request.ply}: {remark}")
-        return _scored(run, request, volume, gaussians, header)
-
-
-def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iterator[str]:
-    """Yield reasons to doubt that the file was made from this volume and look."""
-    if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
-        yield f"its header's affine differs from that of {source.volume.name}; was it made from another volume?"
-    if header.live is None and header.optics is not None and header.optics != source.optics():
-        yield (
-            f"made with other labels, functions or layers than {source.name}, according to its header "
-            f"({header.optics}, not {source.optics() or 'scalars'})"
-        )
-
-
-def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussians, header: PlyHeader) -> Evaluation:
-    """Measure the scores, and write a preview if requested."""
-    from vvgt_cli.dvr import REFERENCE
-    from vvgt_cli.images import write_png
-
-    source = volume.source
-    size, rule = request.size or header.screen_size or SIZE, file_rule(header, request.rule)
-    with run.stage("reference") as stage:
-        own = _reference_psnr(volume, size, request.step)
-        stage.note = f"its own error {own:.1f} dB"
-    evaluation = Evaluation(
-        len(gaussians), size, rule.name, request.step, len(default_views("test")), volume_record(source),
-        tf_record(source, request.source), own,
+    return score(
+        console_of(progress), ply_of(ply), source_of(volume, look, reading), blocks_of(blocks), size=size, rule=rule,
+        target=target, conditions=conditions, step=step, preview=preview, overwrite=overwrite,
     )  # fmt: skip
-    settings = replace(REFERENCE, step=request.step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
-    with run.stage("test views") as stage, _together(volume, wanted):
-        bar = run.console.bar("test views")
-        scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
-        evaluation.scores = asdict(scores)
-        stage.note = f"{psnr_note(scores)}, {size} px"
-    if header.certificate is not None:
-        with run.stage("certificate") as stage:
-            verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
-            evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
-            stage.note = verdict.text()
-    if request.preview:
-        camera, axes = default_views("test", size=size)[PICTURED], upright_axes(source.volume, header.up)
-        with run.stage("preview"):
-            sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
-            write_png(request.preview, sheet, request.overwrite)
-    if request.conditions:
-        eyes = eye_pictures(request.target, headset_axes(source.volume, header.up))
-        _look_around(run, evaluation, volume, gaussians, rule, eyes)
-    evaluation.stages = run.report.stages
-    evaluation.seconds = run.finish().seconds
-    return evaluation
 
 
-def _look_around(
-    run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule, eyes: list[ConditionPicture]
-) -> None:
-    """Score the viewing conditions, those of a headset, too, and texture seen from near."""
-    from vvgt_cli.dvr import RenderSettings
+@shared.command("evaluate", short_help="Measure the error of a .ply against its volume.")
+@click.argument("ply", metavar="OUT.ply")
+@click.option("--volume", required=True, metavar="VOLUME", help="Volume that OUT.ply was made from.")
+@click.option(
+    "--size", type=click.IntRange(16, 8192), metavar="PX",
+    help="Image size to score at. Default: the size recorded in the file, or 400.",
+)  # fmt: skip
+@shared.rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
+@shared.target_option(
+    "Device to score it on: by its size and rule unless given, on a headset also as both eyes see it."
+)
+@click.option(
+    "--no-conditions", "conditions", is_flag=True, default=True, flag_value=False,
+    help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
+)  # fmt: skip
+@click.option(
+    "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",
+    help="Sampling distance of the reference, in voxels; 'vvgt convert' uses 0.5.",
+)  # fmt: skip
+@click.option(
+    "--preview", metavar="FILE.png",
+    help="Save volume, splats and difference side by side, from the side and close up.",
+)  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@shared.tf_options
+@shared.light_options
+@shared.placed_read_options
+@shared.block_options
+@shared.overwrite_option
+@shared.common_options
+def command(as_json: bool, **options: Any) -> None:
+    """Score OUT.ply against the volume it was made from.
 
-    size, settings = evaluation.size, RenderSettings()
-    places = condition_pictures(viewing_conditions(size)) + eyes
-    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
-    with run.stage("conditions") as stage, _together(volume, wanted):
-        seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))
-        conditions = score_conditions(gaussians, seen, headset=rule.name)
-        evaluation.conditions = [asdict(condition) for condition in conditions]
-        stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
-    near = [Picture(camera, settings) for camera in near_cameras(size)]
-    with run.stage("texture") as stage, _together(volume, near):
-        found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
-        evaluation.texture = asdict(found)
-        stage.note = texture_note(found)
+    OUT.ply may be a FOLDER of streamed levels, scored at the finest level; FOLDER#1 is level 1.
 
+    Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
+    (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures
+    above 565 px are scored on a sample of blocks. A .ply of 'vvgt convert --live' is scored under --tf.
 
-def _reference_psnr(volume: Field, size: int, step: float) -> float:
-    """Return the PSNR of the reference against half its step and twice its rays along a pixel's edge.
+    The reference is ray-cast with steps of 1/8 voxel and up to 9 rays per pixel; its own error is printed too. Size,
+    viewer, light and opacity unit distance are those recorded in the file unless given.
 
-    Measured on the middle of the first test view: the whole of it would cost as much as eight views.
+    Example:
+      vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    from vvgt_cli.dvr import REFERENCE, render_view
-    from vvgt_cli.images.metrics import score_view
-
-    whole = default_views("test", size=size)[0]
-    edge = min(size // 2, MIDDLE)
-    offset = (size - edge) // 2
-    middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
-    settings = replace(REFERENCE, step=step)
-    finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
-    with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):
-        images = [render_view(volume.views, middle, s) for s in (finer, settings)]
-    return score_view(images[0], images[1], perceptual=False).psnr
+    scores = evaluate(**shared.arguments(**options))
+    click.echo(scores.to_json() if as_json else scores.table(), nl=False)

@@ -1,43 +1,80 @@
-"""`infer`: Gaussians improved by an exported network, kept if the views agree."""
+"""`vvgt infer`: Gaussians improved by an exported network, kept if the views agree."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians, write_gaussians
-from vvgt_cli.gaussians.outputs import Output, claimed, write_text
-from vvgt_cli.jit.ahead import INFER
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.views import Views
+import click
 
-SHIPPED = "vvgt-small"  # the model that comes with the program
+from vvgt_cli.commands import options as shared
+
+if TYPE_CHECKING:
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.library.inputs import PathLike
+    from vvgt_cli.progress import Console
+    from vvgt_cli.score.record import Run
+
 JUDGES = 4  # views that the network is not shown, as many as the default check set
 
 
-@dataclass(frozen=True)
-class InferRequest:
-    """A run of a network.
+def infer(
+    ply: PathLike, output: PathLike | None = None, *, views: PathLike, model: str, provider: str = "cpu",
+    report: PathLike | None = None, overwrite: bool = False, progress: bool | Console = False,
+) -> Result:  # fmt: skip
+    """Improve Gaussians with a network that looks at views of their volume: ``vvgt infer``.
 
-    Attributes:
-        ply: Gaussians, "-" for standard input.
-        views: folder that `vvgt render-views` wrote.
+    Args:
+        ply: a file, "-" is standard input.
+        output: ``.ply`` to write; "-" is standard output, None writes nothing.
+        views: folder of ``vvgt render-views``.
         model: folder of a model, or the name of one that is shipped.
-        output: the .ply to write, "-" for standard output.
         provider: "cpu" or "cuda".
-        report: JSON to write, or None.
+        report: JSON to write.
         overwrite: replace files that exist.
-    """
+        progress: print messages and bars on standard error.
 
-    ply: str
-    views: str
-    model: str
-    output: str
-    provider: str = "cpu"
-    report: str | None = None
-    overwrite: bool = False
+    Returns:
+        The better Gaussians, or those of the file if the views that judge them show no gain.
+
+    Raises:
+        UsageError: an output that may not be written, or an unknown model or provider.
+        DataError: Gaussians, views or a model that are not valid.
+    """
+    from vvgt_cli.library.outputs import written
+
+    name = os.fspath(ply)
+    make = partial(_improved, name, os.fspath(views), model, provider)
+    return written(make, "infer", [name], output, report, overwrite=overwrite, progress=progress)
+
+
+@shared.command("infer", short_help="Improve a .ply with an exported network.")
+@click.argument("ply", metavar="IN.ply")
+@click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
+@click.option(
+    "--model", required=True, metavar="NAME", help="Folder written by 'vvgt export', or the name of a shipped model."
+)
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
+@click.option(
+    "--provider", type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Device for onnxruntime."
+)
+@click.option("--report", metavar="FILE.json", help="Save stages, times and scores as JSON.")
+@shared.overwrite_option
+@shared.common_options
+def command(console: Console, **options: Any) -> None:
+    """Improve the Gaussians of IN.ply with a network that looks at views of their volume.
+
+    The network reads a fixed number of training views, chosen far apart. Up to four other views judge the result: if
+    their PSNR does not rise, the Gaussians of IN.ply are written unchanged and a message says so. IN.ply may be "-".
+
+    Example:
+      vvgt render-views head.nrrd --tf bone.json -o views
+      vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model small -o head.ply
+    """
+    infer(**options, progress=console)
 
 
 def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]]:
@@ -53,38 +90,29 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
     return read, judges
 
 
-def infer_file(request: InferRequest, console: Console | None = None) -> ConversionReport:
-    """Improve a `.ply` with a network and write it; if the judging views show no gain, write the input's Gaussians.
+def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Result:
+    from dataclasses import replace
 
-    Raises:
-        UsageError: an output that may not be written, or an unknown model or provider.
-        DataError: Gaussians, views or a model that are not valid.
-    """
-    outputs = [Output("-o", request.output, (".ply",))]
-    if request.report:
-        outputs.append(Output("--report", request.report, (".json",), binary=False))
-    with claimed(outputs, [request.ply], request.overwrite):
-        return _infer_file(request, Run(console or Console(), ConversionReport("infer")))
-
-
-def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
     import numba
 
+    from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
+    from vvgt_cli.conversion.result import Result
     from vvgt_cli.images.files import load_views
+    from vvgt_cli.jit.ahead import INFER
     from vvgt_cli.network.card import find_model
     from vvgt_cli.network.runtime import Model
+    from vvgt_cli.score.views import Views
 
     with run.stage("read") as stage:
-        model = Model.open(find_model(request.model), numba.get_num_threads(), request.provider)
-        gaussians, header = open_gaussians(request.ply)
-        cameras, images = load_views(request.views, "train")
-        wanted = model.card.network.total_views
-        read, judges = divide(cameras, wanted)
-        stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {model.card.name}"
+        network = Model.open(find_model(model), numba.get_num_threads(), provider)
+        gaussians, header = open_gaussians(name)
+        cameras, images = load_views(folder, "train")
+        read, judges = divide(cameras, network.card.network.total_views)
+        stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {network.card.name}"
     run.compile(INFER)
     with run.stage("network") as stage:
         shown = [cameras[i] for i in read]
-        better = model.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
+        better = network.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
         stage.note = f"reads {len(read)} views"
     with run.stage("judge") as stage:
         before, after = map(Views(cameras, images).take(judges).psnr, (gaussians, better))
@@ -92,16 +120,11 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
         own = "" if set(judges) - set(read) else ", all read by the network"
         stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
     run.report.options = {
-        "model": model.card.name,
-        "provider": request.provider,
+        "model": network.card.name,
+        "provider": provider,
         "read": [cameras[i].name for i in read],
         "judges": [cameras[i].name for i in judges],
         "psnr_before": before,
         "psnr_after": after,
     }
-    kept = better if stage.kept else gaussians
-    write_gaussians(run, request.output, kept, replace(layout_of(header), certificate=None), request.overwrite)
-    report = run.finish()
-    if request.report:
-        write_text(request.report, report.to_json(), request.overwrite)
-    return report
+    return Result(better if stage.kept else gaussians, run.report, replace(layout_of(header), certificate=None))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import sys
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,16 +26,15 @@ from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_live import VALUES_ID
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
-from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.readers import SUFFIXES
+from vvgt_cli.look.label_files import is_table, labels_of, read_labels
+from vvgt_cli.look.labels import Label
+from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.blocks import Packed
-from vvgt_cli.volume.registry import contents
+from vvgt_cli.volume.registry import contents, is_recognised
 from vvgt_cli.volume.space import axis_facts
-from vvgt_cli.volume.vtk import is_index as is_vtk_index
 
 if TYPE_CHECKING:
     from vvgt_cli.field.layered import Content
@@ -44,6 +44,9 @@ _PLY = (b"ply\n", b"ply\r")
 LISTED = 50  # of several volumes in a file
 CHEAP = 64 << 20  # bytes of a volume whose range is looked for
 _HEAD = 65536  # bytes that tell a view set from a transfer function
+_FUNCTION = re.compile(
+    rb'RGBPoints|"(points|R|colorTransfer|volumeProperties)"|<(ColorMap|VolumeProperty|inviwo)', re.I
+)
 
 
 def machine_facts() -> dict[str, Any]:
@@ -96,12 +99,16 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         return {"kind": f"index of {index['kind']}", "name": name.name, **about, "clouds": index["files"]}
     if is_table(name):
         return _table(file)
-    if is_vtk_index(head) or name.suffix.lower() == ".p3d":  # JSON of ParaView's
+    if is_recognised(head) or name.suffix.lower() == ".p3d":  # JSON and XML that are no transfer functions
         return _volume(file, read)
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(name)
-        return _transfer_function(file)
+        try:
+            return _transfer_function(file)
+        except DataError:
+            if name.suffix.lower() in OWN or _FUNCTION.search(head):
+                raise
     return _volume(file, read)
 
 
@@ -156,11 +163,12 @@ def _transfer_function(file: str) -> dict[str, Any]:
 
 def _table(file: str) -> dict[str, Any]:
     table = read_labels(file)
-    return {"kind": "table of labels", "name": table.name, "labels": len(table.labels), "entries": _entries(table)}
+    entries = _entries(table.labels)
+    return {"kind": "table of labels", "name": table.name, "labels": len(entries), "entries": entries}
 
 
-def _entries(table: LabelTable) -> list[dict[str, Any]]:
-    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in table.labels]
+def _entries(labels: Sequence[Label]) -> list[dict[str, Any]]:
+    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in labels]
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
@@ -219,13 +227,13 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
 
 def _channels(content: Content) -> list[dict[str, Any]]:
     """Describe each channel of a volume: the option that selects it, its name, colour and range."""
-    from vvgt_cli.field.layered import channel_color
     from vvgt_cli.volume import statistics
 
     rows = []
-    for k, volume in enumerate(content.volumes):
-        row: dict[str, Any] = {"choice": f"--channel {k}", "name": content.names[k] if content.names else ""}
-        row |= {"color": [round(v, 4) for v in channel_color(k, content.colors[k])]}
+    names = content.names or [""] * len(content.volumes)
+    for k, name, color, volume in zip(content.numbers, names, content.colors, content.volumes, strict=True):
+        shown = [round(v, 4) for v in color]
+        row: dict[str, Any] = {"choice": f"--channel {k}", "name": name, "color": shown}
         if volume.data.nbytes <= CHEAP:
             stats = statistics(volume)
             row["range"] = [stats.lo, stats.hi]
@@ -257,11 +265,8 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         kinds |= {"channels": len(content.volumes), "choices": _channels(content)}
     elif not isinstance(volume.data, Packed) and recognised(volume):
         kinds["label_map"] = True
-    if holds_table(content.path) and not content.overlapping:
-        kinds["label_map"] = True
-        with suppress(DataError):  # a header that says less of its segments than colours need
-            one = content.layer
-            kinds["segments"] = _entries(read_labels(file) if one is None else segments_of(file, one))
+    if named := [label for one in content.volumes for label in labels_of(one.segments or (), one.name)]:
+        kinds["segments"] = _entries(named)
     stats = statistics(volume)
     return {
         "kind": "volume",
@@ -283,6 +288,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "scaling": [volume.slope, volume.intercept],
         **({"modality": volume.modality} if volume.modality else {}),
         "range": [stats.lo, stats.hi],
+        **({"value_unit": volume.values_in} if volume.values_in else {}),
         "nan": stats.nan_count,
         "inf": stats.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},

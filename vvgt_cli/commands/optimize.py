@@ -1,124 +1,185 @@
-"""`optimize`: refinement of Gaussians by gradient descent on views."""
+"""`vvgt optimize`: Gaussians refined by gradient descent on views."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import os
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-import numpy as np
+import click
 
-from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians, write_gaussians
-from vvgt_cli.conversion.result import Result
-from vvgt_cli.conversion.stages.refinement import refine
+from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed, write_text
-from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.images.files import load_views
-from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
-from vvgt_cli.progress import Console
-from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.views import Views, psnr_note
 
 if TYPE_CHECKING:
-    from vvgt_cli.images.metrics import Scores
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.gaussians import Gaussians
+    from vvgt_cli.gaussians.rules import Rule
+    from vvgt_cli.library.inputs import PathLike
+    from vvgt_cli.progress import Console
+    from vvgt_cli.refine import OptimizeOptions
+    from vvgt_cli.score.record import Run
+    from vvgt_cli.score.views import Views
 
 HOLD_OUT = 8  # of so many training views one decides, where the folder has no check views
 
 
-@dataclass(frozen=True)
-class OptimizeRequest:
-    """A refinement.
+def optimize(
+    ply: PathLike | Result, views: PathLike, output: PathLike | None = None, *, steps: int | None = None,
+    time_budget: float | None = None, target_psnr: float | None = None, method: str = "frame",
+    max_gaussians: int | None = None, checkpoint: PathLike | None = None, size: int | None = None,
+    rule: str | None = None, sh_degree: int | None = None, seed: int = 0, report: PathLike | None = None,
+    device: str = "cpu", overwrite: bool = False, progress: bool | Console = False,
+) -> Result:  # fmt: skip
+    """Refine Gaussians by gradient descent on views: ``vvgt optimize``.
 
-    Attributes:
-        ply: Gaussians to start from, "-" for standard input, or a stream of them.
-        views: folder that `render-views` wrote.
-        output: `.ply` to write, "-" for standard output, None for none.
-        options: how to descend, and when to stop.
-        size: pixels along the edge of the screen that the file is made for; None: the file's, or the views'.
-        rule: one of `vvgt_cli.gaussians.rules` to fit to; None: the file's, or inria.
-        sh_degree: degree of the harmonics that are refined and written, 0 to 3; None: the file's.
-        report: JSON to write, "-" for standard output, None for none.
+    Args:
+        ply: path, "-" for standard input, or result of `convert`.
+        views: folder of ``vvgt render-views``.
+        output: ``.ply`` to write; "-" is standard output, None writes nothing.
+        steps: number of steps, of one view each; or give ``time_budget``.
+        time_budget: seconds; or give ``steps``.
+        target_psnr: dB on the check views at which to stop.
+        method: "frame", "adam" or "3dgs".
+        max_gaussians: maximal number of Gaussians, for "3dgs".
+        checkpoint: ``.npz`` to save progress in, from which the same call goes on.
+        size: pixels along the edge of the target screen; None: the file's.
+        rule: drawing rule; None: the file's.
+        sh_degree: degree of the spherical harmonics that are refined, 0 to 3; None: the file's.
+        seed: seed of the order of views.
+        report: JSON to write.
+        device: "cpu", or "cuda" for the steps of "frame".
         overwrite: replace files that exist.
-    """
+        progress: print messages and bars on standard error.
 
-    ply: str | BinaryIO
-    views: str
-    output: str | None
-    options: OptimizeOptions
-    size: int | None = None
-    rule: str | None = None
-    sh_degree: int | None = None
-    report: str | None = None
-    overwrite: bool = False
-
-    def outputs(self) -> list[Output]:
-        """Return all files that will be written."""
-        report = [Output("--report", self.report, (".json",), binary=False)] if self.report else []
-        return [*([Output("-o", self.output, (".ply",))] if self.output else []), *report]
-
-    def inputs(self) -> list[str]:
-        """Return the files that are read."""
-        return [self.ply] if isinstance(self.ply, str) else []
-
-
-def optimize_file(request: OptimizeRequest, console: Console | None = None) -> ConversionReport:
-    """Refine a `.ply` and write it: fitted to training views, selected by check views, scored on test views.
+    Returns:
+        The best Gaussians by the check views.
 
     Raises:
-        UsageError: an output that may not be written; raised before anything is read.
-        DataError: a `.ply` or a folder of views that is not valid.
+        DataError: an invalid ``.ply`` or folder of views.
+        UsageError: both of steps and time_budget, or neither; an output that may not be written.
     """
-    if request.options.checkpoint:
-        check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], request.inputs(), True)
-    with claimed(request.outputs(), request.inputs(), request.overwrite):
-        run = Run(console or Console(), ConversionReport("optimize"))
-        result = optimized(run, request)
-        assert request.output is not None
-        write_gaussians(run, request.output, result.gaussians, result.ply, request.overwrite)
-        run.finish()
-        if request.report:
-            write_text(request.report, run.report.to_json(), request.overwrite)
-        return run.report
+    from vvgt_cli.gaussians.outputs import Output, check_outputs
+    from vvgt_cli.library.inputs import ply_of
+    from vvgt_cli.library.outputs import written
+    from vvgt_cli.refine import OptimizeOptions
+
+    if max_gaussians is not None and method != "3dgs":
+        raise UsageError(f"--max-gaussians applies to --method 3dgs; --method {method} does not change the number")
+    if (steps is None) == (time_budget is None):
+        raise UsageError("give either --steps N or --time-budget shared.SECONDS")
+    kept = None if checkpoint is None else os.fspath(checkpoint)
+    how = OptimizeOptions.of(
+        method, steps=steps, time_budget=time_budget, target_psnr=target_psnr, max_gaussians=max_gaussians, seed=seed,
+        checkpoint=kept, device=device,
+    )  # fmt: skip
+    start = ply_of(ply)
+    inputs = [start] if isinstance(start, str) else []
+    check_outputs(Output.of("--checkpoint", kept, (".npz",)), inputs, True)
+    make = partial(_refined, start, os.fspath(views), how, size, rule, sh_degree)
+    return written(make, "optimize", inputs, output, report, overwrite=overwrite, progress=progress)
 
 
-def optimized(run: Run, request: OptimizeRequest) -> Result:
-    """Refine Gaussians without writing anything but the checkpoint.
+@shared.command("optimize", short_help="Refine a .ply by gradient descent on views.")
+@click.argument("ply", metavar="IN.ply")
+@click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
+@click.option(
+    "--steps", type=click.IntRange(0, 10_000_000), metavar="N", help="Maximum number of steps, one view each."
+)
+@click.option(
+    "--time-budget", type=shared.Measure("time", shared.SECONDS), metavar="TIME",
+    help="Time for the descent, such as 90 or 10m, instead of --steps.",
+)  # fmt: skip
+@click.option(
+    "--target-psnr", type=click.FloatRange(0, 150), metavar="DB", help="Stop when the check views reach this PSNR."
+)
+@click.option(
+    "--method", type=click.Choice(["frame", "adam", "3dgs"]), default="frame", show_default=True,
+    help="Steps in each Gaussian's own frame or, for comparison, plain Adam or Adam with 3DGS' density control.",
+)  # fmt: skip
+@click.option(
+    "--max-gaussians", type=click.IntRange(1, 100_000_000), metavar="K",
+    help="Maximum number of Gaussians with --method 3dgs. Default: as many as IN.ply has.",
+)  # fmt: skip
+@click.option(
+    "--checkpoint", metavar="FILE.npz",
+    help="Save progress here, so that the same command resumes after an interruption.",
+)  # fmt: skip
+@click.option(
+    "--size", type=click.IntRange(16, 8192), metavar="PX",
+    help="Screen size to optimise for, in pixels. Default: the size recorded in IN.ply, or that of the views.",
+)  # fmt: skip
+@shared.rule_option("Viewer to optimise for. Default: the one recorded in IN.ply, or inria.")
+@click.option(
+    "--sh-degree", type=click.IntRange(0, 3), metavar="N",
+    help="Degree of the spherical harmonics to refine; missing ones start at 0. Default: that of IN.ply.",
+)  # fmt: skip
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
+)
+@click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
+@shared.device_option("steps of --method frame are taken")
+@shared.overwrite_option
+@shared.common_options
+def command(console: Console, **options: Any) -> None:
+    """Refine IN.ply so that its pictures match the views in DIR.
 
-    Raises:
-        DataError: a `.ply` or a folder of views that is not valid.
+    Training views are fitted, check views decide what is kept, and test views only score the result. The best state
+    on the check views is written, never worse than IN.ply. If the folder has no check views, every 8th training view
+    is used instead. Ctrl-C ends the descent early and writes the result.
+
+    Examples:
+      vvgt render-views head.nrrd --tf bone.json -o views
+      vvgt optimize head.ply --views views --steps 200 -o better.ply
+      vvgt optimize head.ply --views views --time-budget 60 --target-psnr 40 -o better.ply
     """
+    optimize(**options, progress=console)
+
+
+def _refined(
+    ply: str | BinaryIO, folder: str, how: OptimizeOptions, size: int | None, rule: str | None, sh_degree: int | None,
+    run: Run,
+) -> Result:  # fmt: skip
+    """Refine Gaussians without writing anything but the checkpoint."""
+    from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
+    from vvgt_cli.conversion.result import Result
+    from vvgt_cli.conversion.stages.refinement import refine
+    from vvgt_cli.images.files import load_views
+    from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
+    from vvgt_cli.score.views import Views
+
     with run.stage("read") as stage:
-        start, header = open_gaussians(request.ply)
+        start, header = open_gaussians(ply)
         stage.note = f"{len(start)} Gaussians, {header.frame} frame"
-        start = start if request.sh_degree is None else start.of_degree(request.sh_degree)
+        start = start if sh_degree is None else start.of_degree(sh_degree)
     with run.stage("views") as stage:
-        train, check, held_out = load_sets(request.views)
-        test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
+        train, check, held_out = load_sets(folder)
+        test = Views(*load_views(folder, "test")) if _has(folder, "test") else None
         stage.note = f"{len(train)} training views, {len(check)} check views{held_out}"
     run.compile(for_degree(OPTIMIZE, start.degree))
     edge = train.cameras[0].width
-    size, asked = request.size or header.screen_size or edge, file_rule(header, request.rule)
-    rule = asked.at(edge / size)
-    options = replace(request.options, rule=rule, judge=rule)
-    run.report.options = asdict(request.options) | {
-        "rule": asked.name,
-        "judge": asked.name,
-        "size": size,
-        "sh_degree": start.degree,
-    }
-    gaussians = refine(run, start, train, check, options)
+    screen, asked = size or header.screen_size or edge, file_rule(header, rule)
+    fitted = asked.at(edge / screen)
+    named = {"rule": asked.name, "judge": asked.name, "size": screen, "sh_degree": start.degree}
+    run.report.options = asdict(how) | named
+    gaussians = refine(run, start, train, check, replace(how, rule=fitted, judge=fitted))
     if test is not None:
-        _score(run, test, start, gaussians, rule)
-    degree = header.sh_degree if request.sh_degree is None else request.sh_degree
-    layout = replace(layout_of(header), certificate=None, screen_size=size, rule=asked.name, sh_degree=degree)
+        _score(run, test, start, gaussians, fitted)
+    degree = header.sh_degree if sh_degree is None else sh_degree
+    layout = replace(layout_of(header), certificate=None, screen_size=screen, rule=asked.name, sh_degree=degree)
     return Result(gaussians, run.report, layout)
 
 
 def load_sets(folder: str) -> tuple[Views, Views, str]:
     """Return training views, check views, and a remark if they come from the training views, or raise DataError."""
+    import numpy as np
+
+    from vvgt_cli.images.files import load_views
+    from vvgt_cli.score.views import Views
+
     train = Views(*load_views(folder, "train"))
     if _has(folder, "check"):
         return train, Views(*load_views(folder, "check")), ""
@@ -135,20 +196,13 @@ def _has(folder: str, split: str) -> bool:
 
 
 def _score(run: Run, test: Views, start: Gaussians, gaussians: Gaussians, rule: Rule) -> None:
+    from vvgt_cli.images.metrics import score_views
+    from vvgt_cli.score.views import psnr_note
+
     with run.stage("test views") as stage:
-        before, after = (_mean(test, g, rule, perceptual=last) for g, last in ((start, False), (gaussians, True)))
+        before, after = (
+            score_views(test.images, test.pictures(g, rule), perceptual=last)
+            for g, last in ((start, False), (gaussians, True))
+        )
         run.report.scores = asdict(after)
         stage.note = f"{psnr_note(after)}, from {before.psnr:.2f} dB, {after.views} views"
-
-
-def _mean(test: Views, gaussians: Gaussians, rule: Rule, perceptual: bool) -> Scores:
-    from vvgt_cli.images.metrics import score_views
-
-    return score_views(test.images, test.pictures(gaussians, rule), perceptual=perceptual)
-
-
-def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:
-    """Return the options of the budget, either steps or seconds; raise UsageError for both or neither."""
-    if (steps is None) == (seconds is None):
-        raise UsageError("give either --steps N or --time-budget SECONDS")
-    return {"steps": steps, "time_budget": seconds}

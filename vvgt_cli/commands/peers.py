@@ -7,8 +7,8 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from vvgt_cli.commands.render_views import CameraRequest, ViewsRequest, render_view_sets
 from vvgt_cli.commands.view_files import Layout
+from vvgt_cli.commands.view_sets import CameraRequest, ViewsRequest, render_view_sets
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.settings import BlockOptions

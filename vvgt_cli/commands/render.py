@@ -1,502 +1,124 @@
-"""`render`: pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
+"""`vvgt render`: pictures or a movie of Gaussians as viewers draw them, or of a volume by the ray caster."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from itertools import chain, pairwise
-from pathlib import Path
-from typing import Any
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
-import numpy as np
+import click
 
-from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
-from vvgt_cli.cameras.files import read_cameras, transforms_json
-from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.commands.render_views import check_folder, draw_in_blocks
-from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
-from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
-from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
-from vvgt_cli.conversion.index import FRAMES, is_pattern, put_name
-from vvgt_cli.conversion.manifest import Shard
-from vvgt_cli.conversion.recolored import FunctionRequest, recolored
-from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.field.blocked import Blocked
-from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
-from vvgt_cli.field.rays import HALO
-from vvgt_cli.field.reader import Scalars, VoxelBox
-from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
-from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
-from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
-from vvgt_cli.gaussians.formats.page_live import shared_facts
-from vvgt_cli.gaussians.formats.splats import gaussians_of
-from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
-from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
-from vvgt_cli.images.compose import BLACK
-from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.tables import Optics, exposed_distance
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.volume import Statistics
-from vvgt_cli.volume.space import shear_text
+from vvgt_cli.commands import options as shared
+from vvgt_cli.errors import UsageError
 
-VIEWS_FILE, PICTURE = "transforms.json", ".png"
-Seen = Callable[[Camera], Gaussians]  # what a camera is shown
-Part = tuple[VoxelBox, np.ndarray, np.ndarray]  # voxels with a halo; the first (3,) without it, and the end, (x, y, z)
-MIP_RAYS, MIP_STEP = 2, 0.25  # rays along a pixel's edge, and voxels between their samples
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.recolored import FunctionRequest
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
 
 
-@dataclass(frozen=True)
-class RenderRequest:
-    """Pictures to draw.
-
-    Attributes:
-        source: files of Gaussians, "-" for standard input, of streamed levels those that the name selects
-            (`vvgt_cli.gaussians.formats.levels`), several as the frames of a movie, None for an empty one; or a volume
-            or a series of volumes with its look.
-        output: directory for the images, one picture (`PICTURE`), numbered ones (`is_pattern`), or a movie by its
-            ending (`SUFFIXES`).
-        camera: view-set file, or None.
-        orbit: number of views on a circle around the up axis, or None; not both. Single pictures and frames need
-            neither.
-        size: image height in pixels; None: the view set's own, or what the Gaussians are made for.
-        rule: one of `vvgt_cli.gaussians.rules` to draw Gaussians by, or of `vvgt_cli.conversion.grey.NAMES`, also for a
-            volume; None: the Gaussians' file's.
-        exr: write EXR too.
-        background: RGB in [0, 1] behind the pictures, None for transparent PNGs and black movies.
-        overwrite: replace images that exist.
-        function: look to show live Gaussians under; None: the look of the file.
-        blocks: how a volume is processed in blocks; None: in memory, or in blocks if it is large.
-    """
-
-    source: tuple[str | None, ...] | SourceRequest
-    output: str
-    camera: str | None = None
-    orbit: int | None = None
-    size: int | None = None
-    rule: str | None = None
-    exr: bool = False
-    background: tuple[float, float, float] | None = None
-    overwrite: bool = False
-    function: FunctionRequest | None = None
-    blocks: BlockOptions | None = None
-
-    @property
-    def png(self) -> bool:
-        """Whether the output is one picture, or numbered ones."""
-        return Path(self.output).suffix.lower() == PICTURE
-
-    @property
-    def movie(self) -> bool:
-        """Whether the output is a movie."""
-        return Path(self.output).suffix.lower() in SUFFIXES
-
-    def views(self, frames: int, size: int | None = None, up: str = "none") -> list[list[Camera]]:
-        """Return the views of each frame; ``size`` (pixels) and ``up`` (axis to circle) are an orbit's defaults.
-
-        Several views are shared evenly among the frames, in their order; all frames have a single one in common.
-
-        Raises:
-            UsageError: no views are given, several for one picture, or fewer than frames.
-        """
-        still = self.camera is None and (self.png or frames > 1)
-        if (self.camera is None) == (self.orbit is None) and not still:
-            raise UsageError(
-                "give the views with either --camera FILE or --orbit N, or one picture, as -o out.png, or a series for "
-                "a movie, as 'run_*.vti'"
-            )
-        if self.camera is not None:
-            cameras = read_cameras(self.camera, self.size)
-        else:
-            circle = orbit_views(self.orbit or 1, size=self.size or size or SIZE)
-            cameras = [to_box_frame(camera, upright_matrix(up))[0] for camera in circle]
-        if self.png and len(cameras) > 1 and not is_pattern(self.output):
-            raise UsageError(f"-o {self.output}: one picture of {len(cameras)} views; expected a directory")
-        cameras *= frames if len(cameras) == 1 else 1
-        if len(cameras) < frames:
-            raise UsageError(
-                f"{len(cameras)} views of {frames} frames; expected a view of each, as --orbit {frames}, or one of all"
-            )
-        ends = [k * len(cameras) // frames for k in range(frames + 1)]
-        return [cameras[a:b] for a, b in pairwise(ends)]
-
-    def files(self, cameras: list[Camera]) -> list[str]:
-        """Return the movie, or the picture of each view."""
-        if self.movie:
-            return [self.output]
-        if not self.png:
-            return [str(Path(self.output, f"{camera.name}{PICTURE}")) for camera in cameras]
-        named = is_pattern(self.output)
-        return [put_name("-o", self.output, FRAMES, str(k)) if named else self.output for k in range(len(cameras))]
-
-    def check(self, frames: int) -> list[list[Camera]]:
-        """Return the views of frames yet to be read; raise UsageError or DataError for bad options or outputs."""
-        where = Path(self.output)
-        if self.rule in NAMES and self.background is not None:
-            raise UsageError(f"--background: pictures of --rule {self.rule} are opaque; omit it")
-        if self.movie and self.exr:
-            raise UsageError(f"--exr writes pictures, -o {where} is a movie; give only one of the two")
-        if frames > 1 and not (self.movie or (self.png and is_pattern(self.output))):
-            raise UsageError(
-                f"-o {where}: got {frames} frames; expected a movie, as -o time.gif or -o time.mp4, or a picture of "
-                "each, as -o 'out_{:04d}.png' (or --time N for one time step of a file)"
-            )
-        shares = self.views(frames)
-        cameras = list(chain(*shares))
-        files = self.files(cameras)
-        if self.movie and len({(camera.width, camera.height) for camera in cameras}) > 1:
-            raise UsageError(f"-o {where}: views of several sizes; a movie has one: give --size")
-        outputs = [Output("-o", file) for file in files]
-        outputs += [Output("--exr", str(Path(file).with_suffix(".exr"))) for file in files if self.exr]
-        if where.suffix.lower() == ".mp4":
-            _ffmpeg(str(where))
-        if not (self.movie or self.png):
-            check_folder(where, "images")
-            outputs.append(Output("-o", str(where / VIEWS_FILE)))
-        if self.movie or self.png or where.is_dir():
-            inputs = self.source.paths() if isinstance(self.source, SourceRequest) else list(filter(None, self.source))
-            check_outputs(outputs, inputs, self.overwrite)
-        return shares
-
-
-def render_file(request: RenderRequest, console: Console | None = None) -> int:
-    """Write one PNG (and EXR) per view and `transforms.json`, single pictures, or a movie; return the number of views.
-
-    Raises:
-        UsageError: an image exists, or the directory cannot be made; views or an output that do not suit the frames.
-        DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
-    """
-    run, given = Run(console or Console(), ConversionReport("render")), request.source
-    if not isinstance(given, SourceRequest):
-        return _render(run, request, given)
-    over_time = request.movie and request.camera is None and request.orbit is None and not is_glob(given.path)
-    if not over_time and not is_glob_of_volumes(given.path):
-        try:
-            return _render(run, request, [given])
-        except SeveralSteps:  # which are the frames
-            pass
-    series = FrameSeries(ConvertRequest(given, blocks=request.blocks), Shard(), page=False)
-    return _render(run, request, series.sources(), series)
-
-
-def _render(
-    run: Run, request: RenderRequest, frames: Sequence[str | SourceRequest | None], series: FrameSeries | None = None
+def render(
+    file: VolumeLike, output: PathLike, look: LookLike = None, *, camera: PathLike | None = None,
+    orbit: int | None = None, size: int | None = None, rule: str | None = None, exr: bool = False,
+    background: Sequence[float] | None = None, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
+    progress: bool | Console = False, **reading: Unpack[Reading],
 ) -> int:  # fmt: skip
-    """Draw all frames, of volumes as ``series`` prepares them, one in memory at a time; return the number of views."""
-    shares = request.check(len(frames))
-    if series is not None and len(frames) > 1:
-        series.prepare(run)
-        request, frames = replace(request, blocks=series.request.blocks), series.sources()
-    with ExitStack() as stack:
-        start = next((given, share) for given, share in zip(frames, shares, strict=True) if given is not None)
-        draw, by, first = _frame(run, request, *start, stack)
-        if first is not None:
-            shares = request.views(len(frames), first.screen_size, first.up)
-        cameras, opened = list(chain(*shares)), [draw]
-        del draw
-
-        def pictures() -> Iterator[np.ndarray]:
-            bar, done, shown = run.console.bar("render"), 0, len(frames) == 1
-            quiet, blank = Run(Console(quiet=True), run.report), _blank(request.rule)
-            for given, share in zip(frames, shares, strict=True):
-                if given is None:
-                    draw = blank
-                else:
-                    draw = opened.pop() if opened else _frame(quiet, request, given, share, stack, first)[0]
-                for camera in share:
-                    picture = draw(camera)
-                    yield picture
-                    shown, done = shown or bool(picture[..., 3].any()), done + 1
-                    if bar:
-                        bar(done, len(cameras))
-                del draw
-                stack.close()
-            if not shown:
-                raise DataError(f"nothing is visible in any of {len(frames)} frames; try another function")
-
-        with run.stage("render") as stage:
-            note = (_movie if request.movie else _pictures)(request, pictures(), cameras)
-            stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {by} in {note}"
-    return len(cameras)
-
-
-def _blank(rule: str | None) -> Draw:
-    """Return the renderer of a frame that holds nothing: transparent, or black where ``rule`` draws opaque pictures."""
-    opaque = float(rule in NAMES)
-    return lambda camera: np.tile(np.array([0, 0, 0, opaque], np.float32), (camera.height, camera.width, 1))
-
-
-def _frame(
-    run: Run, request: RenderRequest, source: str | SourceRequest, cameras: list[Camera], stack: ExitStack,
-    first: PlyHeader | None = None,
-) -> tuple[Draw, str, PlyHeader | None]:  # fmt: skip
-    """Return the renderer of a frame, its name, and the header of Gaussians; ``first`` is that of the first frame."""
-    if isinstance(source, SourceRequest):
-        return (*_volume(run, request, source, cameras, stack), None)
-    with run.stage("read") as stage:
-        seen, gaussians, header = _opened(request, source, first)
-        stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-    if request.rule in NAMES:
-        edge = 2.0 * header.scale / first.scale if first and first.scale and header.scale else 2.0
-        draw, by = draw_gaussians(source, gaussians, header, request.rule, request.function, edge), request.rule
-        run.compile(GREY)
-    else:
-        from vvgt_cli.splat import render
-
-        rule = file_rule(first or header, request.rule)
-        run.compile(for_degree(DRAW, gaussians.degree))
-        draw, by = lambda camera: render(seen(camera), camera, rule), rule.name
-    return _placed(draw, source, header, first), by, header
-
-
-def _in_range(name: str, header: PlyHeader, first: PlyHeader) -> PlyHeader:
-    """Return the header with the histograms of the first file's values, or raise DataError if they differ in range."""
-    if first.live is None or header.live is None or shared_facts([first.live, header.live]) is None:
-        raise DataError(
-            f"{name}: its values have another range or function than those of the first frame; expected frames that "
-            "'vvgt convert --live' makes of one series"
-        )
-    pairs = zip(header.live.layers, first.live.layers, strict=True)
-    own, *others = [replace(layer, histogram=same.histogram) for layer, same in pairs]
-    return replace(header, live=replace(own, others=tuple(others)))
-
-
-def _placed(draw: Draw, name: str, header: PlyHeader, first: PlyHeader | None) -> Draw:
-    """Return the renderer of a file's Gaussians for cameras in the unit frame of the first file, if both are known.
-
-    Raises:
-        DataError: the files' worlds have different axes or units.
-    """
-    if first is None or not (first.scale and first.centre and header.scale and header.centre):
-        return draw
-    for one, other in ((header.space, first.space), (header.length_unit, first.length_unit)):
-        if one and other and one != other:
-            raise DataError(f"{name}: positions in {one}; expected {other}, as in the first frame")
-    factor, offset = first.scale / header.scale, first.scale * np.subtract(header.centre, first.centre)
-    return lambda camera: draw(replace(camera, translation=(camera.rotation @ offset + camera.translation) / factor))
-
-
-def _volume(
-    run: Run, request: RenderRequest, asked: SourceRequest, cameras: list[Camera], stack: ExitStack
-) -> tuple[Draw, str]:
-    """Return the ray caster of a volume, in memory or in blocks, and its name; ``stack`` closes the blocks."""
-    from vvgt_cli.dvr import RenderSettings, render_view
-
-    settings, options, found = RenderSettings(), request.blocks or automatic(asked, run.console), None
-    if options is not None:
-        needs = FieldNeeds(1, cameras[0].height, values=request.rule == XRAY)
-        found = stack.enter_context(blocked(run, asked, options, stack.enter_context(store_beside(None)), needs))
-        source = found.source
-    else:
-        with run.stage("read") as stage:
-            source = load(asked)
-            stage.note = describe_source(source)
-    if source.volume.sheared:  # no pinhole camera sees it
-        text = shear_text(source.volume.axes)
-        raise DataError(f"{source.volume.name}: {text}; expected right angles: 'vvgt convert' accepts it")
-    where = " in blocks" if found else ""
-    if request.rule == MIP:
-        run.compile(GREATEST, source.kernel_type())
-        return render_in_box(mip_of(found or source), source.volume.axes), f"MIP{where}"
-    if request.rule == XRAY:
-        source = as_xray(source)
-        found = found and found.with_look(source)
-    kernels = source.kernels(RAYCAST)
-    run.compile(for_blocks(kernels) if found else kernels, source.kernel_type())
-    if found:
-        draw = draw_in_blocks(found, settings, cameras)
-    else:
-        scene = source.scene()
-        draw = render_in_box(lambda camera: render_view(scene, camera, settings), source.volume.axes)
-    if request.rule == XRAY:
-        return lambda camera: grey(draw(camera)[..., 3]), f"X-ray{where}"
-    return draw, f"ray casting{where}"
-
-
-def _opened(request: RenderRequest, name: str, first: PlyHeader | None) -> tuple[Seen, Gaussians, PlyHeader]:
-    """Return the Gaussians for a camera, those for all or the coarsest level, and the header; a frame may be empty."""
-    manifest, function = by_view(name), None if request.rule in NAMES else request.function
-    if manifest is None:
-        several = isinstance(request.source, tuple) and len(request.source) > 1
-        gaussians, header = open_gaussians(name, empty=several)
-        if first is not None and (request.rule in NAMES or request.function is not None):
-            header = _in_range(name, header, first)
-        gaussians = recolored(name, gaussians, header, function, empty=several)
-        return lambda camera: gaussians, gaussians, header
-    levels = StreamedLevels(manifest)
-    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
-    turned = up_matrix(header.up)
-
-    def seen(camera: Camera) -> Gaussians:
-        field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
-        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), name))
-
-    return seen, recolored(name, coarsest, header, function), header
-
-
-def _pictures(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
-    """Write PNG and EXR, and `transforms.json` beside those in a directory; return the output."""
-    from vvgt_cli.images import over, write_exr, write_png
-
-    where = Path(request.output)
-    if not request.png:
-        where.mkdir(exist_ok=True)
-    for file, camera, image in zip(request.files(cameras), cameras, pictures, strict=True):
-        if request.exr:
-            write_exr(Path(file).with_suffix(".exr"), image, camera=camera, overwrite=request.overwrite)
-        write_png(file, image if request.background is None else over(image, request.background), request.overwrite)
-    if not request.png:
-        write_text(str(where / VIEWS_FILE), transforms_json(cameras), request.overwrite)
-    return str(where)
-
-
-def _movie(request: RenderRequest, pictures: Iterator[np.ndarray], cameras: list[Camera]) -> str:
-    """Write one movie, and return its name and what it holds."""
-    from vvgt_cli.images import over
-
-    rate = SLOW if cameras[0] is cameras[-1] else RATE
-    shown = (over(picture, request.background or BLACK) for picture in pictures)
-    size = write_movie(request.output, shown, request.overwrite, rate)
-    return f"{request.output}: {len(cameras) / rate:.1f} s, {size / 1e6:.2f} MB"
-
-
-def as_xray(source: Source) -> Source:
-    """Return a volume under the extinction of its X-ray, unlit; raise UsageError for an optics grid."""
-    source.require_scalar_field()
-    layer = source.layers[0]
-    assert isinstance(layer.tf, TransferFunction)
-    distance = exposed_distance(layer.tf, source.overall, 2 / source.volume.unit_frame().scale)
-    return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
-
-
-def mip_of(field: Blocked | Source) -> Draw:
-    """Return the function that draws the MIP of a volume in blocks or in memory, for cameras in its box frame.
-
-    Raises:
-        UsageError: labels, channels or layers.
-    """
-    source = field.source if isinstance(field, Blocked) else field
-    source.require_scalar_field()
-    if isinstance(field, Blocked):
-        return lambda camera: grey(_greatest(source, _blocks(field), camera))
-    from vvgt_cli.dvr.scene import kernel_values
-
-    values, slope, intercept = kernel_values(source.volume)
-    whole = VoxelBox(values, None, _of_range(source.overall, slope, intercept), np.zeros(3, np.int64))
-    part = whole, whole.begin, np.array(source.volume.dims)
-    return lambda camera: grey(_greatest(source, [part], camera))
-
-
-def _blocks(field: Blocked) -> Iterator[Part]:
-    """Yield the blocks of a volume."""
-    reader, volume = field.reader, field.source.volume
-    assert isinstance(reader, Scalars)
-    optics = _of_range(field.source.overall, reader.rule.slope, reader.rule.intercept)
-    blocks = Boxes(volume.dims, (field.edge, field.edge, field.edge))
-    for number in range(len(blocks)):
-        lo, hi = blocks.at(number)
-        box = reader.box(np.maximum(lo - HALO, 0), np.minimum(hi + HALO, volume.dims))
-        yield replace(box, optics=optics), lo, hi
-
-
-def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarray:
-    """Return the mean over a pixel of the greatest values along its rays, (h, w) float32 of the range of values."""
-    from vvgt_cli.dvr.march import greatest
-    from vvgt_cli.dvr.render import BoxFrame, camera_arrays
-
-    n, frame, dims = MIP_RAYS, source.volume.unit_frame(), np.array(source.volume.dims)
-    larger = replace(
-        camera, fx=n * camera.fx, fy=n * camera.fy, cx=n * camera.cx, cy=n * camera.cy,
-        width=n * camera.width, height=n * camera.height,
-    )  # fmt: skip
-    rays = camera_arrays(BoxFrame(np.array(frame.half), np.array(frame.step)), larger)
-    out = np.zeros((larger.height, larger.width), np.float32)
-    for box, lo, hi in parts:
-        faces = np.stack([np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == dims, np.inf, hi - 0.5), dims])
-        greatest(box.voxels, box.optics, faces, box.begin.astype(np.float64), *rays, MIP_STEP, out)
-    mean: np.ndarray = out.reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
-    return mean
-
-
-def _of_range(statistics: Statistics, slope: float, intercept: float) -> Optics:
-    """Return tables whose coordinate goes from 0 to 1 over the range of data values."""
-    width = (statistics.hi - statistics.lo) or 1.0
-    return Optics.linear(1.0)._replace(lo=(statistics.lo - intercept) / slope, inv_width=slope / width)
-
-
-SUFFIXES = (".gif", ".mp4")
-RATE, SLOW = 25, 5  # pictures per second, a hundredth times 4 and 20, which GIF can represent; SLOW is as pages play
-_QUALITY = "18"  # of x264: visually almost lossless
-_MOST = 1 << 16  # colours that a palette is computed from
-_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # size of a GIF's palette, pictures sampled for it, rounds of clustering
-
-
-def write_movie(path: str | Path, pictures: Iterable[np.ndarray], overwrite: bool = False, rate: int = RATE) -> int:
-    """Write pictures as a looping movie, and return its size in bytes.
+    """Write pictures or a movie of Gaussians or of a volume, and return the number of views: ``vvgt render``.
 
     Args:
-        path: a file that ends in one of `SUFFIXES`.
-        pictures: (h, w, 3) float32 RGB in [0, 1] (clipped), at least one, all of the same size.
-        overwrite: replace an existing file.
-        rate: pictures per second.
+        file: Gaussians ("-" for standard input, a glob or an index for several), or a volume as in `convert`.
+        output: directory for pictures, one picture (``.png``), numbered ones ("{:04d}.png"), or a movie by its ending.
+        look: of a volume, as in `convert`, or of live Gaussians; None: their own.
+        camera: view-set file.
+        orbit: number of views on a circle around the up axis.
+        size: image height in pixels; None: the view set's, the one that the Gaussians are made for, or 400.
+        rule: drawing rule of Gaussians, "mip" or "xray", also of a volume; None: the file's.
+        exr: also write float EXR.
+        background: (r, g, b) in [0, 1]; None: transparent pictures and black movies.
+        blocks: as in `convert`.
+        overwrite: replace files that exist.
+        progress: print messages and bars on standard error.
+        **reading: of a volume, as in `convert`.
 
     Raises:
-        DataError: the library fails or is not installed, or the file cannot be written.
-        UsageError: the file exists and ``overwrite`` is not set.
+        UsageError: an output exists or cannot be made; views or an output that do not suit the frames.
+        DataError: Gaussians, a volume or a view set that are not valid, or a missing library for movies.
     """
-    frames = (np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8) for picture in pictures)
-    with atomic_write(path, overwrite) as temporary:
-        (_gif if Path(path).suffix.lower() == ".gif" else _mp4)(temporary, frames, rate)
-        return temporary.stat().st_size
+    from vvgt_cli.commands.pictures import Drawing, draw_files
+    from vvgt_cli.conversion.index import movie_frames
+    from vvgt_cli.gaussians.formats import is_splats
+    from vvgt_cli.library.inputs import Look, blocks_of, console_of, live_look, source_of
+    from vvgt_cli.score.record import ConversionReport, Run
+    from vvgt_cli.volume import ReadOptions
+
+    if background is not None and not all(0 <= c <= 1 for c in background):
+        raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
+    frames = movie_frames(os.fspath(file)) if isinstance(file, str | os.PathLike) else ()
+    given: tuple[str | None, ...] | SourceRequest = frames
+    function: FunctionRequest | None = None
+    if any(map(is_splats, filter(None, frames))) or (file == "-" and reading.get("dims") is None):
+        if source_of(file, None, reading).read != ReadOptions() or blocks is not None:
+            raise UsageError(f"{file} holds Gaussians; reading options and --blocks are for volumes only: omit them")
+        function = live_look(Look.of(look))
+    elif rule not in (None, "mip", "xray"):
+        raise UsageError(f"--rule {rule}: is for Gaussians, {file} is a volume; expected mip or xray, or none")
+    else:
+        given = source_of(file, look, reading)
+    how = (os.fspath(output), camera, orbit, size, rule, exr, background, overwrite)
+    run = Run(console_of(progress), ConversionReport("render"))
+    return draw_files(run, Drawing(given, function, blocks_of(blocks), *how))
 
 
-def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
-    """Write a GIF that loops forever, with one palette for all pictures, so that static parts do not flicker."""
-    from PIL import Image
+@shared.command("render", short_help="Render pictures or a movie of Gaussians or a volume.")
+@click.argument("file", metavar="FILE")
+@click.option("--camera", metavar="FILE", help="Camera poses from a transforms.json, in the unit frame.")
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the up axis.")
+@click.option(
+    "--size", type=click.IntRange(1, 16384), metavar="PX",
+    help="Image height in pixels. Default: that of the camera file, else the size recorded in the .ply, or 400.",
+)  # fmt: skip
+@click.option(
+    "-o", "--output", required=True, metavar="DIR|FILE",
+    help="One picture such as out.png, a directory for several, created if missing, numbered ones such as "
+    "'out_{:04d}.png' (of a series also {step}, {time} or {stem}), or a movie such as turn.gif or turn.mp4.",
+)  # fmt: skip
+@click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
+@click.option(
+    "--background", type=float, nargs=3, metavar="R G B",
+    help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
+)  # fmt: skip
+@shared.tf_options
+@shared.light_options
+@shared.rule_option(
+    "Viewer to imitate when drawing Gaussians; mip and xray show the values of a volume or a live file in grey. "
+    "Default: the one recorded in the file, or inria.",
+    more=("mip", "xray"),
+)
+@shared.placed_read_options
+@shared.block_options
+@shared.overwrite_option
+@shared.common_options
+def command(**options: Any) -> None:
+    """Render Gaussians as viewers do, or a volume by ray casting: one PNG per view and a transforms.json.
 
-    images = [Image.fromarray(frame) for frame in frames]
-    some = [np.asarray(image).reshape(-1, 3) for image in images[:: max(len(images) // _SAMPLES, 1)]]
-    colors = np.unique(np.concatenate(some), axis=0)  # each once, so that the background does not dominate
-    colors = colors[:: max(len(colors) // _MOST, 1)]
-    palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
-    drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // rate, loop=0, optimize=False)
+    Choose the views with --camera or --orbit; -o out.png without them is the first view of an orbit. With -o turn.gif
+    or turn.mp4 they become a movie at 25 frames per second, which loops seamlessly for an orbit. A quoted glob of
+    volumes or of Gaussians, a file of several time steps, or an index of 'vvgt convert' becomes a movie over time, or
+    numbered pictures: 5 frames per second from one view, or several views shared among the frames. The up axis is the
+    one recorded in a .ply, else +z, superior in anatomical volumes. FILE may be "-", or FOLDER of streamed levels:
+    FOLDER#1 is its level 1, FOLDER#view what viewers show each camera. A .ply of 'vvgt convert --live' can be shown
+    under any function (--tf) and light (--light); its layers as --layer LAYER,tf=TF, by number or name. Of a volume of
+    values, and of its live .ply, --rule mip shows the greatest value along each ray, from black for the least value of
+    the volume to white for the greatest, and --rule xray the sum of extinction under the function, both opaque and
+    unlit.
 
-
-def _ffmpeg(source: str) -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise DataError(
-            f"{source}: .mp4 needs imageio_ffmpeg ({error}); try: pip install 'vvgt[share]', or .gif"
-        ) from None
-    return imageio_ffmpeg
-
-
-def _mp4(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
-    """Write H.264 that all players support: 4:2:0, with the last row or column repeated to get even sizes."""
-    library, writer = _ffmpeg(str(path)), None
-    try:
-        for frame in frames:
-            height, width = frame.shape[:2]
-            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            if writer is None:
-                writer = library.write_frames(
-                    str(path), (even.shape[1], even.shape[0]), fps=rate, codec="libx264", macro_block_size=2,
-                    output_params=["-crf", _QUALITY, "-movflags", "+faststart"], ffmpeg_log_level="error",
-                )  # fmt: skip
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{path.name}: ffmpeg failed ({' '.join(str(error).split())[:200]})") from None
-    finally:
-        if writer is not None:
-            writer.close()
+    Examples:
+      vvgt render head.nrrd --tf ct-bone --size 800 -o head.png
+      vvgt render frog.ply --orbit 36 --size 800 -o turn
+      vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
+      vvgt render 'run_*.vti' --tf viridis -o time.mp4
+      vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
+    """
+    render(**shared.arguments(**options))

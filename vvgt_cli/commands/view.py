@@ -1,294 +1,114 @@
-"""`view`: Gaussians shown in a browser by a local server, or written in another format."""
+"""`vvgt view`: Gaussians or a volume shown in a browser, or written in another format."""
 
 from __future__ import annotations
 
 import os
-import sys
-import tempfile
-import time
-import webbrowser
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, JSON, SCRIPT, PageController, ServedCloud, plain_name, stored
-from vvgt_cli.commands.server import Resource, Site, served
-from vvgt_cli.conversion.gaussian_files import (
-    STDIN,
-    is_page,
-    layout_of,
-    open_gaussians,
-    report_agreement,
-    write_gaussians,
-    write_page,
-)
-from vvgt_cli.conversion.index import named_files
-from vvgt_cli.errors import DataError, NoLiveForm, UsageError
-from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
-from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
-from vvgt_cli.gaussians.formats.page_live import Extras
-from vvgt_cli.gaussians.formats.page_slices import Slices
-from vvgt_cli.gaussians.formats.sog import IMAGES, META
-from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
-from vvgt_cli.gaussians.outputs import Output, claimed
-from vvgt_cli.jit.ahead import DRAW, for_degree
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
+import click
 
-TICK = 0.2  # seconds within which Ctrl-C is answered
-SOON = 10.0  # seconds of reading after which a page is shown that waits; earlier failures are reported without one
-LINGER = 1.0  # seconds in which such a page hears why nothing comes
+from vvgt_cli.commands import options as shared
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading
+    from vvgt_cli.progress import Console
 
 
-@dataclass(frozen=True)
-class ViewRequest:
-    """Gaussians or a volume to show.
-
-    Attributes:
-        files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume, or one
-            series of volumes: a glob, or a file of several time steps.
-        source: how to read the volume, and its function; left at its defaults for files of Gaussians.
-        output: file to write instead of showing, None for none.
-        port: of the server; 0 takes a free one.
-        browser: open one, if there is a display.
-        overwrite: replace the file if it exists.
-        live: let a page of a volume have a function editor.
-        slices: let it have slices.
-        title: title of the page; None: the file's own.
-    """
-
-    files: tuple[str, ...]
-    source: SourceRequest
-    output: str | None = None
-    port: int = 0
-    browser: bool = True
-    overwrite: bool = False
-    live: bool = True
-    slices: bool = True
-    title: str | None = None
-
-
-def view(request: ViewRequest, announce: Callable[[str], None], console: Console | None = None) -> None:
-    """Show Gaussians until an interrupt, or write them.
+def view(
+    files: PathLike | Sequence[PathLike], look: LookLike = None, *, output: PathLike | None = None,
+    port: int | None = None, browser: bool = True, live: bool = True, slices: bool = True, title: str | None = None,
+    overwrite: bool = False, progress: bool | Console = False, **reading: Unpack[Reading],
+) -> None:  # fmt: skip
+    """Show files of Gaussians or a volume in a browser until an interrupt, or write them: ``vvgt view``.
 
     Args:
-        request: files and options.
-        announce: called with the page's URL once it can be opened.
-        console: for messages.
+        files: of Gaussians, globs of them, or indexes of ``vvgt convert``; several are a series. Or one volume, or one
+            series of volumes: a glob, or a file of several time steps.
+        look: of a volume, as in `convert`.
+        output: file to write instead of showing.
+        port: of the server; None takes a free one. Its address is printed.
+        browser: open one, if there is a display.
+        live: let a page of a volume have a function editor.
+        slices: let it have slices.
+        title: of the page; None: the file's own.
+        overwrite: replace the output if it exists.
+        progress: print messages on standard error.
+        **reading: of a volume, as in `convert`.
 
     Raises:
         UsageError: several volumes, options of volumes with files of Gaussians, or a port or an output that cannot be
             used.
         DataError: a file that is not valid.
     """
-    run = Run(console or Console(), ConversionReport("view"))
-    clouds = named_files(request.files)
-    if len(clouds) == 1 and _is_series(source := replace(request.source, volume=clouds[0][1])):
-        _show_series(run, request, source, announce)
-        return
-    if request.output is None:
-        _serve(run, request, clouds, announce)
-        return
-    if len(clouds) > 1:
-        _join(run, request, clouds)
-        return
-    file = clouds[0][1]
-    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
-        gaussians, options, extras = _opened(run, request, file)
-        write_gaussians(run, request.output, gaussians, options, request.overwrite, extras=extras)
-        run.compile(for_degree(DRAW, gaussians.degree))
-        report_agreement(run, request.output, gaussians, options)
+    from vvgt_cli.commands import viewer
+    from vvgt_cli.conversion.index import named_files
+    from vvgt_cli.library.inputs import console_of, source_of
+    from vvgt_cli.score.record import ConversionReport, Run
+
+    if output is not None and (port is not None or not browser):
+        raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
+    if output is None and not (live and slices):
+        raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
+    names = [files] if isinstance(files, str | os.PathLike) else files
+    clouds, run = named_files([os.fspath(name) for name in names]), Run(console_of(progress), ConversionReport("view"))
+    source = source_of(clouds[0][1], look, reading)
+    if output is None:
+        viewer.show(run, clouds, source, title, port or 0, browser, click.echo)
+    else:
+        how = {"live": live, "slices": slices, "overwrite": overwrite}
+        viewer.save(run, clouds, source, os.fspath(output), title=title, **how)
 
 
-def _is_series(source: SourceRequest) -> bool:
-    """Return whether a volume is several frames: a glob of files, or a file of several time steps."""
-    from vvgt_cli.conversion.frames import is_glob_of_volumes, list_steps
+@shared.command("view", short_help="Show Gaussians or a volume in a browser, or save a page.")
+@click.argument("files", metavar="FILE...", nargs=-1, required=True)
+@click.option(
+    "-o", "--output", metavar="OUT.html",
+    help="Save a page that works offline, or another format by its ending, instead of showing.",
+)  # fmt: skip
+@click.option(
+    "--port", type=click.IntRange(1, 65535), metavar="N", help="Port of the local server. Default: any free port."
+)
+@click.option(
+    "--no-browser", "browser", is_flag=True, default=True, flag_value=False,
+    help="Print the address without opening a browser.",
+)  # fmt: skip
+@click.option(
+    "--no-live", "live", is_flag=True, default=True, flag_value=False,
+    help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
+)  # fmt: skip
+@shared.slices_option
+@shared.title_option
+@shared.tf_options
+@shared.light_options
+@shared.placed_read_options
+@shared.overwrite_option
+@shared.common_options
+def command(**options: Any) -> None:
+    """Show FILE in a browser: Gaussians in any supported format, or a volume.
 
-    if source.path == STDIN or is_splats(source.path) or is_streamed(source.path):
-        return False
-    return is_glob_of_volumes(source.path) or (
-        os.path.isfile(source.path) and source.read.time is None and len(list_steps(source)) > 1
-    )
+    A volume appears within seconds. If its transfer function is changed in the page, the volume is converted for it in
+    the background.
 
+    A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
+    address is printed; Ctrl-C stops the server. Several files, a glob, or an index written by convert form a series
+    with a slider. A series of volumes (a quoted glob, or a file of several time steps) is converted first, refined only
+    with -o.
 
-def _show_series(run: Run, request: ViewRequest, source: SourceRequest, announce: Callable[[str], None]) -> None:
-    """Convert the frames of a volume: refined to a page that is written, or as live Gaussians that are shown."""
-    from vvgt_cli.conversion.convert_batch import convert_files
-    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+    A folder with a lod-meta.json is streamed: near parts load in fine detail, far ones coarsely. FOLDER#1 is level 1
+    alone.
 
-    if request.output is not None:
-        if not is_page(request.output):
-            raise UsageError(f"-o {request.output}: holds one frame; expected a page (.html), or --time N")
-        whole = ConvertRequest(
-            source, request.output, overwrite=request.overwrite, title=request.title, editor=request.live,
-            slices=request.slices,
-        )  # fmt: skip
-        convert_files(whole, console=run.console)
-        return
-    with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=request.title)
-        try:
-            convert_files(quick, console=run.console)
-        except NoLiveForm as error:  # takes longer
-            run.console.message(f"converted without a live form: {error}")
-            convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
-        clouds = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
-        shown = replace(request, files=tuple(file for _, file in clouds), source=SourceRequest(source.path))
-        _serve(run, shown, clouds, announce)
+    With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
+    .sog, .glb, .usdc and .usdz are for other programs. The loss due to the format is printed.
 
-
-def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
-    """Write several files into one page."""
-    files = [file for _, file in clouds]
-    _only_gaussians(files)
-    _refuse_reading(request.source, files[0])
-    if request.output is None or not is_page(request.output):
-        raise UsageError(
-            f"-o {request.output}: got {len(files)} files; expected a page (.html), which holds several "
-            "(one .glb, .usdc or .usdz of several labels is written by 'vvgt convert MAP --split-labels')"
-        )
-    with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
-        names = [name for name, _ in clouds]
-        if len(set(names)) < len(names):
-            names = list(files)
-        write_page(run, request.output, list(zip(names, files, strict=True)), request.overwrite)
-
-
-def _refuse_reading(given: SourceRequest, name: str) -> None:
-    """Refuse options for volumes with a file of Gaussians."""
-    if given != SourceRequest(given.volume):
-        raise UsageError(
-            f"{name} holds Gaussians; --tf, --labels, --layer, light and reading options are for volumes only: omit "
-            "them ('vvgt recolor' relights live files)"
-        )
-
-
-def _only_gaussians(files: Sequence[str]) -> None:
-    """Refuse several files that are not all ordinary files of Gaussians."""
-    if any(map(is_streamed, files)):
-        first = next(filter(is_streamed, files))
-        raise UsageError(f"{first}: streamed levels are shown alone; open one, as 'vvgt view {Path(first).parent}'")
-    volumes = [name for name in files if name != STDIN and not is_splats(name)]
-    if len(files) > 1 and (volumes or STDIN in files):
-        raise UsageError(
-            f"{(volumes or [STDIN])[0]}: not Gaussians; expected files of Gaussians, or one volume: for a series of "
-            "volumes, quote the pattern so that the shell does not expand it, as 'run_*.vti'"
-        )
-
-
-def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions, Extras]:
-    """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
-    given = request.source
-    if name == STDIN or is_splats(name):
-        _refuse_reading(given, name)
-        gaussians, header = open_gaussians(name)
-        options = layout_of(header)
-        return gaussians, replace(options, title=request.title or options.title), NO_EXTRAS
-    from vvgt_cli.conversion.convert import convert_in_memory
-    from vvgt_cli.conversion.request import ConvertRequest
-
-    editor = request.live and is_page(request.output)
-    conversion = convert_in_memory(
-        ConvertRequest(replace(given, volume=name), editor=editor, title=request.title), run.console
-    )
-    extras = conversion.extras(editor, request.slices, run) if is_page(request.output) else NO_EXTRAS
-    return conversion.gaussians, conversion.ply, extras
-
-
-def _serve(
-    run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]], announce: Callable[[str], None]
-) -> None:  # fmt: skip
-    files = [file for _, file in clouds]
-    if len(files) > 1:
-        _only_gaussians(files)
-    resources = {"viewer.js": Resource("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
-    site = Site(resources, run.console.message)
-    controller = PageController(site.resources, site.posts, plain_name(files[0]), run.console)
-    with ExitStack() as stack:
-        stack.enter_context(suppress(KeyboardInterrupt))
-        if given := files[0] == STDIN or is_splats(files[0]):
-            _refuse_reading(request.source, files[0])
-        if is_streamed(files[0]):
-            resources |= streamed_resources(files[0])
-        elif len(files) > 1:
-            resources |= _series(clouds)
-        elif given:
-            gaussians, header = open_gaussians(files[0])
-            controller.show(ServedCloud(gaussians, layout_of(header), controller.name))
-        url = stack.enter_context(served(site, request.port))
-        if not resources.get(""):
-            source = replace(request.source, volume=files[0])
-            converter = stack.enter_context(Converter(source, controller.name, controller.on_message))
-            controller.await_volume(converter, partial(slices_in, source))
-            controller.ready.wait(SOON)
-        if controller.error is None:
-            announce(url)
-            opened = request.browser and display() and webbrowser.open(url)
-            run.console.message(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C stops")
-        while controller.error is None:
-            time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
-        if controller.waited_for:
-            time.sleep(LINGER)
-        raise controller.error
-
-
-def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
-    """Return the page of several files, and each file, read when it is requested."""
-
-    def content(k: int) -> bytes:
-        gaussians, header = open_gaussians(clouds[k][1])
-        return stored(gaussians, layout_of(header))
-
-    first, frames = content(0), [{"name": name, "file": f"{k}.ply"} for k, (name, _) in enumerate(clouds)]
-    text = page(clouds[0][0], columns_of(first, clouds[0][1]), frames, SCRIPT)
-    resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
-    return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
-
-
-def slices_in(request: SourceRequest) -> Slices | None:
-    """Return the slices of a volume, which is read again, in blocks if it is large; None if it has colours."""
-    from vvgt_cli.conversion.convert import open_field
-    from vvgt_cli.conversion.request import ConvertRequest
-
-    with open_field(Run(Console(quiet=True), ConversionReport("view")), ConvertRequest(request), ()) as field:
-        return field.source.slices()
-
-
-def display() -> bool:
-    """Return whether a browser would have a screen; without one `webbrowser` may start a text browser."""
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def streamed_resources(file: str) -> dict[str, Resource]:
-    """Return the resources by name; "" is the page.
-
-    Raises:
-        DataError: not a manifest, or a file that it names is missing.
+    Examples:
+      vvgt view frog.ply
+      vvgt view example:frog
+      vvgt view head.nrrd --tf bone.json
+      vvgt view head_index.json
+      vvgt view 'run_*.vti' --tf viridis
+      vvgt view 'run/*.ply' --port 8000 --no-browser
+      vvgt view frog.ply -o frog.html
     """
-    manifest, folder = read_manifest(file), Path(file).parent
-    resources = {MANIFEST: Resource(JSON, Path(file).read_bytes)}
-    for name in manifest["filenames"]:
-        if not (folder / name).is_file():
-            raise DataError(f"{file}: {folder / name} is missing; expected the whole folder")
-        resources[name] = Resource(JSON, (folder / name).read_bytes)
-        for image in IMAGES:
-            path = (folder / name).with_name(f"{image}.webp")
-            resources[f"{name.removesuffix(META)}{path.name}"] = Resource("image/webp", partial(path.read_bytes))
-    splats, scale = placed(manifest)
-    view = camera(splats)
-    view |= {key: [scale * x for x in view[key]] for key in ("position", "target")}
-    more: dict[str, Any] = {
-        "streamed": True, "camera": view, "outermost": [], "comments": splats.comments,
-        "enlarged": scale,
-    }  # fmt: skip
-    name = Path(file).absolute().parent.name
-    text = page(name, splats, [{"name": name, "file": MANIFEST}], SCRIPT, more)
-    return resources | {"": Resource(HTML, lambda: text.encode("utf-8"))}
+    view(**shared.arguments(**options))

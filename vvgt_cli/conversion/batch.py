@@ -143,6 +143,10 @@ class Batch(ABC):
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield the items with a stem that is ``wanted``; skip those that show nothing, with a message."""
 
+    def places(self, stem: str) -> Mapping[str, Any]:
+        """Return what an item's input states for places in names: step, time and stem of frames."""
+        return {}
+
     def settings(self) -> dict[str, Any]:
         """Return everything that the files depend on, for a batch that ``resumes`` and is prepared."""
         return {}

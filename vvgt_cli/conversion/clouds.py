@@ -102,7 +102,8 @@ class Clouds(Mapping[str, Result]):
 
         Args:
             path: a page (``.html``); unless they are frames, a file with a node of each (``.glb``, ``.usdc``,
-                ``.usdz``); or a pattern with a place for the name (``{}``, for frames also ``{:04d}``), where
+                ``.usdz``); or a pattern with a place for the name (``{}``, for frames also ``{:04d}``, ``{step}``,
+                ``{time}`` and ``{stem}``), where
                 ``x.ply`` means ``x_{}.ply``. The index is ``x_index.json``.
             overwrite: replace files that exist.
             **how: frame, up, sh_degree and comments of the files; see `Result.save`.
@@ -128,7 +129,7 @@ class Clouds(Mapping[str, Result]):
         if not is_pattern(name):
             suffix = known.suffix if known else Path(name).suffix
             name = f"{name[: len(name) - len(suffix)]}_{{}}{suffix}"
-        files = [put_name("save", name, self.kind, cloud.stem) for cloud in self.clouds]
+        files = [put_name("save", name, self.kind, cloud.stem, cloud.facts) for cloud in self.clouds]
         index = index_output(name)
         check_outputs([*(Output("save", file, SUFFIXES, splats=True) for file in files), index], [], overwrite)
         rows, total, folder = [], 0, Path(index.path).parent

@@ -26,7 +26,7 @@ from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.open import MIN_BLOCKED, FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.settings import MANY
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
@@ -36,6 +36,7 @@ from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
+from vvgt_cli.look.suggest import fitting
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -318,6 +319,9 @@ def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     flattened = harmonics_warning(degree_of(request, source), source)
     for warning in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.message(warning)
+    plain = request.source.tf is None and not source.gridded and source.volume.data.nbytes < MIN_BLOCKED
+    if plain and (name := fitting(source.overall, source.volume)):
+        run.console.message(f"{source.volume.name}: no look is given; --tf {name} is made for such data, try it")
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     fit = request.fit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -51,7 +52,7 @@ from vvgt_cli.gaussians.formats.page_live import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
 from vvgt_cli.gaussians.targets import check_opened
-from vvgt_cli.progress import Console
+from vvgt_cli.progress import Console, Once
 from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
@@ -87,14 +88,14 @@ class Files:
         """Return the path of a file relative to the index, by which index and manifest have it."""
         return Path(os.path.relpath(name, Path(self._index.path).parent)).as_posix()
 
-    def names(self, kind: str, stem: str) -> list[str]:
+    def names(self, batch: Batch, stem: str) -> list[str]:
         """Return an item's names of output, report and preview.
 
-        Raise UsageError unless patterns have one place for it.
+        Raise UsageError unless patterns have a place for it.
         """
-        request = self._request
-        patterns = {"-o": request.output, "--report": request.report, "--preview": request.preview}
-        return [put_name(option, pattern, kind, stem) for option, pattern in patterns.items() if pattern is not None]
+        request, facts = self._request, batch.places(stem)
+        given = {"-o": request.output, "--report": request.report, "--preview": request.preview}
+        return [put_name(option, name, batch.kind, stem, facts) for option, name in given.items() if name is not None]
 
     def _named(self, request: ConvertRequest, names: Sequence[str]) -> ConvertRequest:
         rest = list(names)
@@ -113,7 +114,7 @@ class Files:
         """
         if self._request.overwrite and self._shard.count > 1:
             raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
-        self.names(batch.kind, UNKNOWN)
+        self.names(batch, UNKNOWN)
         folder = Path(self._index.path).parent
         if is_streamed(self._request.output):
             self._stack.enter_context(folder_of(folder / MANIFEST))
@@ -132,7 +133,9 @@ class Files:
         """Check the outputs as far as stems are known, and return them; files of a series may exist."""
         request, stems, inputs = self._request, batch.stems, self._request.inputs()
         batch.check_names()
-        rows, levels = [self.names(batch.kind, stem) for stem in stems or [UNKNOWN]], is_streamed(request.output)
+        rows, levels = [self.names(batch, stem) for stem in stems or [UNKNOWN]], is_streamed(request.output)
+        if same := [name for name, count in Counter(name for row in rows for name in row).items() if count > 1]:
+            raise UsageError(f"{same[0]} would hold several {batch.kind}; expected another place in its name, as {{}}")
         names = [name for row in rows for name in row if not levels or self._key(name).startswith("..")]
         folders = sorted({str(Path(name).parent) for name in names})
         if batch.resumes and len(folders) > (0 if levels else 1):
@@ -159,17 +162,17 @@ class Files:
         """Return whether an item belongs to this shard and is not complete yet."""
         if self._manifest is None:
             return True
-        own = map(self._key, self.names(batch.kind, stem))
+        own = map(self._key, self.names(batch, stem))
         return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item to its files, and return the report."""
-        request = self._named(item.request, self.names(batch.kind, item.stem))
+        request = self._named(item.request, self.names(batch, item.stem))
         return _to_file(request, console, item.gaussians, batch.previous)
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Record a complete item."""
-        names = [self._key(name) for name in self.names(batch.kind, item.stem)]
+        names = [self._key(name) for name in self.names(batch, item.stem)]
         row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
         row["file"] = names[0]
         self._rows[item.stem] = row
@@ -183,7 +186,7 @@ class Files:
         while manifest is None or len(manifest.files) > known:
             if manifest is not None:
                 known = len(manifest.files)
-                files = (self._key(self.names(batch.kind, stem)[0]) for stem in batch.stems)
+                files = (self._key(self.names(batch, stem)[0]) for stem in batch.stems)
                 rows = [manifest.files[file]["row"] for file in files if file in manifest.files]
             found = index_of(batch.kind, batch.volume, rows, **batch.facts)
             write_index(path, found, self._request.overwrite or manifest is not None)
@@ -250,6 +253,8 @@ def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
     Raises:
         KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command converts it again.
     """
+    once, outer = Once(), console
+    console = replace(console, once=once)
     run = Run(console, ConversionReport("convert"))
     try:
         sink.open(batch, run)
@@ -258,6 +263,8 @@ def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
             if report.interrupted:
                 raise KeyboardInterrupt
             sink.take(batch, item, report, batch.previous.facts() if batch.previous else {})
+        for line in once.repeated():
+            outer.message(line)
         return sink.finish(batch, console)
     finally:
         sink.close()
@@ -302,7 +309,7 @@ def convert_files(
         request = replace(request, blocks=request.blocks or BlockOptions())
     if dry_run:
         return plan_conversion(request, console).text()
-    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
+    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source)):
         try:
             _to_file(request, console)
             return None
@@ -370,12 +377,11 @@ def convert_to_memory(
     kind = FUNCTIONS if as_clouds else LABELS if split_labels else ONE
     for one in [LAYERS if kind == LABELS and request.source.layers else kind, *([LIVE] if request.live else [])]:
         check_options(one, used)
-    path = request.source.volume
-    if kind == ONE and not (isinstance(path, str) and is_glob_of_volumes(path)):
+    if kind == ONE and not is_glob_of_volumes(request.source):
         try:
             return convert_in_memory(request, console, None if after is None else PreviousLook(after))
         except SeveralSteps:
-            if not isinstance(path, str):
+            if not isinstance(request.source.volume, str):
                 raise
     kind = FRAMES if kind == ONE else kind
     check_options(kind, used)

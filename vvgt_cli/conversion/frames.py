@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.index import FRAMES, index_path
+from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, COLOR, Content, functions_of, open_content
+from vvgt_cli.field.layered import ALL, Content, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
-from vvgt_cli.look.label_files import holds_table, table_for
+from vvgt_cli.look.label_files import table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
@@ -29,7 +29,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.medical.masks import hold_volumes, mask_files
 from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
@@ -47,12 +47,14 @@ class Step:
         volume: see `SourceRequest.volume`.
         read: how to read it.
         time: time of the step and its unit, which may be ""; None where the file has none.
+        named: "step" and "stem" of its input (`frame_facts`).
     """
 
     name: str
     volume: str
     read: ReadOptions
     time: tuple[float, str] | None = None
+    named: Mapping[str, str] = field(default_factory=dict)
 
     def label(self) -> str:
         """Return name and time for a message."""
@@ -61,11 +63,11 @@ class Step:
         return f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
 
     def facts(self) -> dict[str, Any]:
-        """Return its time as entries of an index."""
+        """Return step, stem and time as entries of an index."""
         if self.time is None:
-            return {}
+            return {**self.named}
         value, unit = self.time
-        return {"time": value, **({"time_unit": unit} if unit else {})}
+        return {**self.named, "time": value, **({"time_unit": unit} if unit else {})}
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,9 @@ class FrameSeries(Batch):
         """List the frames; ``page`` limits the Gaussians of live frames."""
         from vvgt_cli.conversion.previous_frame import previous_frame
 
-        self._steps: Sequence[Step] = list_steps(request.source)
+        outputs = (request.output, request.report, request.preview)
+        timed = request.output is None or any("{time" in (name or "") for name in outputs)
+        self._steps: Sequence[Step] = list_steps(request.source, timed)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
@@ -153,6 +157,10 @@ class FrameSeries(Batch):
         self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
         self.request = replace(request, source=source)
         self.facts = {"empty": [k for k, dark in enumerate(self._dark) if dark]}
+
+    def places(self, stem: str) -> dict[str, Any]:
+        """Return step, time and stem of a frame, as far as its input states them."""
+        return self._steps[int(stem)].facts()
 
     def sources(self) -> list[SourceRequest]:
         """Return the request of each frame, with what all share once that is prepared."""
@@ -205,25 +213,12 @@ def is_glob(path: str) -> bool:
     return bool(set(path) & set("*?[")) and not os.path.exists(path)
 
 
-def is_glob_of_volumes(path: str) -> bool:
-    """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
-    if not is_glob(path):
+def is_glob_of_volumes(source: SourceRequest) -> bool:
+    """Return whether a source is a glob of files that each hold a frame, and not slices of one volume, or masks."""
+    path = source.volume
+    if not isinstance(path, str) or not is_glob(path) or not hold_volumes(matching(path)):
         return False
-    files = matching(path)
-    if any(file.suffix.lower() not in SUFFIXES for file in files):
-        return True
-    return bool(files) and _pages(files[0]) > 1
-
-
-def _pages(path: Path) -> int:
-    """Return the number of pages of a TIFF; 1 where it cannot be read, which is reported later."""
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            return len(file.pages)
-    except Exception:  # whatever a damaged file makes of it
-        return 1
+    return source.labels == NO_LABELS or not mask_files(path)
 
 
 def survey(
@@ -253,7 +248,7 @@ def survey(
         first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.single_volume:
-            mapped = holds_table(content.path) or recognised(content.volumes[0])
+            mapped = recognised(content.volumes[0])
         if mapped and content.single_volume:
             found.update(labels_in(content.volumes[0]))
         stats.append([statistics(volume) for volume in content.classified])
@@ -274,27 +269,12 @@ def _without_values(volume: Volume) -> Volume:
 
 def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
     """Check that a frame has the grid and the components of the first."""
-    volume, grid = content.volumes[0], first.volumes[0]
-    if _grid(volume) != _grid(grid):
-        raise DataError(
-            f"{step.name}: {_grid_text(volume)}; expected the grid of {begin.name}, {_grid_text(grid)}: frames of one "
-            "series share it"
-        )
+    content.volumes[0].check_grid(step.name, first.volumes[0], begin.name, "frames of one series share it")
     if (len(content.volumes), content.color) != (len(first.volumes), first.color):
         raise DataError(
             f"{step.name}: components {len(content.volumes)}; expected the {len(first.volumes)} of {begin.name}: "
             "frames of one series share them"
         )
-
-
-def _grid(volume: Volume) -> tuple[Any, ...]:
-    return volume.dims, volume.spacing, volume.origin, volume.direction, volume.space
-
-
-def _grid_text(volume: Volume) -> str:
-    vectors = (volume.spacing, volume.origin, volume.direction)
-    numbers = (" ".join(f"{value:g}" for value in values) for values in vectors)
-    return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
 def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
@@ -329,7 +309,7 @@ def _functions(
     from vvgt_cli.look.resolve import parse_tf_range
 
     if frames.labels is not None and frames.first.single_volume:
-        table = table_for(source.labels or AUTO, frames.labels, "the series")
+        table = table_for(source.labels or AUTO, frames.labels, "the series", frames.grid.segments)
         return (table,), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))
@@ -337,8 +317,8 @@ def _functions(
     return shown, unit_distance(source.unit_distance, frames.grid, given)
 
 
-def list_steps(source: SourceRequest) -> list[Step]:
-    """List the files of a glob, or the time steps of a single file.
+def list_steps(source: SourceRequest, timed: bool = False) -> list[Step]:
+    """List the files of a glob, whose times are looked for if ``timed``, or the time steps of a single file.
 
     Raises:
         UsageError: the glob matches nothing.
@@ -351,13 +331,29 @@ def list_steps(source: SourceRequest) -> list[Step]:
             "a file with several time steps"
         )
     if len(files) > 1:
-        return [Step(file.name, str(file), source.read) for file in files]
+        named = frame_facts(list(map(str, files)))
+        times = [_stated_time(str(file), source.read) if timed else None for file in files]
+        return [Step(f.name, str(f), source.read, t, n) for f, t, n in zip(files, times, named, strict=True)]
     volume = str(files[0]) if files else source.path
     name = Path(volume).name
-    times = _times(volume, source.read)
+    times, facts = _times(volume, source.read), frame_facts([volume])[0]
     if len(times) == 1:
-        return [Step(name, volume, source.read)]
-    return [Step(f"{name} time {k}", volume, replace(source.read, time=k), time) for k, time in enumerate(times)]
+        time = _stated_time(volume, source.read) if timed else None
+        return [Step(name, volume, source.read, time, facts)]
+    return [
+        Step(f"{name} time {k}", volume, replace(source.read, time=k), time, {**facts, "step": str(k)})
+        for k, time in enumerate(times)
+    ]
+
+
+def _stated_time(volume: str, read: ReadOptions) -> tuple[float, str] | None:
+    """Return the time of a file of one step and its unit, None where it states none."""
+    from vvgt_cli.volume.vtk.xml import time_value
+
+    if os.path.isfile(volume) and (value := time_value(Path(volume))) is not None:
+        return value, ""
+    times = _times(volume, read)
+    return times[0] if len(times) == 1 else None
 
 
 def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
@@ -365,7 +361,7 @@ def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
     from vvgt_cli.volume.registry import time_steps
 
     read = replace(read, stored=True, packed=True)
-    if read.component in (COLOR, ALL):
+    if isinstance(read.component, str):
         read = replace(read, component=0)
     try:
         return time_steps(volume, read)

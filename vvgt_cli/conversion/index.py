@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
@@ -17,50 +18,91 @@ from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, write_text
 from vvgt_cli.score.record import SCHEMA, ConversionReport, plain
+from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff.slices import matching
 
 FORMAT = "vvgt-clouds"
 FRAMES, FUNCTIONS, LABELS = "frames", "functions", "labels"  # kinds of batches
 INDEX = "index"  # stem of the index
-FIELD = re.compile(r"\{(?::0?\d{0,2}d)?\}")
+FIELD = re.compile(r"\{([^{}]*)\}")  # a place in the name of an output
+_FRAME = re.compile(r"(step)?(:0?\d{0,2}d)?|time(:\d{0,2}(\.\d{1,2})?[efg])?|stem")  # what may stand in one
 _HEAD = 256  # characters that tell an index from another JSON file
 
 
 def is_pattern(output: str) -> bool:
-    """Return whether an output has a place for a frame's number or a name, as ``out_{:04d}.ply``."""
+    """Return whether an output has places for a frame's number, step, time or stem, or a name: ``out_{:04d}.ply``."""
     return FIELD.search(output) is not None
 
 
 def function_name(tf: str) -> str:
     """Return the name of a function: that of its file without folder and endings, or NAME of FILE#NAME."""
+    if ":" in tf:  # a colour map or levels, with numbers
+        return tf
     return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]
 
 
-def put_name(option: str, pattern: str, kind: str, stem: str) -> str:
-    """Return a pattern with a frame's number, or the name of a function or label, in its place.
+def put_name(
+    option: str, pattern: str, kind: str, stem: str, facts: Mapping[str, Any] = MappingProxyType({})
+) -> str:  # fmt: skip
+    """Return a pattern with what stands for a frame, or the name of a function or label, in its places.
 
     Args:
         option: option with the pattern, for the message.
-        pattern: pattern such as ``out_{:04d}.ply`` or ``out_{}.ply``; number formats are for `FRAMES` alone.
+        pattern: ``out_{}.ply``; for `FRAMES` also ``out_{:04d}.ply``, ``{step}``, ``{time}`` and ``{stem}``.
         kind: `FRAMES`, `FUNCTIONS` or `LABELS`.
-        stem: number, name or `INDEX`.
+        stem: number or name.
+        facts: "step", "time" and "stem" of a frame, as far as its input states them.
 
     Raises:
-        UsageError: the pattern has no such place, or several.
+        UsageError: the pattern has no such place, one of them twice, or one that the input says nothing of.
     """
-    places = FIELD.findall(pattern)
-    if len(places) != 1 or set(FIELD.sub("", pattern)) & set("{}") or (places[0] != "{}" and kind != FRAMES):
-        what = "frame's number, as out_{:04d}" if kind == FRAMES else f"{kind[:-1]}'s name, as out_{{}}"
+    places, what = FIELD.findall(pattern), f"{kind[:-1]}'s name, as out_{{}}"
+    keys = [text.partition(":")[0] for text in places]
+    known = all(_FRAME.fullmatch(text) if kind == FRAMES else not text for text in places)
+    if not (known and 0 < len(keys) == len(set(keys))) or set(FIELD.sub("", pattern)) & set("{}"):
+        if kind == FRAMES:
+            what = "frame's number {} or {:04d}, {step} or {time} that its input states, or {stem}, its input's name"
         end = f"/{MANIFEST}" if is_streamed(pattern) else ".ply"
-        raise UsageError(f"{option} {pattern}: expected one place for the {what}{end}")
-    return pattern.replace(places[0], places[0].format(int(stem)) if stem.isdecimal() and kind == FRAMES else stem)
+        raise UsageError(f"{option} {pattern}: expected one place for the {what}{end if kind != FRAMES else ''}")
+
+    def value(place: re.Match[str]) -> str:
+        key, _, form = place[1].partition(":")
+        one = facts.get(key) if key else stem
+        if one is None:
+            raise UsageError(
+                f"{option} {pattern}: the input of frame {stem} states no {key}; expected another place, such as {{}}"
+            )
+        if form:
+            return format(float(one) if key == "time" else int(one), form)
+        return f"{one:.12g}" if isinstance(one, float) else str(one)
+
+    return FIELD.sub(value, pattern)
+
+
+def frame_facts(paths: Sequence[str | None]) -> list[dict[str, Any]]:
+    """Return "step" and "stem" of the files of a series, as far as their names have them, empty for None.
+
+    The step is the last number that differs from name to name, folders included, with its zeros; else the last number.
+    """
+    stems = [Path(path or "") for path in paths]
+    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+        stems = [path.with_name(volume_name(path).removesuffix(suffix)) if path.name else path for path in stems]
+    numbers = [re.findall(r"\d+", str(path)) for path in stems if path.name]
+    alike = len({len(row) for row in numbers}) == 1
+    varying = [k for k, column in enumerate(zip(*numbers, strict=True)) if len(set(column)) > 1] if alike else []
+    facts = []
+    for path in stems:
+        own = [re.findall(r"\d+", str(path))[varying[-1]]] if varying and path.name else re.findall(r"\d+", path.name)
+        facts.append({"stem": path.name} if path.name else {})
+        facts[-1] |= {"step": own[-1]} if own else {}
+    return facts
 
 
 def index_path(pattern: str) -> str:
     """Return the path of the index: ``out_index.json`` for ``out_{}.ply``, ``index.json`` for ``{}/out.ply``."""
     parts = Path(pattern).parts
     first = next(k for k, part in enumerate(parts) if is_pattern(part))
-    name = FIELD.sub(INDEX, parts[first])
+    name = re.sub(r"\{.*\}", INDEX, parts[first])
     if first == len(parts) - 1:
         known = format_of(name)
         name = name[: -len(known.suffix)] if known else str(Path(name).with_suffix(""))

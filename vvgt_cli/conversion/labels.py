@@ -21,7 +21,7 @@ from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content
+from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
@@ -89,6 +89,7 @@ class Labels(Batch):
             budget = max(request.fit.max_gaussians // len(sources), 1)
             tables: list[str] = []
             firsts: list[Volume] = []
+            used: set[tuple[float, float, float]] = set()
             names: list[str] = []
             for one in sources:
                 own = replace(request, source=one, fit=replace(request.fit, max_gaussians=budget))
@@ -96,7 +97,7 @@ class Labels(Batch):
                 firsts.append(content.volumes[0])
                 check_lengths(firsts[0], firsts[-1])
                 names.append(unused(content.volumes[0].name, names))
-                self._layers.append((own, _parts(own, content, names[-1] if len(sources) > 1 else "", tables)))
+                self._layers.append((own, _parts(own, content, names[-1] if len(sources) > 1 else "", tables, used)))
                 self.volume = self.volume or content.volumes[0].name
             self.facts = {"table": " + ".join(tables)}
             found = [part for _, parts in self._layers for part in parts]
@@ -135,14 +136,14 @@ def check_lengths(first: Volume, other: Volume) -> None:
 
 def _content(source: SourceRequest, stored: bool) -> Content:
     """Return the content of the map's file, or the map itself."""
-    if not isinstance(source.volume, str):
-        return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
-    return open_content(source.path, read)
+    return open_content(source.path, read) if isinstance(source.volume, str) else content_of(source.volume)
 
 
-def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[str]) -> list[LabelItem]:
-    """Return the labels of a map, or a ``layer`` as a whole if it is none; the names of tables are added to ``tables``.
+def _parts(
+    request: ConvertRequest, content: Content, layer: str, tables: list[str], used: set[tuple[float, float, float]]
+) -> list[LabelItem]:  # fmt: skip
+    """Return the labels of a map, or a ``layer`` as a whole if it is none; add to ``tables`` and ``used`` colours.
 
     Raises:
         DataError: see `convert`; of a single map, no label is visible.
@@ -155,6 +156,7 @@ def _parts(request: ConvertRequest, content: Content, layer: str, tables: list[s
         return [LabelItem(name, UNSAFE.sub("-", name), replace(request, source=whole), {})]
     read = read_labels(labels) if isinstance(labels, str) and labels not in (AUTO, NO_LABELS) else labels
     maps = layers_of(content, None, read, distance=source.unit_distance)
+    maps = told_apart(maps, used) if layer else maps
     tables += [one.tf.name for one in maps]
     if not layer:
         check_labels([one.tf for one in maps])

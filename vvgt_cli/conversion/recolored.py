@@ -80,11 +80,14 @@ Look = TransferFunction | LabelTable | SeveralLooks
 
 
 def parse_layer_look(text: str) -> LayerLook:
-    """Parse ``LAYER[,tf=TF][,labels=TABLE][,distance=D]``; raise UsageError for an unknown key, or no look."""
-    name, *rest = re.split(r",(?=[a-z]+=)", text)
+    """Parse ``LAYER[,tf=TF][,iso=LEVEL][,labels=TABLE][,distance=D]``; raise UsageError for other texts."""
+    name, *rest = re.split(r",(?=[a-z]+=)", text.replace(",iso=", ",tf=iso:"))
     given = dict(entry.split("=", 1) for entry in rest if "=" in entry)
-    if not name or not rest or set(given) - {"tf", "labels", "distance"} or not all(given.values()):
-        raise UsageError(f"--layer {text}: expected LAYER,tf=TF or LAYER,labels=TABLE, and perhaps distance=LENGTH")
+    unknown = set(given) - {"tf", "labels", "distance"} or len(given) < len(rest)
+    if not name or not rest or unknown or not all(given.values()):
+        raise UsageError(
+            f"--layer {text}: expected LAYER,tf=TF, LAYER,iso=LEVEL or LAYER,labels=TABLE, and perhaps distance=LENGTH"
+        )
     return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
 
 

@@ -22,9 +22,10 @@ from vvgt_cli.look import (
     unit_distance,
 )
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.label_files import holds_table, segments_of, table_for
-from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, distinct, hex_color
+from vvgt_cli.look.label_files import holds_table, table_beside, table_for
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, default_name, distinct, hex_color, palette
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
+from vvgt_cli.volume.components import channel_numbers
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
@@ -45,23 +46,23 @@ class Content:
     Attributes:
         volumes: the scalar field; or red, green, blue and optionally opacity; or one volume per channel; or label maps.
         color: the volumes are colours.
-        colors: RGB of each channel, None where the file gives none.
+        colors: RGB of each channel, that of the file or a default.
         path: path of the file, None for content in memory.
         overlapping: the volumes are layers of a segmentation with overlapping segments.
-        layer: number of the requested component, None for all.
         stored: values stay in the file, and derived volumes are computed block by block.
         names: names of the channels, where they have any.
+        numbers: numbers of the channels in the file, where they are several.
         components_message: the reader's message about several components if all are shown by default, else None.
     """
 
     volumes: tuple[Volume, ...]
     color: bool = False
-    colors: Sequence[tuple[float, float, float] | None] = ()
+    colors: Sequence[tuple[float, float, float]] = ()
     path: str | None = None
     overlapping: bool = False
-    layer: int | None = None
     stored: bool = False
     names: Sequence[str] = ()
+    numbers: Sequence[int] = ()
     components_message: str | None = None
 
     @property
@@ -142,13 +143,16 @@ def content_of(source: Volume | Content) -> Content:
 def open_content(source: str, read: ReadOptions) -> Content:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    Components are returned for "color" and "all", for a file of colours, and by default for up to `MAX_CHANNELS`
-    channels of a microscope.
+    Components are returned for "color", "all" and several names or numbers, for a file of colours, and by default for
+    up to `MAX_CHANNELS` channels of a microscope.
 
     Raises:
-        DataError, UsageError: see `read_volume`; also for components that are not colours.
+        DataError, UsageError: see `read_volume`; also for components that are not colours, and channels that are not
+            there.
     """
-    asked = read.component if read.component in (COLOR, ALL) else None
+    word = read.component if isinstance(read.component, str) else ""
+    several = "," in word
+    asked = word if several or word in (COLOR, ALL) else None
     try:
         volume = read_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
@@ -161,26 +165,24 @@ def open_content(source: str, read: ReadOptions) -> Content:
         color = asked == COLOR or (error.color and not asked and not overlapping)
         if color and read.keep_largest is not None:
             raise UsageError(f"--keep-largest: {source} has colours; expected scalars: give a --mask") from None
-        parts = tuple(read_volume(source, replace(read, component=k)) for k in range(error.count))
+        numbers: Sequence[int] = range(error.count)
+        if several:
+            numbers = channel_numbers(word.split(","), error.count, error.names, source)
+            if len(numbers) == 1:
+                return open_content(source, replace(read, component=numbers[0]))
+        parts = tuple(read_volume(source, replace(read, component=k)) for k in numbers)
         if color:
             return Content(parts, True, stored=read.stored)
-        colors = error.colors or [None] * error.count
-        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
-        return Content(
-            named,
-            False,
-            colors,
-            source,
-            overlapping,
-            None,
-            read.stored,
-            error.names,
-            str(error) if by_default else None,
-        )
-    if asked:
+        colors = [(error.colors and error.colors[k]) or CHANNEL_COLORS[k % len(CHANNEL_COLORS)] for k in numbers]
+        names = [error.names[k] for k in numbers] if error.names else []
+        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in zip(numbers, parts, strict=True))
+        message = str(error) if by_default else None
+        return Content(named, False, colors, source, overlapping, read.stored, names, numbers, message)
+    if several:
+        volume = read_volume(source, read)  # the name of its one channel, or an error
+    elif asked:
         raise UsageError(f"{source}: one component; expected several: omit --component {asked}")
-    layer = read.component if isinstance(read.component, int) else None
-    return Content((volume,), path=source, layer=layer, stored=read.stored)
+    return Content((volume,), path=source, stored=read.stored)
 
 
 def is_plain(
@@ -189,11 +191,7 @@ def is_plain(
     """Return whether the content is one scalar field under a function, and not a recognised label map."""
     if not opened.single_volume or layers or labels not in (None, NO_LABELS):
         return False
-    return (
-        tf is not None
-        or labels == NO_LABELS
-        or not (holds_table(opened.path) or recognised(opened.volumes[0], access.labels))
-    )
+    return tf is not None or labels == NO_LABELS or not recognised(opened.volumes[0], access.labels)
 
 
 def layers_of(
@@ -222,14 +220,14 @@ def layers_of(
     """
     labels = _chosen_labels(opened, tf, labels, access)
     if labels is not None and labels != NO_LABELS:
-        own_table = labels == AUTO and holds_table(opened.path)
-        if opened.overlapping:
-            return _overlapping(opened, labels, own_table, distance, access)
-        if own_table and opened.layer is not None:
-            labels = segments_of(str(opened.path), opened.layer)
-        elif own_table:
-            labels = str(opened.path)
-        return [_labelled(opened.volumes[0], labels, distance, access, empty=bool(whole))]
+        maps = [one for one in opened.volumes if any(access.labels(one))] if opened.overlapping else opened.volumes[:1]
+        if not maps:
+            raise DataError(f"{opened.path}: no label other than 0 in any layer; expected some to show")
+        beside = None if labels != AUTO or maps[0].segments else table_beside(opened.path)
+        if beside:
+            warnings.warn(f"{opened.path}: {beside} may name its labels (try --labels {beside})", stacklevel=3)
+        found = [_labelled(volume, labels, distance, access, empty=bool(whole)) for volume in maps]
+        return told_apart(found, set()) if opened.overlapping else found
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
     stats = whole or [access.statistics(volume) for volume in sources]
@@ -259,12 +257,10 @@ def _chosen_labels(
         raise UsageError(f"{volume.name}: several components; expected a label map: choose one with --component N")
     if labels not in (None, NO_LABELS) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
-    if labels is None and tf is None and opened.single_volume:
-        own_table = holds_table(opened.path)
-        if own_table or recognised(volume, access.labels):
-            reason = "its segments" if own_table else "its name and its few integers"
-            warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
-            return AUTO
+    if labels is None and tf is None and opened.single_volume and recognised(volume, access.labels):
+        reason = "its name and its few whole numbers" if volume.segments is None else "its segments"
+        warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
+        return AUTO
     return labels
 
 
@@ -281,12 +277,13 @@ def functions_of(
     if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
-            return [from_histogram(stats[0], one.hounsfield, one.density)]
+            return [from_histogram(stats[0], one.hounsfield, one.density, one.preset)]
         return [resolve(tf, stats[0], tf_range, one.hounsfield)]
     if opened.components_message:
         _warn_all_channels(opened, tf)
     names = opened.names or [""] * len(stats)
-    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(stats)]
+    rows = zip(opened.numbers, names, opened.colors, stats, strict=True)
+    return [_channel(k, name, color, its, tf, tf_range) for k, name, color, its in rows]
 
 
 def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
@@ -295,40 +292,18 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
         raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
-        f"{k}{f' {name!r}' if name else ''} #{hex_color(channel_color(k, color))}"
-        for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
+        f"{k}{f' {name!r}' if name else ''} #{hex_color(color)}"
+        for k, name, color in zip(opened.numbers, known, opened.colors, strict=True)
     ]
     warnings.warn(
         f"{opened.path}: {len(shown)} channels, all shown: {', '.join(shown)} (try --channel N for one)", stacklevel=4
     )
 
 
-def channel_color(number: int, color: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """Return the colour of a channel, RGB in [0, 1]: the file's, else the default for its number."""
-    return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
-
-
 def _white(opened: Content) -> float:
     """Return the data value that stands for a colour of 1."""
     kind = opened.volumes[0].data.dtype
     return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0
-
-
-def _overlapping(
-    opened: Content, labels: str | LabelTable, own_tables: bool, distance: str | None, access: Access
-) -> list[Layer]:
-    """Return overlapping layers (.seg.nrrd) or segments (DICOM), each under its own table, or all under one.
-
-    Empty ones are skipped.
-    """
-    found = []
-    for k, volume in enumerate(opened.volumes):
-        if any(access.labels(volume)):
-            table = segments_of(str(opened.path), k) if own_tables else labels
-            found.append(_labelled(volume, table, distance, access))
-    if not found:
-        raise DataError(f"{opened.path}: no label other than 0 in any layer; expected some to show")
-    return found
 
 
 def _labelled(
@@ -338,9 +313,33 @@ def _labelled(
     labels_there = access.labels(volume)
     if not any(labels_there) and not empty:
         raise DataError(f"{volume.name}: no label other than 0; expected some to show")
-    table = table_for(labels, labels_there, volume.name) if any(labels_there) else distinct(labels_there)
+    table = distinct(labels_there)
+    if any(labels_there):
+        table = table_for(labels, labels_there, volume.name, volume.segments)
     shows = any(label.opacity > 0 for label in table.labels)
     return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
+
+
+def told_apart(layers: Sequence[Layer], used: set[tuple[float, float, float]]) -> list[Layer]:
+    """Return layers of labels whose automatic colours are not ``used``, to which theirs are added.
+
+    A label without a name that is alone in its layer is called as its volume.
+    """
+    shown = []
+    for layer in layers:
+        if isinstance(table := layer.tf, LabelTable):
+            own = {label.color for label in table.structures}
+            free = (color for color in palette() if color not in used | own)
+            labels = []
+            for label in table.labels:
+                alone = table.structures == (label,) and label.name == default_name(label.number)
+                again = label.automatic and label.number and label.color in used
+                color, name = next(free, label.color) if again else label.color, layer.volume.name
+                labels.append(replace(label, color=color, name=name if alone else label.name))
+            table = replace(table, labels=tuple(labels))
+            used |= {label.color for label in table.structures}
+        shown.append(replace(layer, tf=table))
+    return shown
 
 
 def _luminance(stored: bool, *bands: Volume) -> Volume:
@@ -364,7 +363,7 @@ def _luminance(stored: bool, *bands: Volume) -> Volume:
 def _channel(
     number: int,
     name: str,
-    color: tuple[float, float, float] | None,
+    rgb: tuple[float, float, float],
     stats: Statistics,
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
@@ -372,7 +371,6 @@ def _channel(
     """Return the function of a channel: its colour with the given function's opacity, or a ramp over bright voxels."""
     from vvgt_cli.look.resolve import percentiles
 
-    rgb = channel_color(number, color)
     if tf is not None:
         shown = resolve(tf, stats, tf_range)
         lo, hi = shown.node_range()

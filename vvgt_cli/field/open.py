@@ -25,7 +25,6 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
-from vvgt_cli.look.label_files import holds_table
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
@@ -33,6 +32,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.label_maps import named_so
+from vvgt_cli.volume.medical.masks import mask_files
 from vvgt_cli.volume.readers import SCHEMES, STEPPED
 from vvgt_cli.volume.stored import Stored, is_file_backed, planes
 
@@ -44,7 +44,7 @@ MIN_BLOCKED = 1 << 30  # bytes of values: more are processed in blocks, with a t
 LARGE = 0.25  # share of the free memory: smaller files are always read whole
 PROGRAM, CELL_BYTES = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # a Zarr or N5 folder has one of these
-INDEXES = (".pvti", ".pvd", ".series")  # files that name other files
+INDEXES = (".pvti", ".pvd", ".series", ".xml")  # files that name other files
 PACKED = (
     ".h5",
     ".hdf5",
@@ -154,7 +154,7 @@ def _measured(request: SourceRequest) -> tuple[Volume, int | None]:
         read = replace(request.read, stored=True, packed=True)
         content = open_content(given, read)
         volume, layered = content.volumes[0], layered or not content.single_volume
-        layered |= request.tf is None and (holds_table(content.path) or named_so(volume))
+        layered |= request.tf is None and named_so(volume)
     else:
         volume = content_of(given).volumes[0]
     return volume, LAYERED_BYTES if layered else None
@@ -238,9 +238,8 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     shapes = level_shapes(path, read)
     if not shapes:
         if options.level is not None:
-            raise UsageError(
-                f"{path}: has no resolution levels; expected OME-Zarr, N5 or Imaris: omit --level {options.level}"
-            )
+            kinds = "OME-Zarr, N5, Imaris or BigDataViewer"
+            raise UsageError(f"{path}: has no resolution levels; expected {kinds}: omit --level {options.level}")
         return read, None
     if options.level is not None:
         return replace(read, level=0 if options.level == "full" else int(options.level)), None
@@ -294,7 +293,8 @@ def better_in_blocks(request: SourceRequest) -> bool:
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     index = os.path.isfile(place) and place.lower().endswith(INDEXES)
     away = path.partition(":")[0] in STEPPED
-    packed = away or zarr or h5 or tiff or index  # small files may hold many voxels
+    masks = mask_files(path)
+    packed = away or zarr or h5 or tiff or index or masks  # small files may hold many voxels
     size = sum(file.stat().st_size for file in files)
     if not packed and size < MIN_BLOCKED and (free is None or size <= LARGE * free):
         return False
@@ -303,7 +303,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     except SeveralComponents:  # reported when it is read
         return False
     volumes = content.volumes
-    if not all(map(is_file_backed, volumes)):
+    if not masks and not all(map(is_file_backed, volumes)):
         return False
     if sum(volume.data.nbytes for volume in volumes) >= MIN_BLOCKED:
         return True

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_plain, layers_of
+from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_plain, layers_of, told_apart
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels, palette_color
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
@@ -70,14 +70,14 @@ class SourceRequest:
 
 
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
-    """Parse a layer, ``FILE[,tf=TF][,labels=TABLE][,component=N]...``, or raise UsageError."""
-    path, *rest = re.split(r",(?=[a-z]+=)", text)
+    """Parse a layer, ``FILE[,tf=TF][,iso=LEVEL][,labels=TABLE][,component=N]...``, or raise UsageError."""
+    path, *rest = re.split(r",(?=[a-z]+=)", text.replace(",iso=", ",tf=iso:"))
     given: dict[str, Any] = {}
     for part in rest:
         key, _, value = part.partition("=")
-        if key not in KEYS or not value or (KEYS[key] is int and not value.isdecimal()):
+        if key not in KEYS or key in given or not value or (KEYS[key] is int and not value.isdecimal()):
             raise UsageError(
-                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in KEYS)}"
+                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in ('iso', *KEYS))}"
             )
         given["component" if key == "channel" else key] = KEYS[key](value)
     if not path:
@@ -297,15 +297,14 @@ def load_all(
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # report its errors first
-    lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     stats = content.statistics if reused else access.statistics(volume)
     sources = []
-    for tf, lighting in zip(functions, lights, strict=True):
+    for tf in functions:
         whole = request.statistics[0] if request.statistics else stats
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
-            shown = from_histogram(whole, volume.hounsfield, volume.density)
+            shown = from_histogram(whole, volume.hounsfield, volume.density, volume.preset)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
                 f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
@@ -316,6 +315,7 @@ def load_all(
             check_visible(shown, stats)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if reused else None
+        lighting = request.light.lighting(shown.lighting, volume.space)
         sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 
@@ -335,6 +335,10 @@ def _layered(
                 f"{name}: {error.steps} time steps; expected one per layer: --layer FILE,time=N (0 to {last})"
             ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
+    if request.layers:  # a frame's labels keep their looks: colours of its whole series are in use
+        frames = bool(request.statistics) and isinstance(layers[0].tf, LabelTable)
+        used = {palette_color(n + 1) for n in range(int(request.statistics[0].hi) if frames else 0)}
+        layers = [*layers[:frames], *told_apart(layers[frames:], used)]
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
     stats = access.statistics(layers[0].volume)
     _check_seen(layers, access, len(request.statistics))

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write, check_disk_space, check_target, claim, is_stream
@@ -34,6 +35,11 @@ class Output:
     suffixes: tuple[str, ...] = ()
     binary: bool = True
     splats: bool = False
+
+    @classmethod
+    def of(cls, option: str, path: str | os.PathLike[str] | None, *how: Any, **more: Any) -> list[Output]:
+        """Return a list of the output, empty without a path; the arguments are the attributes."""
+        return [] if path is None else [cls(option, os.fspath(path), *how, **more)]
 
 
 def _check_one(output: Output, overwrite: bool) -> None:
@@ -98,7 +104,15 @@ def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: 
         yield
 
 
-def write_text(path: str, text: str, overwrite: bool) -> None:
+def check_folder(folder: Path, content: str) -> None:
+    """Raise UsageError unless a folder for ``content`` is there or can be made."""
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a directory for the {content}")
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: no directory {folder.parent}; make it first")
+
+
+def write_text(path: str | os.PathLike[str], text: str, overwrite: bool) -> None:
     """Write text to a file, atomically, or to standard output."""
     if path == STDOUT:
         sys.stdout.write(text)

@@ -12,7 +12,7 @@ from contextlib import suppress
 
 FOREIGN = ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH")  # of a program's own Python: ours does not start with them
 ERROR = "vvgt: error: "
-ENDED = "vvgt: ended: "  # a status, as vvgt_cli/cli/main.py says of each of several commands
+ENDED = "vvgt: ended: "  # a status, as vvgt_cli/commands/main.py says of each of several commands
 
 
 def command() -> list[str]:

@@ -24,7 +24,7 @@ F = TypeVar("F", bound=Callable[..., Any])  # a kernel is called as the function
 def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any) -> Callable[[F], F]:
     """Compile a function that Python calls: in another process, to be loaded from disk.
 
-    It runs without the interpreter's lock, so that a signal is answered meanwhile (`vvgt_cli.cli.process`).
+    It runs without the interpreter's lock, so that a signal is answered meanwhile (`vvgt_cli.commands.process`).
 
     Args:
         usual: types of the arguments as commands pass them: "f4:2 i8" is a C-contiguous float32 array of two axes and

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.result import Conversion, Result
+from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
-    FunctionLike,
     Goal,
     GoalLike,
-    LabelsLike,
-    LightLike,
     LookLike,
     LooksLike,
     PathLike,
     Reading,
     VolumeLike,
+    blocks_of,
     console_of,
-    function_of,
-    labels_of,
-    light_of,
     looks_of,
-    ply_of,
     source_of,
     volume_of,
     with_look,
@@ -37,9 +31,7 @@ from vvgt_cli.volume import Volume
 if TYPE_CHECKING:
     import numpy as np
 
-    from vvgt_cli.commands.evaluate import Evaluation
     from vvgt_cli.conversion.clouds import Clouds
-    from vvgt_cli.field.settings import BlockOptions
 
 
 def convert(
@@ -90,17 +82,11 @@ def convert(
         raise UsageError("after: expected the result of convert for one volume and look")
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
-    request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live, editor=not live)
+    request = replace(Goal.of(goal).request(source), blocks=blocks_of(blocks), live=live, editor=not live)
     requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, as_clouds=several, split_labels=split_labels, after=after, console=console_of(progress)
     )
-
-
-def _blocks(blocks: int | str | None) -> BlockOptions | None:
-    from vvgt_cli.field.settings import BlockOptions
-
-    return None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
@@ -173,128 +159,3 @@ def render_views(
     scene = source.scene()
     draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
-
-
-def evaluate(
-    ply: PathLike | Result,
-    volume: VolumeLike,
-    look: LookLike = None,
-    *,
-    size: int | None = None,
-    rule: str | None = None,
-    step: float = 0.125,
-    conditions: bool = True,
-    target: str | None = None,
-    blocks: int | str | None = None,
-    progress: bool = False,
-    **reading: Unpack[Reading],
-) -> Evaluation:
-    """Score a ``.ply``, or a result, against its volume: ``vvgt evaluate``.
-
-    Args:
-        ply: path, or result of `convert` or `optimize`.
-        volume: as in `convert`.
-        look: as in `convert`.
-        size: pixels along the edge of pictures; None: the file's.
-        rule: drawing rule; None: the file's.
-        step: step of the reference, in voxels.
-        conditions: also score every rule at several sizes and close up.
-        target: device to score it on, as ``--for``.
-        blocks: as in `convert`.
-        progress: print messages and bars on standard error.
-
-    Raises:
-        DataError, UsageError: see `convert`.
-    """
-    from vvgt_cli.commands import evaluate as pipeline
-
-    source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(
-        ply_of(ply), source, size, rule, step, conditions, _blocks(blocks), target=target
-    )  # fmt: skip
-    return pipeline.evaluate(request, console_of(progress))
-
-
-def recolor(
-    ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
-    labels: LabelsLike | None = None, light: LightLike = None, layers: Mapping[int | str, Any] | None = None,
-) -> Result:  # fmt: skip
-    """Show a live ``.ply`` under another function, without its volume: ``vvgt recolor``.
-
-    Args:
-        ply: path of a file of ``vvgt convert --live``.
-        look: a function as in `Look`; None: the file's own.
-        range: as in `Result.recolor`.
-        unit_distance: as in `Result.recolor`.
-        labels: for a label map, a table as in `Look`; None: the file's own.
-        light: as in `Look`; None: that of the function's file, else that of the file.
-        layers: for several layers or channels, functions or label tables by number or name.
-
-    Returns:
-        Ordinary Gaussians.
-
-    Raises:
-        DataError: the Gaussians carry no values, or the function shows nothing of them.
-        UsageError: an invalid range, distance or light.
-    """
-    from vvgt_cli.conversion.gaussian_files import layout_of
-    from vvgt_cli.score.record import ConversionReport
-
-    gaussians, header = read_ply(ply)
-    result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
-    distance = None if unit_distance is None else str(unit_distance)
-    return result.recolor(
-        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light),
-        layers=layers,
-    )  # fmt: skip
-
-
-def optimize(
-    ply: PathLike | Result,
-    views: PathLike,
-    *,
-    steps: int | None = None,
-    time_budget: float | None = None,
-    target_psnr: float | None = None,
-    method: str = "frame",
-    max_gaussians: int | None = None,
-    size: int | None = None,
-    rule: str | None = None,
-    sh_degree: int | None = None,
-    seed: int = 0,
-    progress: bool = False,
-) -> Result:
-    """Refine Gaussians by gradient descent on views: ``vvgt optimize``.
-
-    Args:
-        ply: path, or result of `convert`.
-        views: folder of ``vvgt render-views``.
-        steps: number of steps, of one view each; or give ``time_budget``.
-        time_budget: seconds; or give ``steps``.
-        target_psnr: dB on the check views at which to stop.
-        method: "frame", "adam" or "3dgs".
-        max_gaussians: maximal number of Gaussians, for "3dgs".
-        size: pixels along the edge of the target screen; None: the file's.
-        rule: drawing rule; None: the file's.
-        sh_degree: degree of the spherical harmonics that are refined, 0 to 3; None: the file's.
-        seed: seed of the order of views.
-        progress: print messages and bars on standard error.
-
-    Returns:
-        The best Gaussians by the check views.
-
-    Raises:
-        DataError: an invalid ``.ply`` or folder of views.
-        UsageError: both of steps and time_budget, or neither.
-    """
-    from vvgt_cli.commands.optimize import OptimizeRequest, budget, optimized
-    from vvgt_cli.refine import OptimizeOptions
-    from vvgt_cli.score.record import ConversionReport, Run
-
-    how = OptimizeOptions.of(
-        method, max_gaussians=max_gaussians, target_psnr=target_psnr, seed=seed, **budget(steps, time_budget)
-    )
-    run = Run(console_of(progress), ConversionReport("optimize"))
-    result = optimized(run, OptimizeRequest(ply_of(ply), os.fspath(views), None, how, size, rule, sh_degree))
-    run.finish()
-    return result

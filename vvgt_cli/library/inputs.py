@@ -12,17 +12,21 @@ from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 import numpy as np
 
 from vvgt_cli.conversion.index import function_name
+from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, open_content
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
+from vvgt_cli.look.isosurfaces import with_levels
 from vvgt_cli.look.label_files import table_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.arrays.beside import Neighbour, with_neighbours
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
 from vvgt_cli.volume.labelled import axis, labelled_volume
@@ -31,7 +35,7 @@ from vvgt_cli.volume.stored import Stored
 
 PathLike = str | os.PathLike[str]
 VolumeLike: TypeAlias = "PathLike | Volume | Content | ReadAlready | ArrayLike | VtkImage"
-LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
+LightLike = LightOptions | Mapping[str, Any] | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
@@ -66,30 +70,45 @@ class VtkImage(Protocol):
 
 @dataclass(frozen=True)
 class Look:
-    """A look: function, light, labels and layers of a volume.
+    """A look: function, light, labels and layers of a volume, named as the options of commands.
 
     Attributes:
-        function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`;
-            None chooses one from the data.
-        range: "data", "rescale" or (lo, hi): position of the function's nodes.
-        unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
-        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: that
-            of the function or label table (of the first layer), which presets such as ct-bone have.
+        tf: function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a
+            `TransferFunction`; None chooses one from the data.
+        tf_range: "data", "rescale" or (lo, hi): position of the function's nodes.
+        opacity_unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
+        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions` or a mapping
+            of their attributes; None: that of the function or label table (of the first layer), as presets such as
+            ct-bone have.
         labels: table of a label map: a file, a mapping {label: {"name", "color", "opacity"}}, "auto" or "none".
         layers: volumes overlaid on it: values of ``--layer``, or `SourceRequest`.
+        iso: a level of an isosurface or several, as values of ``--iso``, in place of ``tf``.
     """
 
-    function: FunctionLike | None = None
-    range: str | Sequence[float] = "data"
-    unit_distance: str | float | None = None
+    tf: FunctionLike | None = None
+    tf_range: str | Sequence[float] = "data"
+    opacity_unit_distance: str | float | None = None
     light: LightLike = None
     labels: LabelsLike | None = None
     layers: Sequence[LayerLike] = ()
+    iso: float | str | Sequence[float | str] = ()
 
     @classmethod
     def of(cls, look: LookLike) -> Look:
         """Return a look as it is, or one with a function alone."""
         return look if isinstance(look, Look) else cls(look)
+
+    def asked(self) -> dict[str, Any]:
+        """Return all but the layers, as attributes of a request; raise DataError for an invalid function or table."""
+        distance = self.opacity_unit_distance
+        levels: Sequence[object] = [self.iso] if isinstance(self.iso, str | float | Real) else list(self.iso)
+        return {
+            "tf": with_levels(function_of(self.tf), levels, self.labels),
+            "tf_range": self.tf_range if isinstance(self.tf_range, str) else _numbers(self.tf_range),
+            "unit_distance": None if distance is None else str(distance),
+            "light": light_of(self.light),
+            "labels": labels_of(self.labels),
+        }
 
 
 LookLike = Look | FunctionLike | None
@@ -114,7 +133,7 @@ def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
         alone: Any = look  # mypy takes a str for a sequence
         return {"": Look.of(alone)}, False
     looks = [Look.of(one) for one in look]
-    names = [_name_of(one.function) for one in looks]
+    names = [_name_of(one.tf) for one in looks]
     if not names or len(set(names)) < len(names):
         stated = ", ".join(dict.fromkeys(names)) or "none"
         raise UsageError(
@@ -185,9 +204,10 @@ class Reading(TypedDict, total=False):
     header_bytes: int
     spacing: Sequence[float]
     array: str
-    component: int | str
+    component: int | str | Sequence[int | str]
     time: int
     space: str
+    suv: str
     crop: str
     mask: Any
     keep_largest: float
@@ -252,6 +272,8 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
+    if isinstance(parts := given.get("component"), list | tuple):
+        given["component"] = parts[0] if len(parts) == 1 else ",".join(map(str, parts))
     if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
         mask = given["mask"]
         if isinstance(mask, os.PathLike):
@@ -282,15 +304,18 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look; errors are those of `function_of`."""
-    return replace(
-        source,
-        tf=function_of(look.function),
-        tf_range=look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range),
-        unit_distance=None if look.unit_distance is None else str(look.unit_distance),
-        light=light_of(look.light),
-        labels=labels_of(look.labels),
-        layers=tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x)) for x in look.layers),
-    )
+    space = source.read.space
+    layers = tuple(x if isinstance(x, SourceRequest) else parse_layer(os.fspath(x), space) for x in look.layers)
+    return replace(source, **look.asked(), layers=layers)
+
+
+def live_look(look: Look) -> FunctionRequest | None:
+    """Return the request for live Gaussians under a look, with layers as ``--layer`` of `recolor` has them.
+
+    It is None where nothing is asked for; errors as above.
+    """
+    asked = FunctionRequest(**look.asked(), layers=tuple(map(parse_layer_look, map(str, look.layers))))
+    return None if asked == FunctionRequest() else asked
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
@@ -304,15 +329,20 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
 
 
 def light_of(light: LightLike) -> LightOptions:
-    """Return light options as they are, or made from a name, three numbers, or several of these."""
-    if isinstance(light, LightOptions):
-        return light
+    """Return light options as they are, or made from their attributes, a name, three numbers, or several of these."""
+    if isinstance(light, LightOptions | Mapping):
+        return light if isinstance(light, LightOptions) else LightOptions(**light)
     if light is None or isinstance(light, str):
         return LightOptions(() if light is None else (light,))
     lights: list[Any] = list(light)
     if all(isinstance(one, Real) for one in lights):
         lights = [lights]
-    return LightOptions(tuple(p if isinstance(p, str) else ",".join(repr(float(v)) for v in p) for p in lights))
+    return LightOptions(tuple(p if isinstance(p, str) else _numbers(p) for p in lights))
+
+
+def _numbers(values: Sequence[float]) -> str:
+    """Return numbers as options have them."""
+    return ",".join(repr(float(v)) for v in values)
 
 
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:
@@ -324,9 +354,16 @@ def ply_of(ply: PathLike | Result) -> str | BinaryIO:
     return os.fspath(ply)
 
 
-def console_of(progress: bool) -> Console:
-    """Return a console that prints messages and bars, or is silent."""
-    return Console(quiet=not progress)
+def console_of(progress: bool | Console) -> Console:
+    """Return a console that prints messages and bars, or is silent; that of the command line as it is."""
+    return progress if isinstance(progress, Console) else Console(quiet=not progress)
+
+
+def blocks_of(blocks: int | str | BlockOptions | None) -> BlockOptions | None:
+    """Return a caller's options of blocks: the voxels along an edge, "auto", or all options as they are."""
+    if blocks is None or isinstance(blocks, BlockOptions):
+        return blocks
+    return BlockOptions(None if isinstance(blocks, str) else blocks)
 
 
 def volume_in_memory(
@@ -376,14 +413,20 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
     """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
-    axes = []
+    axes, stated = [], dict(data.coords)  # `data.coords.get` makes up numbers
     for dim, size in zip(data.dims, data.shape, strict=True):
-        coordinate = data.coords.get(dim)
+        coordinate = stated.get(dim)
         centres = None
         if coordinate is not None and coordinate.dtype.kind in "iuf":
             centres = np.asarray(coordinate.values, np.float64)
         axes.append(axis(str(dim), size, centres, getattr(coordinate, "attrs", None)))
     label = str(data.name or name)
+    beside = {
+        str(key): Neighbour.of(one.shape, lambda one=one: (one.values, one.attrs), str(one.dims[0]))
+        for key, one in stated.items()
+        if one.ndim == 1
+    }
+    axes = with_neighbours(axes, beside, label, options.spacing is not None)
     if data.chunks is None:
         return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
     read = Chunks(data.data, label)
@@ -393,7 +436,7 @@ def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
 
 
 def _array(values: Any, options: ReadOptions, origin: Sequence[float] | None, affine: Any, name: str) -> Volume:
-    chosen = [key for key in ("array", "component", "time") if getattr(options, key) is not None]
+    chosen = [key for key in ("array", "component", "time", "suv") if getattr(options, key) is not None]
     _refuse([*chosen, *options.raw_flags], "an array is one volume")
     if affine is not None and (options.spacing is not None or origin is not None):
         raise UsageError("affine: holds spacing and origin too; leave out those or the affine")

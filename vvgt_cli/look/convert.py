@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS
 from vvgt_cli.look.resolve import BY
 
@@ -51,6 +52,8 @@ def _minimal(tf: TransferFunction) -> dict[str, Any]:
         what = "midpoints, sharpness or a logarithmic scale"
         raise _refuse(tf, what, "the minimal format", "try --format paraview")
     body: dict[str, Any] = {"name": tf.name}
+    if isinstance(tf, Isosurfaces):
+        return body | {"iso": list(tf.texts)}
     if tf.domain in BY:
         body["range"] = tf.domain
     body["points"] = _points(tf)

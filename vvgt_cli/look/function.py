@@ -15,7 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.volume.types import triple
 
-DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma")
+DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma", "mean", "level")
 PER_VOXEL = "mean-spacing"  # as --opacity-unit-distance calls it
 SPACES = ("RGB", "HSV", "Lab", "Prolab", "Diverging", "Lab/CIEDE2000", "Step")  # ParaView's ColorSpace
 PATH_SAMPLES = 1025  # colours, of 8 bits a channel, by which a CIEDE2000 path between two nodes is kept
@@ -237,8 +237,9 @@ class TransferFunction:
             without a distance: opacities are per mean edge of a voxel.
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
         domain: meaning of the node positions: ``data`` values; a ``fraction`` in [0, 1] of the data range; a
-            ``percentile`` / 100 of the voxels, or of those in the ``foreground``; or ``sigma``, standard deviations
-            above the mean. `vvgt_cli.look.resolve.resolve` turns all into data values.
+            ``percentile`` / 100 of the voxels, or of those in the ``foreground``; ``sigma``, standard deviations above
+            the mean; ``mean``, multiples of the mean of the foreground above 0; or ``level``, of `Isosurfaces`.
+            `vvgt_cli.look.resolve.resolve` turns all into data values.
         lighting: requested by the source, None if it requests none.
         otherwise: the function for data that are not in Hounsfield units, if this one is for those.
 
@@ -264,13 +265,13 @@ class TransferFunction:
         if distance is not None and not (math.isfinite(distance) and distance > 0):
             raise DataError(f"{self.name}: opacity unit distance {distance}; expected a positive number")
         lo, hi = self.node_range()
-        if self.domain not in ("data", "sigma") and not 0 <= lo <= hi <= 1:
+        if self.domain in ("fraction", "percentile", "foreground") and not 0 <= lo <= hi <= 1:
             raise DataError(f"{self.name}: nodes in [{lo:g}, {hi:g}]; expected x in [0, 1] for a {self.domain}")
 
     @property
     def of_histogram(self) -> bool:
         """Return whether the node positions depend on the histogram, not on the range of the data alone."""
-        return self.domain in ("percentile", "foreground", "sigma") or self.otherwise is not None
+        return self.domain not in ("data", "fraction") or self.otherwise is not None
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,); 0 at NaN."""

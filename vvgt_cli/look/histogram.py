@@ -16,7 +16,7 @@ from vvgt_cli.volume.stats import Statistics
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"
-CONTOUR = "automatic ({})"  # of densities: the named function
+CONTOUR = "automatic ({})"  # of densities, smoke and fire: the named function
 BOTH = 0.5  # depth of the negative side of a density, of that of the positive one, from which it is shown too
 UNIT_SHARE = 1 / 256  # of the box's longest edge: what opacities are per, so that they do not depend on voxels or units
 SIDE_WIDTH = 0.125  # share of the value range that it must span: less is padding or clipping
@@ -48,20 +48,22 @@ TISSUES = (
 )
 
 
-def from_histogram(statistics: Statistics, hounsfield: bool = False, density: bool = False) -> TransferFunction:
+def from_histogram(
+    statistics: Statistics, hounsfield: bool = False, density: bool = False, preset: str = ""
+) -> TransferFunction:
     """Return a transfer function chosen from the histogram; deterministic.
 
-    Densities get contours at standard deviations above the mean, and below it if they reach nearly as far down
-    (`contours`). Hounsfield units (stated, or air near -1000 and tissue around 0) get `TISSUES`. For other values the
-    peak with most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977) on each side
-    that leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too. Every
-    other value contributes to an optical depth of `DEPTH`, by the square of its distance from the background, however
-    many voxels hold it: common values are thin, rare ones dense. Data without a dominant peak are shown whole.
+    Densities get `contours`, smoke and fire the functions of these names. Hounsfield units (stated, or air near -1000
+    and tissue around 0) get `TISSUES`. For other values the peak with most voxels is background: its foot is found by
+    the triangle method (Zack, Rogers, Latt 1977) on each side that leads to more data; a second dominant peak right
+    behind it (air behind narrow padding) is skipped too. Other values share an optical depth of `DEPTH` by the square
+    of their distance from it, however many voxels hold them. Data without a dominant peak are shown whole.
 
     Args:
         statistics: range and histogram of the data.
         hounsfield: whether the file states that data values are Hounsfield units.
         density: whether it is a map of densities.
+        preset: name of the function for such data, "" if unknown.
 
     Returns:
         The function on data values, opacity per `UNIT_SHARE`, named `NAME`, `HOUNSFIELD` or `CONTOUR`.
@@ -76,11 +78,10 @@ def from_histogram(statistics: Statistics, hounsfield: bool = False, density: bo
         raise DataError("the data have no finite voxel; expected some to choose a transfer function from")
     if lo == hi:  # a box, seen through
         return _function(NAME, np.array([lo]), np.array([FAINT]), ColorMap(np.array([lo]), COLORS[3:4], space="Lab"))
-    if density:
-        name = contours(counts, edges)
-        shown = replace(
-            resolve(named_function(name), statistics), name=CONTOUR.format(name), opacity_unit_label="automatic"
-        )
+    if density or preset:
+        name = preset or contours(counts, edges)
+        shown = resolve(named_function(name), statistics)
+        shown = replace(shown, name=CONTOUR.format(name), opacity_unit_label="automatic")
         if shown.support(lo, hi):
             return shown
     if hounsfield or in_hounsfield(counts, edges):

@@ -5,15 +5,20 @@
 - CSV and TSV: a row of names of columns (`COLUMNS`), as 3D Slicer 5.9, FastSurfer and BIDS (dseg.tsv) write them.
 - ITK-SNAP: `number R G B A VIS MSH "name"`, colours 0 to 255, A in [0, 1], VIS 0 or 1.
 - .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
-- DICOM SEG: segment numbers, labels and recommended CIELab colours, else distinct ones.
-- JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc".
+- DICOM SEG: segment numbers, labels and recommended CIELab colours.
+- JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc". Names alone:
+  `{"1": "liver"}` or `{"liver": 1}`, also under "labels" (dataset.json of nnU-Net, whose regions are lists of numbers,
+  and of the Medical Segmentation Decathlon) or by name in a map of such maps (TotalSegmentator).
+- ParaView: categorical presets with `IndexedColors` and `Annotations` [value, name, ...].
 
-Groups of labels come from coded terms or, in JSON, from "parents" (`vvgt_cli.look.terms`).
+Labels without a colour get distinct ones. Groups of labels come from coded terms or, in JSON, from "parents" and
+regions (`vvgt_cli.look.terms`).
 """
 
 from __future__ import annotations
 
 import csv
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -22,11 +27,17 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct
-from vvgt_cli.look.readers.fields import json_of, number, rgb, text_of
-from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, codes_of_tags, parents_of
+from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct, palette_color
+from vvgt_cli.look.readers import slicer
+from vvgt_cli.look.readers.fields import json_of, number, rgb, table, text_of
+from vvgt_cli.look.readers.paraview import choose
+from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, parents_of
+from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.dicom import segmentation as dicom
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
-from vvgt_cli.volume.dicom.segmentation import segments as dicom_segments
+from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.medical import nrrd
+from vvgt_cli.volume.segments import MAX_NUMBER, Segment
 
 SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
 SEPARATED = (".csv", ".tsv")
@@ -41,12 +52,10 @@ COLUMNS = {  # names of columns in lower case; the first whose cell is not empty
     "color": ("color", "colour"),
 }
 NAMELESS = ("index", "name", "r", "g", "b", "a")
-MAX_NUMBER = 2**31  # of a label
-HEADER = 2**20  # bytes of a .seg.nrrd that are looked at
 EXPECTED = (
     "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .csv or .tsv "
     "(index, name, R, G, B or color), .seg.nrrd, "
-    'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
+    'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}, {"1": name} or {name: 1}'
 )
 _INTEGER, _DECIMAL = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
 # place for errors, label, name, colour in [0, 1], A / 255 or None, whether it is switched on, codes
@@ -68,9 +77,9 @@ def is_table(path: Path) -> bool:
         return suffix in TABLES
     try:
         text = text_of(path, "a table of labels")
-        if text.lstrip().startswith("{"):
-            parsed = json_of(text, path, "a table of labels")
-            return bool(parsed) and all(_INTEGER.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
+        if text.lstrip().startswith(("{", "[")):
+            parsed = json_of(text, path)
+            return not ('"RGBPoints"' in text or slicer.matches(parsed)) and bool(table_of(parsed, str(path)))
     except DataError:
         return False
     rows = (line.strip() for line in text.splitlines())
@@ -78,19 +87,28 @@ def is_table(path: Path) -> bool:
     return bool(_SNAP.fullmatch(first) or _plain(first))
 
 
-def table_for(labels: str | LabelTable, numbers: Sequence[int], where: str) -> LabelTable:
-    """Return the table of a volume's labels, ascending ``numbers``: read from a file, or ``auto``, or one that is read.
+def table_for(
+    labels: str | LabelTable, numbers: Sequence[int], where: str, segments: Sequence[Segment] | None = None
+) -> LabelTable:
+    """Return the table of a volume's labels, ascending ``numbers``: read from a file, or one that is read, or ``auto``.
+
+    ``auto`` takes the names and colours of ``segments``, and distinct colours for what they leave out.
 
     Raises:
         DataError: the table does not match the labels; see `read_labels`, too.
         UsageError: no such file.
     """
     if labels == AUTO:
-        return distinct(numbers)
-    table = read_labels(labels) if isinstance(labels, str) else labels
-    if table is not labels:
-        table.warn_hidden(numbers, where)
-    return table.restricted_to(numbers, where)
+        own = {one.number: one for one in labels_of(segments or (), where)}
+        auto = distinct([n for n in numbers if n or not own])
+        if own and (missing := [n for n in numbers if n and n not in own]):
+            text = f"{where}: its header does not name labels {listed(missing, ', ')}; they get distinct colours"
+            warnings.warn(text, stacklevel=2)
+        return replace(auto, name=where if own else auto.name, labels=tuple(own.get(e.number, e) for e in auto.labels))
+    given = read_labels(labels) if isinstance(labels, str) else labels
+    if given is not labels:
+        given.warn_hidden(numbers, where)
+    return given.restricted_to(numbers, where)
 
 
 def read_labels(source: str) -> LabelTable:
@@ -100,37 +118,29 @@ def read_labels(source: str) -> LabelTable:
         UsageError: no such file.
         DataError: not a table of labels, or a faulty one.
     """
-    path = Path(source)
+    path, pick = Path(source), ""
+    if not path.is_file() and "#" in source:
+        source, _, pick = source.rpartition("#")
+        path = Path(source)
     if not path.is_file():
         raise UsageError(f"--labels {source}: no such file; {EXPECTED}, or auto, or none")
     with path.open("rb") as stream:
-        head = stream.read(HEADER)
+        head = stream.read(8)
     if is_segmentation_file(source):
-        return _table(_dicom(source), source)
-    if not head.startswith(b"NRRD") and (text := text_of(path, "a table of labels")).lstrip().startswith(("{", "[")):
-        return table_of(json_of(text, path, "a table of labels"), str(path))
-    if head.startswith(b"NRRD"):
-        found = _segments(head.partition(b"\n\n")[0].decode("utf-8", "replace"), str(path))
-    else:
-        found = (_separated if path.suffix.lower() in SEPARATED else _lines)(text, path)
-    return _table(found, str(path))
+        return _table(labels_of(dicom.segments(source), source), source)
+    if head.removeprefix(MARK).startswith(b"NRRD"):
+        return _table(labels_of(nrrd.segments(nrrd.read_header(path)[0]), source), source)
+    if (text := text_of(path, "a table of labels")).lstrip().startswith(("{", "[")):
+        return table_of(json_of(text, path, "a table of labels"), str(path), pick)
+    if pick:
+        raise DataError(f"{path}: holds one table; omit #{pick}")
+    return _table((_separated if path.suffix.lower() in SEPARATED else _lines)(text, path), str(path))
 
 
-def segments_of(source: str, layer: int) -> LabelTable:
-    """Read the segments of one layer of an overlapping .seg.nrrd, or one segment of a DICOM SEG (a layer each).
-
-    The label numbers are those of the layer.
-
-    Raises:
-        DataError: no segment in this layer, or faulty ones.
-    """
-    if is_segmentation_file(source):
-        own = sorted((label for label in _dicom(source) if label.number), key=lambda label: label.number)
-        return replace(_table(own[layer : layer + 1], source), name=f"{Path(source).name} segment {layer}")
-    with Path(source).open("rb") as stream:
-        head = stream.read(HEADER).partition(b"\n\n")[0].decode("utf-8", "replace")
-    found = _table(_segments(head, source, layer), f"{source}: layer {layer}")
-    return replace(found, name=f"{Path(source).name} layer {layer}")
+def table_beside(source: str | None) -> str | None:
+    """Return the dataset.json of nnU-Net or the Medical Segmentation Decathlon beside or above a file, if it fits."""
+    files = [folder / "dataset.json" for folder in Path(source).absolute().parents[:2]] if source else []
+    return next((os.path.relpath(file) for file in files if file.is_file() and is_table(file)), None)
 
 
 def _table(found: list[Label], what: str) -> LabelTable:
@@ -186,14 +196,12 @@ def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label
     channels = [v * 255 for row in rows for v in row[3] or ()]
     if channels and max(channels) <= 1 and any(v % 1 for v in channels):
         raise DataError(f"{path}: no colour above 1; expected red, green and blue from 0 to 255")
-    colors: dict[int, Any] = {}
     if blank := [row[1] for row in rows if row[3] is None]:
         warnings.warn(f"{path.name}: {len(blank)} labels have no colour; given distinct ones", stacklevel=2)
-        colors = {label.number: list(label.color) for label in distinct(sorted(set(blank))).labels}
     found = []
     for here, value, name, color, last, shown, codes in rows:
         alpha = 0.0 if not value else SOLID if last is None else last if opacity else 1 - last
-        found.append(_label(here, value, name, color or colors[value], alpha, shown, codes))
+        found.append(_label(here, value, name, color, alpha, shown, codes))
     return found
 
 
@@ -238,66 +246,89 @@ def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
     return words[0], name, words[-many:][:3], float(words[-1]) / 255 if many == 4 else None
 
 
-def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
-    """Read the segments in a NRRD header, of one layer or of all."""
-    segments: dict[str, dict[str, str]] = {}
-    for index, key, value in re.findall(r"^Segment([0-9]{1,9})_(\w+):=(.*)$", header, re.M):
-        segments.setdefault(index, {})[key] = value.strip()
+def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
+    """Return the table in a parsed JSON file, or raise DataError; ``pick`` names one of several in it."""
+    presets = parsed if isinstance(parsed, list) else [parsed]
+    if presets and all(isinstance(one, dict) and "IndexedColors" in one for one in presets):
+        return _table(_annotated(presets, what, pick), what)
+    parsed = parsed.get("labels", parsed) if isinstance(parsed, dict) else parsed  # dataset.json
+    if not isinstance(parsed, dict):
+        raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
+    nested = all(one and isinstance(one, dict) and not _INTEGER.fullmatch(key) for key, one in parsed.items())
+    tables = parsed if nested and parsed else {"": parsed}  # TotalSegmentator's maps by name
+    if pick not in tables and (pick or len(tables) > 1):
+        raise DataError(f"{what}: {pick!r}; expected FILE#NAME with one of {', '.join(tables)[:200] or 'no names'}")
+    found, regions = list[Label](), dict[str, list[int]]()
+    for key, entry in (tables[pick] if pick in tables else next(iter(tables.values()))).items():
+        numbers = entry if isinstance(entry, list) else [entry]
+        if _INTEGER.fullmatch(key) and isinstance(entry, dict | str):
+            found.append(_entry(f"{what}: label {key}", int(key), {"name": entry} if isinstance(entry, str) else entry))
+        elif numbers and all(type(one) is int for one in numbers):
+            regions[key] = numbers
+        else:
+            raise DataError(f"{what}: {key[:40]!r}; {EXPECTED}")
+    return _table(found + _of_regions(regions, what), what)
+
+
+def _entry(here: str, value: int, entry: dict[str, Any]) -> Label:
+    """Return the label of an entry of a JSON table, or raise DataError."""
+    color = entry.get("color")
+    color = _hex(color) or color if isinstance(color, str) else color
+    opacity = number(f"{here}: opacity", entry.get("opacity", SOLID if value else 0.0))
+    groups, shown = entry.get("parents", []), entry.get("visible", True)
+    groups = [groups] if isinstance(groups, str) else groups
+    if not isinstance(groups, list) or not all(isinstance(one, str) and one for one in groups):
+        raise DataError(f"{here}: parents {str(groups)[:40]!r}; expected names of groups: [..., ...]")
+    if not isinstance(shown, bool):
+        raise DataError(f"{here}: visible {str(shown)[:40]!r}; expected true or false")
+    label = _label(here, value, str(entry.get("name", "")), color, opacity, shown)
+    return replace(label, parents=tuple(one[:MAX_NAME] for one in groups)) if groups else label
+
+
+def _of_regions(regions: dict[str, list[int]], what: str) -> list[Label]:
+    """Return the labels of names and numbers, of which a region of nnU-Net has several: {"whole": [1, 2], "core": [2]}.
+
+    A label is called as the smallest region that it is in, and is in the groups of the larger ones. Raise DataError for
+    two names of one number.
+    """
     found = []
-    for index, segment in segments.items():
-        if layer is not None and segment.get("Layer", "0") != str(layer):
-            continue
-        color, label = segment.get("Color", "").split(), segment.get("LabelValue", str(int(index) + 1))
-        if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
-            raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
-        name = segment.get("Name", segment.get("ID", ""))
-        codes = codes_of_tags(segment.get("Tags", ""))
-        found.append(_label(f"{what}: segment {index}", int(label), name, list(map(float, color)), SOLID, codes=codes))
+    for one in sorted({one for numbers in regions.values() for one in numbers}):
+        *groups, name = sorted((key for key in regions if one in regions[key]), key=lambda key: -len(regions[key]))
+        if groups and len(regions[groups[-1]]) == 1:
+            raise DataError(f"{what}: label {one} is {name[:40]!r} and {groups[-1][:40]!r}; expected one name")
+        label = _label(f"{what}: label {one}", one, name, None, SOLID if one else 0.0)
+        found.append(replace(label, parents=tuple(groups)) if groups else label)
     return found
 
 
-def _dicom(source: str) -> list[Label]:
-    """Read the segments of a DICOM segmentation; 0 is the background."""
-    found = dicom_segments(source)
-    colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
-    labels = []
-    for one in found:
-        color, opacity = list(one.color or colors[one.number]), SOLID if one.number else 0.0
-        labels.append(_label(source, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
-    return labels
+def _annotated(presets: list[dict[str, Any]], what: str, pick: str) -> list[Label]:
+    """Return the labels of a categorical preset of ParaView, or raise DataError.
+
+    ``Annotations`` are value, name, value, name, ...; ``IndexedColors`` (r, g, b, ...) are theirs in turn.
+    """
+    preset = choose(presets, what, pick)
+    words, colors = preset.get("Annotations"), table(f"{what}: IndexedColors", preset["IndexedColors"], 3, "r, g, b")
+    if not isinstance(words, list) or not words or not all(_INTEGER.fullmatch(str(one)) for one in words[::2]):
+        raise DataError(f"{what}: no Annotations with numbers of labels; expected [number, name, number, name, ...]")
+    pairs = enumerate(zip(words[::2], words[1::2], strict=False))
+    shown = [(int(value), {"name": str(name), "color": colors[k % len(colors)].tolist()}) for k, (value, name) in pairs]
+    return [_entry(f"{what}: label {value}", value, entry) for value, entry in shown]
 
 
-def table_of(parsed: Any, what: str) -> LabelTable:
-    """Return the table in a parsed JSON file, or raise DataError."""
-    if not isinstance(parsed, dict):
-        raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
+def labels_of(segments: Sequence[Segment], what: str) -> list[Label]:
+    """Return the labels of segments; 0 is the background unless its opacity is stated."""
     found = []
-    for key, entry in parsed.items():
-        if not re.fullmatch(r"-?\d{1,10}", key) or not isinstance(entry, dict):
-            raise DataError(f"{what}: {key[:40]!r}; {EXPECTED}")
-        color = entry.get("color")
-        color = _hex(color) or color if isinstance(color, str) else color
-        opacity = number(f"{what}: label {key}: opacity", entry.get("opacity", SOLID if int(key) else 0.0))
-        name = str(entry.get("name", ""))
-        groups, shown = entry.get("parents", []), entry.get("visible", True)
-        groups = [groups] if isinstance(groups, str) else groups
-        if not isinstance(groups, list) or not all(isinstance(one, str) and one for one in groups):
-            raise DataError(f"{what}: label {key}: parents {str(groups)[:40]!r}; expected names of groups: [..., ...]")
-        if not isinstance(shown, bool):
-            raise DataError(f"{what}: label {key}: visible {str(shown)[:40]!r}; expected true or false")
-        label = _label(f"{what}: label {key}", int(key), name, color, opacity, shown)
-        found.append(replace(label, parents=tuple(one[:MAX_NAME] for one in groups)) if groups else label)
-    return _table(found, what)
-
-
-def _is_number(text: str) -> bool:
-    return re.fullmatch(r"\d+(\.\d*)?([eE][+-]?\d+)?", text) is not None
+    for one in segments:
+        opacity = (SOLID if one.number else 0.0) if one.opacity is None else one.opacity
+        color = None if one.color is None else list(one.color)
+        found.append(_label(what, one.number, one.name, color, opacity, codes=codes_of(one.terms)))
+    return found
 
 
 def _label(
     what: str, value: int, name: str, color: Any, opacity: float, shown: bool = True, codes: Codes = ()
 ) -> Label:
-    """Make a label from checked values."""
+    """Make a label from checked values, in a colour by its number if it has no ``color``."""
     if not 0 <= opacity <= 1:
         raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
     if abs(value) > MAX_NUMBER:
@@ -305,4 +336,5 @@ def _label(
     name = clean_name(what, value, name)
     parents = parents_of(name, codes)
     seen, hidden = (opacity, 0.0) if shown else (0.0, opacity)
-    return Label(value, name, rgb(f"{what}: colour", color), seen, parents, codes, hidden)
+    given = palette_color(value) if color is None else rgb(f"{what}: colour", color)
+    return Label(value, name, given, seen, parents, codes, hidden, automatic=color is None)

@@ -10,8 +10,8 @@ import json
 import re
 import warnings
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -42,6 +42,7 @@ class Label:
         parents: names of the groups that it is in, from the outermost.
         codes: what its table says of it by coded terms (`vvgt_cli.look.terms`).
         hidden_opacity: opacity that it would have if its table did not switch it off, 0 if it does not.
+        automatic: its colour was chosen by its number, not stated.
     """
 
     number: int
@@ -51,6 +52,7 @@ class Label:
     parents: tuple[str, ...] = ()
     codes: tuple[tuple[str, str, str], ...] = ()
     hidden_opacity: float = 0.0
+    automatic: bool = field(default=False, compare=False, repr=False)
 
     @property
     def shown_opacity(self) -> float:
@@ -119,8 +121,9 @@ class LabelTable:
             raise DataError(f"{self.name}: no labels; expected one")
         numbers = [label.number for label in self.labels]
         if sorted(set(numbers)) != numbers:
-            twice = next((a for a, b in pairwise(sorted(numbers)) if a == b), None)
-            raise DataError(f"{self.name}: label {twice} twice; expected each label once")
+            pairs = pairwise(sorted(self.labels, key=lambda label: label.number))
+            twice = next((f"{a.number} twice ({a.name}, {b.name})" for a, b in pairs if a.number == b.number), "order")
+            raise DataError(f"{self.name}: label {twice}; expected each label once")
 
     @cached_property
     def _numbers(self) -> np.ndarray:
@@ -200,12 +203,22 @@ def check_labels(looks: Sequence[Named]) -> None:
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:
-    """Return solid labels (``numbers`` ascending, 0 transparent) in colours by their number, which repeat above 78."""
+    """Return solid labels (``numbers`` ascending, 0 transparent) in colours by their number."""
+    named = [(n, default_name(n), palette_color(n), SOLID if n else 0.0) for n in numbers]
+    return LabelTable("distinct colours", tuple(Label(*one, automatic=True) for one in named))
+
+
+@cache
+def palette() -> list[tuple[float, float, float]]:
+    """Return the 78 colours, RGB in [0, 1], of labels whose table gives none."""
     from matplotlib import colormaps
 
-    colors = [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
-    labels = [Label(n, default_name(n), colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]
-    return LabelTable("distinct colours", tuple(labels))
+    return [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
+
+
+def palette_color(number: int) -> tuple[float, float, float]:
+    """Return the colour of a label whose table gives none; they repeat after 78 numbers."""
+    return palette()[(number - 1) % len(palette())]
 
 
 def default_name(number: int) -> str:

@@ -10,12 +10,14 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import PER_VOXEL, TransferFunction
+from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import Volume
 
 BY = {"percentile": "percentiles", "foreground": "percentiles of the foreground", "sigma": "standard deviations"}
+BY |= {"mean": "multiples of the mean", "level": "levels"}
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
@@ -66,6 +68,8 @@ def resolve(
     if tf.domain in BY:
         if chosen != "data":
             raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; omit --tf-range")
+        if isinstance(tf, Isosurfaces):
+            return tf.placed(statistics, hounsfield or look_like_hounsfield(statistics))
         return tf.moved(_positions(tf, statistics))
     if tf.domain == "fraction":
         a, b = (lo, hi) if isinstance(chosen, str) else chosen
@@ -99,12 +103,15 @@ def look_like_hounsfield(statistics: Statistics) -> bool:
 
 
 def _positions(tf: TransferFunction, statistics: Statistics) -> np.ndarray:
-    """Return data values of the breakpoints (m,) of a function on percentiles or standard deviations."""
+    """Return data values of the breakpoints (m,) of a function on percentiles, standard deviations or means."""
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if tf.domain == "sigma" and counts.any():
         mean, deviation = moments(counts, edges)
         return mean + deviation * tf.breakpoints()
-    front = foreground(counts) if tf.domain == "foreground" and counts.any() else counts
+    front = foreground(counts) if tf.domain in ("foreground", "mean") and counts.any() else counts
+    if tf.domain == "mean":  # of densities, which begin at 0
+        scaled = front * np.clip(edges[:-1] / 2 + edges[1:] / 2, 0, None)
+        return tf.breakpoints() * (float(scaled.sum() / front[scaled > 0].sum()) if scaled.any() else 1.0)
     return _quantiles(front, edges, tf.breakpoints())
 
 

@@ -17,6 +17,8 @@ X_LABEL = {
     "fraction": "fraction of the data range",
     "percentile": "fraction of the voxels",
     "foreground": "fraction of the voxels in front of the background",
+    "mean": "multiples of the foreground's mean",
+    "level": "level",
     "sigma": "standard deviations above the mean",
 }
 

@@ -169,8 +169,8 @@ def fitting(statistics: Statistics, volume: Volume) -> str | None:
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if not counts.any() or statistics.lo == statistics.hi:
         return None
-    if volume.density:
-        return contours(counts, edges)
+    if volume.density or volume.preset:
+        return volume.preset or contours(counts, edges)
     if volume.hounsfield or (volume.modality in ("", "CT") and in_hounsfield(counts, edges)):
         body, bone = (_share(counts, edges, *span) / counts.sum() for span in (BODY, BONE))
         lung = _lungs(volume)

@@ -21,20 +21,9 @@ _SIDE = re.compile(r"(Left|Right)-")
 
 
 def codes_of(terms: Sequence[Sequence[str]]) -> Codes:
-    """Return the codes of (scheme, value, meaning) for each of `PARTS`, without parts that have no meaning."""
-    stated = zip(PARTS, terms, strict=True)
+    """Return the codes of (scheme, value, meaning), one for each of `PARTS` or none; omit those without meaning."""
+    stated = zip(PARTS, terms, strict=False)
     return tuple((part, f"{scheme}:{value}", meaning) for part, (scheme, value, meaning) in stated if meaning.strip())
-
-
-def codes_of_tags(tags: str) -> Codes:
-    """Return the codes in the tags of a segment of a `.seg.nrrd`; none if they are not as 3D Slicer writes them.
-
-    The entry is ``context~category~type~modifier~context~region~modifier``, each code ``scheme^value^meaning``.
-    """
-    entry = next((tag for tag in tags.split("|") if tag.startswith("TerminologyEntry:")), "")
-    fields = entry.partition(":")[2].split("~")
-    terms = [field.split("^") for k, field in enumerate(fields) if k not in (0, 4)]
-    return codes_of(terms) if len(terms) == len(PARTS) and all(len(term) == 3 for term in terms) else ()
 
 
 def codes_of_row(cells: Mapping[str, str]) -> Codes:

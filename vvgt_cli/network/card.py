@@ -16,6 +16,7 @@ from vvgt_cli.version import VERSION
 
 FORMAT, SCHEMA = "vvgt-model", 1  # the schema is raised when a graph's input or output changes its meaning
 CARD = "card.json"
+SHIPPED = "vvgt-small"  # the model that comes with the program
 MODELS = Path(__file__).parents[2] / "models"  # of a checkout
 INSTALLED = "share/vvgt/models"  # below where pip puts a wheel's data
 MAPS = [f"maps_{scale}" for scale in range(SCALES)]

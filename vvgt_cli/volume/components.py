@@ -154,6 +154,33 @@ def selected_dtype(info: ArrayInfo, component: int | str | None, source: str) ->
     return select_from_array(np.zeros((1, 1, 1, info.components), info.dtype), info, component, source).dtype
 
 
+def channel_numbers(wanted: Sequence[str], count: int, names: Sequence[str], source: str) -> list[int]:
+    """Return the numbers of the channels that are asked for, each once.
+
+    Args:
+        wanted: what stands between the commas of ``A,B``: numbers, names, and pieces of names that have commas.
+        count: how many channels there are.
+        names: their names, where they have any.
+        source: for messages.
+
+    Raises:
+        UsageError: no channel of that name or number, or several of that name.
+    """
+    left, numbers = list(wanted), list[int]()
+    while left:
+        words = [",".join(left[:size]).strip() for size in range(len(left), 0, -1)]
+        word = next((word for word in words if names.count(word) == 1), words[-1])
+        if word.isdecimal() and int(word) < count:
+            numbers.append(int(word))
+        elif names.count(word) == 1:
+            numbers.append(names.index(word))
+        else:
+            rows = [f"{k} {name[:40]!r}" for k, name in enumerate(names)] or [f"0 to {count - 1}"]
+            raise UsageError(f"{source}: no channel {word!r}; it has {listed(rows, ', ')}")
+        del left[: len(words) - words.index(word)]
+    return list(dict.fromkeys(numbers))
+
+
 def contiguous(field: np.ndarray) -> np.ndarray:
     """Return the field itself (mapped, perhaps), or a C-contiguous copy where it is not one."""
     return field if field.flags.c_contiguous else np.ascontiguousarray(field)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +88,18 @@ class HeaderFields(dict[str, str]):
         return found
 
 
+def fields_of_sections(path: Path) -> HeaderFields:
+    """Return the fields ``section/key`` of a text file, ``block/section/key`` behind a line ``{block}``."""
+    fields, block, section = HeaderFields(str(path)), "", ""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for line in map(str.strip, file.read(MAX_HEADER).splitlines()):
+            key, equals, value = line.partition("=")
+            block, section = (line.strip("{}") + "/", "") if line.startswith("{") else (block, section)
+            section = line.strip("[]").lower() if line.startswith("[") else section
+            fields.update({f"{block}{section}/{key.strip().lower()}": value.strip()} if equals else {})
+    return fields
+
+
 def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | None:
     """Return the type of numbers that a name such as ``unsigned short int``, ``uchar`` or ``uint16_t`` stands for.
 
@@ -112,3 +126,9 @@ def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | N
 def printable(text: str) -> str:
     """Return ``text`` as a message can hold it: what cannot be printed (a line break, say) is a question mark."""
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def text_of(value: Any) -> str:
+    """Return an attribute as text, the first of several."""
+    value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

@@ -17,7 +17,7 @@ from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
 
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
-NAMED = re.compile(r"label|seg(?![a-z])|segment|atlas|parc|aseg", re.I)
+NAMED = re.compile(r"label|seg(?![a-z])|segment|atlas|parc|aseg|mask(?!ed)", re.I)
 MAX_LABELS = 1 << 21  # labels that are counted
 SORTED = 1 << 16  # span of a plane's values above which they are sorted, not counted
 
@@ -45,17 +45,24 @@ def labels_in(volume: Volume) -> list[int]:
 
 
 def named_so(volume: Volume) -> bool:
-    """Tell whether a volume holds integers and its name suggests a label map."""
-    return volume.data.dtype.kind in "iu" and NAMED.search(volume.name) is not None
+    """Tell whether a volume's file says that it is a label map, or its name suggests it."""
+    return volume.segments is not None or NAMED.search(volume.name) is not None
 
 
 def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in) -> bool:
-    """Tell whether a volume is a label map: few different integers, and a name that says so; ``labels`` lists them."""
-    if not named_so(volume):
-        return False
+    """Tell whether a volume is a label map: its file says so, or its name and few different whole numbers do.
+
+    ``labels`` lists the numbers.
+    """
+    if volume.segments is not None or not named_so(volume):
+        return volume.segments is not None
+    most = 2 if "mask" in map(str.lower, NAMED.findall(volume.name)) else FEW  # a masked scan is no label map
     middle = len(volume.data) // 2
-    first = np.unique(volume.data[middle : middle + 1])  # one slice decides for most
-    return len(first) <= FEW and len(labels(volume)) <= FEW
+    first = volume.slope * np.unique(volume.data[middle : middle + 1]) + volume.intercept  # one slice decides for most
+    try:
+        return len(first) <= most and bool((first == np.round(first)).all()) and len(labels(volume)) <= most
+    except DataError:  # fractions elsewhere
+        return False
 
 
 @dataclass

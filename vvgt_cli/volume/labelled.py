@@ -16,8 +16,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.components import contiguous, select_component
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.components import contiguous, listed, select_component
+from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
@@ -78,9 +78,14 @@ class Axis:
 def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Mapping[str, Any] | None = None) -> Axis:
     """Make an axis, with its role from the attributes ``axis``, ``standard_name`` and ``units``, else from its name.
 
-    Coordinates of a vertical axis that point down become their negatives, so that z always points up.
+    Coordinates are decoded as `decode` does it. Those of a vertical axis that point down become their negatives, so
+    that z always points up.
     """
-    stated = {key: str(value).strip() for key, value in (attributes or {}).items() if key in AXIS_ATTRIBUTES}
+    attributes = attributes or {}
+    stated = {key: text_of(value).strip() for key, value in attributes.items() if key in AXIS_ATTRIBUTES}
+    if centres is not None:
+        values, slope, intercept = decode(np.array(centres), attributes, f"axis {name}")
+        centres = values.astype(np.float64) * slope + intercept
     units = stated.get("units", "")
     role = stated.get("axis", "").lower()
     words = [stated.get("standard_name", "").lower(), name.lower()]
@@ -158,7 +163,9 @@ def labelled_volume(
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
         if k is not None:
             if value is not None and value not in range(axes[k].size):
-                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
+                named = f" ({listed([f'{n} {name!r}' for n, name in enumerate(axes[k].labels)], ', ')})"
+                expected = f"expected 0 to {axes[k].size - 1}{named if axes[k].labels else ''}"
+                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; {expected}")
             index[k] = slice(None) if value is None else value
     if callable(stored) and options.stored and chunks is not None and len(space) == 3:
         return _left(stored, dtype, axes, index, zyx, attributes, options, source, name, chunks)
@@ -178,7 +185,7 @@ def labelled_volume(
         field = np.transpose(values, order)
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
-    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes)
+    return _named(_placed(field, spatial, (slope, intercept), options, source, name), attributes, _time(axes, options))
 
 
 def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
@@ -259,9 +266,8 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
     """
     slope = _number(attributes, "scale_factor", 1.0, source)
     intercept = _number(attributes, "add_offset", 0.0, source)
-    missing = _missing(values, attributes)  # marks have the stored type, signed as it may be
-    if str(attributes.get("_Unsigned", "")).lower() == "true" and values.dtype.kind == "i":
-        values = values.view(values.dtype.str.replace("i", "u"))
+    values = values.view(stored_type(values.dtype, attributes))
+    missing = _missing(values, attributes, slope, intercept)
     if missing is None or not missing.any():
         return values, slope, intercept
     check_memory(values.size * max(values.itemsize, 4), source)
@@ -272,6 +278,12 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
         values = np.array(values)
     values[missing] = np.nan
     return values, slope, intercept
+
+
+def stored_type(dtype: np.dtype, attributes: Mapping[str, Any]) -> np.dtype:
+    """Return the type of stored values, for integers with the sign that ``_Unsigned`` states (NUG, appendix B)."""
+    signs = {"true": "iu", "false": "ui"}.get(text_of(attributes.get("_Unsigned", "")).lower(), "  ")
+    return np.dtype(dtype.str.replace(*signs)) if dtype.kind in "iu" else dtype
 
 
 def _number(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
@@ -286,14 +298,16 @@ def _number(attributes: Mapping[str, Any], key: str, default: float, source: str
     return value
 
 
-def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | None:
-    """Return a mask of the stored values that the attributes call missing, or None."""
+def _missing(values: np.ndarray, attributes: Mapping[str, Any], slope: float, intercept: float) -> np.ndarray | None:
+    """Return a mask of the stored values (of `stored_type`) that the attributes call missing, or None."""
     mask: np.ndarray | None = None
-    marks = [m for key in ("_FillValue", "missing_value") if key in attributes for m in _stored(attributes[key])]
+    marks = [m for key in ("_FillValue", "missing_value") for m in _marks(attributes, key, values.dtype)]
     tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
-    limits = _stored(attributes.get("valid_range", ()))
-    lo = _stored(attributes.get("valid_min", ())) or limits[:1]
-    hi = _stored(attributes.get("valid_max", ())) or limits[1:2]
+    limits = _marks(attributes, "valid_range", values.dtype)
+    lo = _marks(attributes, "valid_min", values.dtype) or limits[:1]
+    hi = _marks(attributes, "valid_max", values.dtype) or limits[1:2]
+    if any(_unpacked(attributes, key, values.dtype) for key in ("valid_range", "valid_min", "valid_max")):
+        lo, hi = ([_packed(m, slope, intercept) for m in some] for some in ((lo, hi) if slope > 0 else (hi, lo)))
     tests += [values < lo[0]] if lo else []
     tests += [values > hi[0]] if hi else []
     for test in tests:
@@ -301,22 +315,45 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | 
     return mask
 
 
-def _stored(value: Any) -> list[Any]:
-    """Return the numbers of an attribute; nothing where it is text."""
-    found = np.asarray(value).reshape(-1)
-    return [] if found.dtype.kind not in "iuf" else found.tolist()
+def _marks(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> list[Any]:
+    """Return the numbers of an attribute, with the sign of ``_Unsigned`` as values have it; none where it is text."""
+    found = np.asarray(attributes.get(key, ())).reshape(-1)
+    if found.dtype.kind not in "iuf":
+        return []
+    if "_Unsigned" in attributes and found.dtype.kind in "iu" and dtype.kind in "iu":
+        found = found.astype(dtype)  # wraps
+    return found.tolist()
 
 
-def _named(volume: Volume, attributes: Mapping[str, Any]) -> Volume:
-    """Return the volume with the name and unit that the attributes give its values, as CF has them."""
-    long, standard, unit = (_text(attributes.get(key, "")) for key in NAMING)
+def _unpacked(attributes: Mapping[str, Any], key: str, dtype: np.dtype) -> bool:
+    """Tell whether limits of packed integers count in data values: they have the type of the scaling (NUG, appendix A).
+
+    Fractions count so, too, whatever their type.
+    """
+    found = np.asarray(attributes.get(key, ()))
+    scaling = [np.asarray(attributes[name]).dtype for name in ("scale_factor", "add_offset") if name in attributes]
+    if dtype.kind not in "iu" or found.dtype.kind != "f" or not found.size or not scaling:
+        return False
+    return found.dtype == np.result_type(*scaling) or bool((found % 1 != 0).any())
+
+
+def _packed(limit: float, slope: float, intercept: float) -> float:
+    """Return the stored value of a data value, a whole number where rounding alone keeps it from being one."""
+    stored = (limit - intercept) / slope
+    return round(stored) if math.isfinite(stored) and abs(stored - round(stored)) < 1e-3 else stored
+
+
+def _time(axes: Sequence[Axis], options: ReadOptions) -> tuple[float, str] | None:
+    """Return the coordinate along the axis of time, and its unit, None where there is none."""
+    stated = (a for a in axes if a.role == "t" and a.centres is not None and (options.time or 0) < a.size)
+    return next(((float(a.centres[options.time or 0]), a.units) for a in stated if a.centres is not None), None)
+
+
+def _named(volume: Volume, attributes: Mapping[str, Any], time: tuple[float, str] | None) -> Volume:
+    """Return the volume with its time, and the name and unit that attributes give its values, as CF has them."""
+    long, standard, unit = (printable(text_of(attributes.get(key, ""))).strip()[:40] for key in NAMING)
     bare = unit in ("1", "none", "unitless", "dimensionless")
-    return replace(volume, quantity=long or standard, value_unit="" if bare else unit)
-
-
-def _text(value: Any) -> str:
-    """Return an attribute of text, of HDF5 too, for a legend."""
-    return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()[:40]
+    return replace(volume, quantity=long or standard, value_unit="" if bare else unit, time=time)
 
 
 def _placed(
@@ -376,8 +413,7 @@ def _left(
         raise UsageError(f"{source}: block by block a magnitude or another grid cannot be read; choose one component")
     flips = [_descends(axes[k], source) for k in zyx]
     marked = any(key in attributes for key in MARKS)
-    unsigned = dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true"
-    kind = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
+    kind = stored_type(dtype, attributes)
     wide = marked and kind.kind != "f"
     final = float_dtype(kind) if wide else kind
     scale = _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
@@ -396,7 +432,7 @@ def _left(
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     volume = _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
-    return _named(volume, attributes)
+    return _named(volume, attributes, _time(axes, options))
 
 
 def _descends(a: Axis, source: str) -> bool:

@@ -28,7 +28,7 @@ class ReadOptions:
             voxel and the directions stay. Not of values that stand at points (meshes).
         array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
         component: index of a component or channel, the name of a channel, or ``magnitude``, for arrays that have
-            several.
+            several; names and indices of several, as ``A,B``, are for `vvgt_cli.field.layered.open_content`.
         time: index of the time step, for files that hold several.
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
         crop: ``x0:x1,y0:y1,z0:z1``, the voxels to keep, as `parse_crop` has it.
@@ -38,6 +38,8 @@ class ReadOptions:
             (`vvgt_cli.volume.blocks.Packed`).
         stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
         level: of a file with several resolutions (OME-Zarr), from 0, the finest.
+        suv: of DICOM PET, ``bw`` for SUV by body weight or an error, ``none`` for values as they are; None: SUV where
+            the file states enough.
 
     Raises:
         UsageError: a value out of its range.
@@ -58,6 +60,7 @@ class ReadOptions:
     packed: bool = False
     stored: bool = False
     level: int | None = None
+    suv: str | None = None
 
     def __post_init__(self) -> None:
         """Check the values one by one."""
@@ -78,6 +81,7 @@ class ReadOptions:
              "an index (0, 1, ...), a channel's name or magnitude"),
             ("keep-largest", self.keep_largest, math.isfinite(self.keep_largest or 0), "a finite data value"),
             ("level", self.level, (self.level or 0) >= 0, "full, or the number of a level (0, 1, ...)"),
+            ("suv", self.suv, self.suv in (None, "bw", "none"), "bw or none"),
             ("time", self.time, (self.time or 0) >= 0, "the index of a time step (0, 1, ...)"),
         ):  # fmt: skip
             if not good:

@@ -50,8 +50,8 @@ class Reader:
             that do not suit.
         sniff: tells whether a file with these first `HEAD_BYTES`, decompressed, has the format; None where files begin
             in no certain way, so that the name decides.
-        takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order`` and ``header_bytes`` it
-            takes; all readers take the others.
+        takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order``, ``header_bytes``
+            and ``suv`` it takes; all readers take the others.
         by_name: also tried on files that `sniff` does not recognise.
         holds: tells whether a folder holds the format.
         whole: a folder that holds it is one volume, whatever other files lie in it.

@@ -17,6 +17,7 @@ from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.bodies import without_other_bodies
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
@@ -46,8 +47,11 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
+    scheme = "-" if source == "-" else source.partition(":")[0]
+    if options.time is not None and scheme in {"-", *SCHEMES} - STEPPED:
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
+    if options.suv is not None and scheme in {"-", *SCHEMES}:
+        raise UsageError(f"{source}: no DICOM PET; leave out --suv {options.suv}")
     if (options.crop, options.mask, options.keep_largest) != (None, None, None):
         options = replace(options, packed=False)
     return cut(in_space(_read(source, options), options.space), options)
@@ -108,12 +112,12 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
 def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | None]:
     """List time and unit of each step where ``options`` choose none, None without times; errors are `read_volume`'s."""
     try:
-        read_volume(source, options)
+        volume = read_volume(source, options)
     except SeveralSteps as error:
         if not error.times:
             return [None] * error.steps
         return [(float(time), error.unit) for time in error.times]
-    return [None]
+    return [volume.time]
 
 
 def contents(source: str, options: ReadOptions) -> dict[str, Any]:
@@ -150,9 +154,11 @@ def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
 
 
 def _slices(source: str, options: ReadOptions) -> Volume | None:
-    """Read a glob of slices; None where the source is none."""
+    """Read a glob of slices or masks; None where the source is none."""
     if not set(source) & set("*?[") or "\0" in source or os.path.exists(source):
         return None
+    if MASKS.holds is not None and MASKS.holds(Path(source)):
+        return MASKS.read(Path(source), options)
     from vvgt_cli.volume.tiff.slices import read_glob
 
     volume = read_glob(source, options)
@@ -202,6 +208,7 @@ def _head(path: Path, source: str) -> bytes:
             head = file.read(HEAD_BYTES)
     except FileNotFoundError:
         hint = "" if ":" not in source else f" (schemes: {', '.join(s + ':' for s in SCHEMES)})"
+        hint = " (it is a link to a file that is not there; of git-annex: git annex get)" if path.is_symlink() else hint
         raise DataError(f"{source}: no such file; expected a volume file, - or example:NAME{hint}") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
@@ -211,15 +218,19 @@ def _head(path: Path, source: str) -> bytes:
     return head.removeprefix(MARK)
 
 
-def _recognised(path: Path, head: bytes) -> tuple[Reader | None, bool]:
-    """Find the first reader that recognises a file's content, and tell whether the file is compressed by gzip."""
-    zipped = head[:2] == b"\x1f\x8b"
-    if zipped:
+def _recognised(path: Path, head: bytes) -> tuple[Reader | None, bytes]:
+    """Find the first reader that recognises a file's content; return it and the first bytes, unpacked from gzip."""
+    if head[:2] == b"\x1f\x8b":
         try:
             head, _ = read_head(path, HEAD_BYTES)
         except DataError:
-            return None, True
-    return next((r for r in READERS if r.sniff is not None and r.sniff(head)), None), zipped
+            return None, head
+    return next((r for r in READERS if r.sniff is not None and r.sniff(head)), None), head
+
+
+def is_recognised(head: bytes) -> bool:
+    """Tell whether a file that begins so has the format of some reader."""
+    return any(reader.sniff is not None and reader.sniff(head) for reader in READERS)
 
 
 def _by_name(path: Path) -> Reader | None:
@@ -231,19 +242,19 @@ def _by_name(path: Path) -> Reader | None:
 def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
     """Find the reader of a file, or raise `DataError` with what else to do with it."""
     named = _by_name(path)
-    found, zipped = _recognised(path, head)
+    found, inner = _recognised(path, head)
     if found is not None and named is not None and found.name in named.within:
         found = named
     raw_layout = options.dtype or parse_name(path.name) or (options.dims and not (found and found.resamples))
     if found is not None and found is not named and raw_layout:
         return RAW  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
-        if zipped and not any(suffix.endswith("gz") for suffix in found.suffixes):
+        if inner != head and not any(suffix.endswith("gz") for suffix in found.suffixes):
             raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
         return found
     if options.dims and (options.dtype or named is None or not named.resamples):
         return RAW
-    if known := way_out(path, head, by_name=named is None):
+    if known := way_out(path, inner, by_name=named is None):
         raise DataError(f"{path}: {known}")
     if named is not None and (named.by_name or named.nameable):
         return named
@@ -267,6 +278,8 @@ def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
             f"{source}: a {reader.name} file, which has no known time steps; leave out --time {options.time} (along a "
             "fourth axis of any kind --component N chooses)"
         )
+    if options.suv is not None and "suv" not in reader.takes:
+        raise UsageError(f"{source}: a {reader.name} file, no DICOM PET; leave out --suv {options.suv}")
     if options.array is not None and "array" not in reader.takes:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"
@@ -285,6 +298,14 @@ ROWS = (
      "'vvgt info', 'vvgt render' and 'vvgt evaluate {name} --volume VOLUME')"),
     (rb"NanoVDB", "", "NanoVDB, which is laid out for GPUs", "nanovdb_convert {name} {stem}.vdb (comes with OpenVDB)"),
     (rb"7z\xbc\xaf|\xfd7zXZ|\x28\xb5\x2f\xfd|Rar!", "", "an archive or packed", "unpack it first"),
+    (rb"PK\x03\x04|(?s:.{257})ustar", r"^(?!.*\.(zip|ozx|npz)$).*", "an archive", "unpack it first"),
+    (rb"version https://git-lfs", "", "a pointer of Git LFS, in place of the file", "git lfs pull --include '{name}'"),
+    (rb"(\.\./)*(\.git)?/annex/objects/", "", "a pointer of git-annex, in place of the file", "git annex get '{name}'"),
+    (rb"(?i)\s*(<\?xml[^>]*>\s*)?<(!doctype html|html|error>)", "", "an answer of a web server, in place of the file",
+     "open it in a browser to see what it says, and load the file again"),
+    (rb"mrtrix image", "", "MRtrix", "mrconvert '{name}' '{stem}.nii.gz'"),
+    (rb"C[ 0]1|\xc3[\x40\xf0]\xf1", "", "SEG-Y", "in Python: numpy.save('{stem}.npy', segyio.tools.cube('{name}'))"),
+    (rb"#std", "", "Nek5000", "open its .nek5000 file in ParaView and save it as .vtu"),
     (rb"SIMPLE  =", "", "FITS", "in Python: numpy.save('{stem}.npy', astropy.io.fits.getdata('{name}'))"),
     (rb"MATLAB 5", "", "a MATLAB file before version 7.3", _MAT),
     (rb"\x0e\x03\x13\x01", "", "HDF4", "h4toh5convert '{name}' '{stem}.h5' (HDF Group's h4h5tools)"),
@@ -295,18 +316,21 @@ ROWS = (
     (rb"ncaa", r"\.vff", "VFF", "3D Slicer with SlicerRT opens it; save it as .nrrd"),
     (rb"#!SZPLT", "", "Tecplot's SZL", "save it as .plt in Tecplot, and that with ParaView as .vtu"),
     (rb"#!TDV|\(0 \"", "", "a Tecplot or Fluent file", _VIEW),
-    (b"", r"\.(plt|tec|cas|d3plot)(\.gz)?|d3plot", "a file of a simulation program", _VIEW),
+    (b"", r"\.(plt|tec|cas|d3plot|nek5000)(\.gz)?|d3plot", "a file of a simulation program", _VIEW),
     (b"", r"\.(msh|inp|bdf|med|su2)", "a mesh", "meshio convert '{name}' '{stem}.vtu'"),
     (b"", r"\.(stl|obj|off|gltf|glb|3mf)", "a surface, with no values inside", "give the volume that it was made from"),
-    (b"", r"\.(oib|oif|vsi|scn|dv|r3d|ics|ids|sld|lsm|zvi|mvd2)", "a microscope's file", _BIO),
+    (b"", r"\.(oib|oif|oir|vsi|scn|dv|r3d|ics|ids|sld|lsm|zvi|mvd2|mrxs|ndpi|obf|msr)", "a microscope's file", _BIO),
+    (b"", r"\.ser", "a series of an electron microscope", "e2proc3d.py '{name}' '{stem}.mrc' (EMAN2)"),
+    (b"", r"\.companion\.ome", "OME-XML of TIFF files beside it", "give one of them"),
+    (b"", r"\.[qf]", "values of Plot3D", "give the coordinates beside it, '{stem}.xyz'"),
     (b"", r"\.(txm|txrm|xrm)", "Zeiss Xradia", "export it as TIFF, or in Python: dxchange.read_txrm('{name}')"),
     (b"", r"\.dm[34]", "Gatan DigitalMicrograph", "dm2mrc '{name}' '{stem}.mrc' (IMOD)"),
     (b"", r"\.(em|spi|hed)", "EM, SPIDER or IMAGIC", "e2proc3d.py '{name}' '{stem}.mrc' (EMAN2)"),
     (b"", r"\.(dsn6|brix|omap|xplor|cns)", "an electron density", "open it in ChimeraX and: save '{stem}.mrc'"),
     (b"", r"(^|[/\\])2dseq", "Bruker ParaVision", "brkraw tonii STUDY, or Bru2Nii, make NIfTI of the study's folder"),
     (b"", r"(^|[/\\])(fid|ser)", "signals of a scanner before reconstruction", "give the reconstructed images"),
-    (b"", r"\.(vol|vgi|pca|xtekct)", "a CT scanner's raw values or their description", "read the raw file with "
-     "--dims X Y Z --dtype TYPE --spacing X Y Z as the text file beside it states them"),
+    (b"", r"\.(vol|pca|xtekct)", "a CT scanner's raw values or their description", "give the .vgi beside it, or the "
+     "raw file with --dims X Y Z --dtype TYPE --spacing X Y Z as the text file beside it states them"),
 )  # fmt: skip
 
 

@@ -10,9 +10,11 @@ from typing import TypeVar
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.segments import Segment
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 FLAT = 1e-3  # volume of the parallelepiped of three unit axes, below which they lie in a plane
+ALIKE = 1e-3  # of a voxel, by which places on one grid may differ
 RIGHT = 1e-4  # cosine up to which axes are at right angles
 
 
@@ -69,8 +71,11 @@ class Volume:
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
+        preset: name of the function that shows such values (smoke, fire); "" unknown.
         value_unit: unit of the values; "" unknown.
+        time: time that the values are of, and its unit, which may be ""; None unknown.
         unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
+        segments: what the file says of its labels, if it says that values are labels; else None.
 
     Raises:
         DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
@@ -90,7 +95,10 @@ class Volume:
     unit: str = ""
     modality: str = ""
     quantity: str = ""
+    preset: str = ""
     value_unit: str = ""
+    time: tuple[float, str] | None = None
+    segments: tuple[Segment, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""
@@ -142,6 +150,18 @@ class Volume:
         matrix[:3, :3] = self.axes * np.array(self.spacing)
         matrix[:3, 3] = self.origin
         return matrix
+
+    def check_grid(self, own: str, first: Volume, name: str, why: str) -> None:
+        """Raise DataError unless this volume, called ``own``, has the grid of ``first``, called ``name``."""
+        shift = np.abs(self.affine - first.affine).max() if self.dims == first.dims else np.inf
+        if self.space == first.space and shift <= ALIKE * min(first.spacing):
+            return
+        texts = [
+            " x ".join(map(str, one.dims)) + " voxels of {} from {} along {}".format(
+                *(" ".join(f"{v:g}" for v in vector) for vector in (one.spacing, one.origin, one.direction))
+            ) for one in (self, first)
+        ]  # fmt: skip
+        raise DataError(f"{own}: {texts[0]}; expected the grid of {name}, {texts[1]}: {why}")
 
     @property
     def sheared(self) -> bool:

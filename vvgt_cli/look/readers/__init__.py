@@ -9,12 +9,14 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.isosurfaces import PREFIX
 from vvgt_cli.look.readers import inviwo, lut, minimal, names, paraview, slicer
 from vvgt_cli.look.readers.fields import load
 
 # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
 FORMATS = (paraview, minimal, slicer, inviwo, lut)
-SUFFIXES = (".json", ".xml", ".itf", ".vp", *lut.SUFFIXES)
+OWN = (".itf", ".vp", *lut.SUFFIXES)  # endings that nothing else has
+SUFFIXES = (".json", ".xml", *OWN)
 __all__ = ["read_transfer_function"]
 
 
@@ -24,7 +26,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
     Args:
         source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room list the
             formats), or a name (`vvgt_cli.look.readers.names`): one of ours, or a matplotlib colour map with an opacity
-            ramp, ``NAME[:LO,HI[:MAX]]``; or the parsed content of such a JSON file.
+            ramp, ``NAME[:LO,HI[:MAX]]``, or ``iso:LEVEL``; or the parsed content of such a JSON file.
 
     Returns:
         The function; `vvgt_cli.look.resolve.resolve` maps it to the data.
@@ -39,6 +41,8 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
     if not source.strip():
         raise UsageError("an empty name; expected a transfer-function file or a colour-map name")
     path, pick = Path(source), ""
+    if source.startswith(PREFIX) and not path.exists():  # before the # of a colour
+        return names.read(source)
     if not path.exists() and "#" in source:
         head, _, pick = source.rpartition("#")
         path = Path(head)

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -85,8 +86,15 @@ def text_of(path: Path, what: str = "a transfer function") -> str:
 
 def json_of(text: str, path: Path, what: str = "a ParaView preset or a minimal transfer function") -> Any:
     """Return the content of a JSON text, else raise DataError; ``what`` is expected there."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = sorted(key for key, _ in pairs)
+        for key in (a for a, b in pairwise(keys) if a == b):
+            raise DataError(f"{path}: {key[:40]!r} twice in one object; expected {what}, each key once")
+        return dict(pairs)
+
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=once)
     except json.JSONDecodeError as error:
         raise DataError(
             f"{path}: not JSON (line {error.lineno}, column {error.colno}: {error.msg}); expected {what}"

@@ -16,9 +16,11 @@ An object with these keys, and no others::
 
 ``x`` is a data value without ``range``; in [0, 1] from one end of ``"range": [lo, hi]`` to the other; with ``"range":
 "percentile"``, the fraction of the voxels that lie below (0.5 is the median), with ``"foreground"`` that of the voxels
-in front of the background; with ``"sigma"``, standard deviations above the mean. A point carries ``rgb`` (three numbers
+in front of the background; with ``"sigma"``, standard deviations above the mean; with ``"mean"``, multiples of
+the mean of the values above 0 in front of the background. A point carries ``rgb`` (three numbers
 in [0, 1]), ``opacity`` (in [0, 1]) or both; at least one point carries each. Between points both are linear; beyond the
-ends they are constant.
+ends they are constant. ``{"name": ..., "iso": [0.03, "3sigma,#88aaff"]}`` are isosurfaces
+(`vvgt_cli.look.isosurfaces`).
 """
 
 from __future__ import annotations
@@ -27,26 +29,32 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.isosurfaces import isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
 from vvgt_cli.look.readers.fields import named, number, rgb
 
 KEYS = {"name", "range", "points", "color_space", "hsv_wrap", "opacity_unit_distance", "opacity_unit_share"}
 KEYS |= {"lighting", "otherwise"}
-DOMAINS = ("percentile", "foreground", "sigma")
+DOMAINS = ("percentile", "foreground", "sigma", "mean")
 POINT_KEYS = {"x", "rgb", "opacity"}
 
 
 def matches(parsed: Any) -> bool:
-    """Return whether parsed JSON is an object with points."""
-    return isinstance(parsed, dict) and "points" in parsed
+    """Return whether parsed JSON is an object with points or levels."""
+    return isinstance(parsed, dict) and ("points" in parsed or "iso" in parsed)
 
 
 def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
     """Return the function that the object describes; raise DataError for a ``pick``, unknown keys or invalid fields."""
     if pick:
         raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
+    if "iso" in parsed:
+        try:
+            return isosurfaces(parsed["iso"] if set(parsed) <= {"iso", "name"} else (), str(parsed.get("name", "")))
+        except (UsageError, TypeError) as error:
+            raise DataError(f"{what}: {error}; expected {{'iso': [LEVEL, ...]}}, and perhaps a name") from None
     unknown = sorted(set(parsed) - KEYS)
     if unknown:
         raise DataError(f"{what}: unknown key {unknown[0]!r}; expected {', '.join(sorted(KEYS))}")

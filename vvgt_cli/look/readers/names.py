@@ -5,7 +5,8 @@ percentiles of the voxels in front of the background.
 
 ``NAME[:LO,HI[:MAX]]`` is a colour map of matplotlib: the colours spread over the data range, opacity is 0 up to the
 fraction LO of the range, rises linearly to MAX at HI and stays there; LO, HI and MAX are in [0, 1] and default to 0, 1
-and 1. ``viridis``, ``magma:0.2,0.8`` and ``bone:0.3,0.35:0.9`` are examples.
+and 1. ``viridis``, ``magma:0.2,0.8`` and ``bone:0.3,0.35:0.9`` are examples. ``iso:LEVEL[:LEVEL...]`` are isosurfaces
+(`vvgt_cli.look.isosurfaces`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.isosurfaces import PREFIX, isosurfaces
 from vvgt_cli.look.readers import minimal
 
 FILE = Path(__file__).with_name("named.json")
@@ -46,6 +48,8 @@ def read(source: str) -> TransferFunction:
     """Return the function of a name: ours, or a colour map on fractions of the data range, or raise UsageError."""
     if source in names():
         return named_function(source)
+    if source.startswith(PREFIX):
+        return isosurfaces(source.removeprefix(PREFIX).split(":"))
     name, *rest = source.split(":")
     lo, hi, top = _ramp(source, rest)
     colors = _colors(name)

@@ -49,7 +49,8 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         raise DataError(f"{what}: an indexed colour map (indexedLookup); expected one over a range of values")
     if "RGBPoints" not in preset:
         raise DataError(
-            f"{what}: a categorical preset (IndexedColors, no RGBPoints); expected one over a range of values"
+            f"{what}: a categorical preset (IndexedColors, no RGBPoints); expected one over a range of values (with "
+            "Annotations it is a table for --labels)"
         )
     colors = table(f"{what}: RGBPoints", preset["RGBPoints"], 4, "x, r, g, b")
     stated = str(preset.get("ColorSpace", "RGB")).lower()

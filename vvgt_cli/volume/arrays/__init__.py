@@ -28,7 +28,7 @@ def is_zipped_zarr(head: bytes) -> bool:
 FORMATS = (
     Reader(
         "HDF5", (".h5", ".hdf5", ".he5", ".hdf", ".ims"), lazy("arrays.hdf5.read_hdf5"), is_hdf5, _ALL,
-        levels=lazy("microscopy.imaris.level_shapes"),
+        levels=lazy("microscopy.bigdataviewer.level_shapes"),
     ),
     Reader("NetCDF", (".nc", ".nc4", ".cdf"), lazy("arrays.netcdf.read_netcdf"), is_netcdf, _ALL, within=("HDF5",)),
     Reader(

@@ -1,4 +1,4 @@
-"""Axes that conventions on top of HDF5 state: openPMD, NeXus, ilastik, and voxel sizes as Fiji's plugin writes them.
+"""Axes that conventions on top of HDF5 state: openPMD, NeXus, Velox, BigDataViewer, DREAM.3D, ilastik, Fiji's plugin.
 
 Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standard), NXdata of the NeXus manual
 (https://manual.nexusformat.org), vigra's ``axistags``.
@@ -7,28 +7,22 @@ Sources: openPMD standard 1.1 and 2.0 (https://github.com/openPMD/openPMD-standa
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, Axis, axis
+from vvgt_cli.volume.headers import text_of
+from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis
 
 
-def text_of(value: Any) -> str:
-    """Return an attribute as text, the first of several."""
-    value = value if isinstance(value, str | bytes) else (np.asarray(value).reshape(-1).tolist() or [""])[0]
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, str]]:
-    """Read a dataset of coordinates along an axis, float64, and the attributes that describe the axis."""
-    stated = {key: text_of(dataset.attrs[key]) for key in AXIS_ATTRIBUTES if key in dataset.attrs}
-    scale, offset = (
-        float(np.ravel(dataset.attrs.get(key, plain))[0]) for key, plain in (("scale_factor", 1), ("add_offset", 0))
-    )
-    return np.asarray(dataset[()], np.float64) * scale + offset, stated
+def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """Read a dataset of coordinates along an axis, as stored, and the attributes that describe them."""
+    keys = ("name", *AXIS_ATTRIBUTES, *CF_ATTRIBUTES)
+    stated = {key: dataset.attrs[key] for key in keys if key in dataset.attrs}
+    return np.asarray(dataset[()]), stated
 
 
 def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:
@@ -40,8 +34,15 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):
         return _openpmd(dataset, source)
     found: list[Axis] = []
+    more: dict[str, Any] = {}
     if text_of(group.attrs.get("NX_class", "")) == "NXdata" and "axes" in group.attrs:
-        found = _nexus(group, dataset)
+        found, more = _nexus(group, dataset), _nexus_scaling(group, dataset.name.rpartition("/")[2])
+    elif "_SIMPL_GEOMETRY/SPACING" in group.parent and len(dataset.shape) >= 3:
+        found = _dream3d(group.parent["_SIMPL_GEOMETRY"], dataset)
+    elif view := re.fullmatch(r"/t\d+/(s\d+)/(\d+)/cells", dataset.name):
+        return _bigdataviewer(file[view[1]], int(view[2]), dataset)
+    elif re.fullmatch("/Data/Image/[^/]+/Data", dataset.name) and len(dataset.shape) == 3:
+        found = _velox(group, dataset)
     elif "axistags" in dataset.attrs:
         found = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
@@ -51,7 +52,7 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
             Axis(name, n, None if step is None else step * np.arange(n), "um" if name else "", name)
             for name, n, step in zip(names, dataset.shape, steps, strict=True)
         ]
-    return (found, {}) if found else None
+    return (found, more) if found else None
 
 
 def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
@@ -102,6 +103,49 @@ def _nexus(group: Any, dataset: Any) -> list[Axis]:
             continue
         axes.append(axis(name, size, *coordinates_of(beside)))
     return axes
+
+
+def _bigdataviewer(setup: Any, level: int, dataset: Any) -> tuple[list[Axis], dict[str, Any]]:
+    """Return the axes of a view of BigDataViewer in voxels of the finest level, and the sign of its values.
+
+    Without the setup's attribute ``dataType``, int16 stands for uint16 (bigdataviewer-core, ``Hdf5ImageLoader``).
+    """
+    axes = []
+    for name, size, factor in zip("zyx", dataset.shape, setup["resolutions"][level][::-1], strict=True):
+        axes.append(axis(name, size, (factor - 1) / 2 + factor * np.arange(size)))
+    unsigned = text_of(setup.attrs.get("dataType", "uint16")).startswith("uint")
+    return axes, {"_Unsigned": "true"} if unsigned else {}
+
+
+def _velox(group: Any, dataset: Any) -> list[Axis]:
+    """Return the axes y, x and frames of an image of Velox; its metadata are JSON in bytes, a column a frame."""
+    stated = group["Metadata"][:, 0].tobytes().partition(b"\0")[0] if "Metadata" in group else b"{}"
+    facts = json.loads(stated).get("BinaryResult", {})
+    axes = []
+    for name, side, size in zip("yx", ("height", "width"), dataset.shape, strict=False):
+        step = float(facts.get("PixelSize", {}).get(side) or 0)
+        centres = step * np.arange(size) if step > 0 else None
+        axes.append(axis(name, size, centres, {"units": facts.get(f"PixelUnit{name.upper()}", "")}))
+    return [*axes, Axis("frame", dataset.shape[2], None, "", "t")]
+
+
+def _nexus_scaling(group: Any, name: str) -> dict[str, Any]:
+    """Return the scaling of an NXdata field, ``(value + offset) * scaling_factor``, as CF has it."""
+    factor, offset = (
+        float(np.ravel(group.get(f"{name}_{key}", group.get(key, plain)))[0])
+        for key, plain in (("scaling_factor", 1.0), ("offset", 0.0))
+    )
+    return {"scale_factor": factor, "add_offset": offset * factor} if (factor, offset) != (1, 0) else {}
+
+
+def _dream3d(geometry: Any, dataset: Any) -> list[Axis]:
+    """Return the axes of cells of DREAM.3D, whose origin is a corner; spacing and origin are in the order x, y, z."""
+    steps, first = (np.ravel(geometry[key])[::-1] for key in ("SPACING", "ORIGIN"))
+    spatial = [
+        axis(name, size, start + step * (np.arange(size) + 0.5))
+        for name, size, start, step in zip("zyx", dataset.shape, first, steps, strict=False)
+    ]
+    return [*spatial, *(Axis("components", n, None, "", "c") for n in dataset.shape[3:])]
 
 
 def _vigra(tags: Sequence[Any], dataset: Any) -> list[Axis]:

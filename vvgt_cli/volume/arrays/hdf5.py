@@ -1,7 +1,8 @@
 """HDF5 (``.h5``, ``.hdf5``): one dataset, ``FILE:/path/to/dataset``; a contiguous one is memory-mapped. Read by h5py.
 
 Axes come from dimension scales where there are any (https://docs.hdfgroup.org, "HDF5 Dimension Scales"), else from the
-conventions of `conventions`; CF attributes of scaling and missing values are applied.
+conventions of `conventions`, else from names beside the dataset (`beside`). CF attributes of scaling and missing values
+are applied.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, text_of
+from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, on_grids, with_neighbours
+from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.components import choose
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
     DESCRIBES,
@@ -29,22 +31,33 @@ from vvgt_cli.volume.labelled import (
     labelled_volume,
 )
 from vvgt_cli.volume.libraries import library_errors, need, read_part
+from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
 MAX_VISITED = 100_000
+MAX_BESIDE = 1000  # members of a group that are looked at for coordinates
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> Volume:
-    """Read one dataset of an HDF5 file."""
+    """Read one dataset of an HDF5 file, or what Imaris or BigDataViewer have in one."""
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         if is_imaris(file):
             return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
-        if options.level is not None:
-            raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
+    if (volume := bigdataviewer.read_beside(path, options)) is not None:
+        return volume
+    if options.level is not None:
+        raise UsageError(f"{path}: of neither Imaris nor BigDataViewer, which have levels; leave out --level")
+    return read_dataset(path, options)
+
+
+def read_dataset(path: Path, options: ReadOptions) -> Volume:
+    """Read one dataset of an HDF5 file, as it is."""
+    h5py = need("h5py", "hdf5", str(path), "HDF5")
+    with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{printable(dataset.name)}"
         check_storage(h5py, dataset, path, source)
@@ -52,10 +65,12 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY, *NAMING) if key in dataset.attrs}
+        attributes |= {key: up.attrs[key] for up in (file, dataset.parent) for key in GEOMETRY if key in up.attrs}
         axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})
             attributes |= more
+        axes = with_neighbours(axes, _beside(h5py, dataset, path), source, options.spacing is not None)
         chunks = dataset.chunks or dataset.shape
         if mapped is None and options.stored:
             stored = partial(read_part, path, dataset.name)
@@ -76,9 +91,11 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
         _check_links(h5py, file, wanted, path)
         found = file.get(wanted)
         if isinstance(found, h5py.Dataset):
+            on_grids({found.name: (found.shape or (), found.dtype.str)}, str(path))
             return found
         file, wanted = (found, None) if isinstance(found, h5py.Group) else (file, wanted)
-    fits = datasets(h5py, file)
+    known = {d.name: d for d in datasets(h5py, file)}
+    fits = [known[name] for name in on_grids({name: (d.shape, d.dtype.str) for name, d in known.items()}, str(path))]
     rows = [f"{d.name} {d.shape} {d.dtype}" for d in fits]
     first = printable(fits[0].name) if fits else "/path"
     how = f"choose one as {path}:{first} (or with --array)"
@@ -98,13 +115,34 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
         nonlocal seen
         seen += 1
         described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and item.shape and 2 <= len(item.shape) <= 5:
+        numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb"
+        text = numbers and item.dtype == np.uint8 and name.endswith("Metadata")  # of Velox
+        if numbers and not text and 2 <= len(item.shape or ()) <= 5:
             found.append(item)
         return True if seen >= MAX_VISITED else None
 
     group.visititems(visit)
     data = [d for d in found if d.name.rpartition("/")[2] not in described] or found
     return [d for d in data if sum(n > 1 for n in d.shape) >= 3] or data
+
+
+def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
+    """List the datasets in the group of another, and in groups of coordinates beside that or above."""
+    here, found = dataset.parent, {}
+
+    def read(item: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        check_storage(h5py, item, path, f"{path}:{printable(item.name)}")
+        return coordinates_of(item)
+
+    def visit(name: str, item: Any) -> bool | None:  # of no links, which may lead into other files
+        group = item.parent
+        coordinates = GROUPS.fullmatch(group.name.rpartition("/")[2]) and group.parent in (here, here.parent)
+        if isinstance(item, h5py.Dataset) and item != dataset and (group == here or coordinates):
+            found[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(item.shape, partial(read, item))
+        return True if len(found) >= MAX_BESIDE else None
+
+    here.parent.visititems(visit)
+    return found
 
 
 def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:

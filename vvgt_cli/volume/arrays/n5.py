@@ -26,6 +26,7 @@ from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.image import EXTRA
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.stored import put_overlap
@@ -140,7 +141,13 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def read_n5(path: Path, options: ReadOptions) -> Volume:
-    """Read one array of an N5 store, of a pyramid its finest or ``options.level``."""
+    """Read one array of an N5 store, of a pyramid its finest or ``options.level``; BigDataViewer's by its XML."""
+    volume = bigdataviewer.read_beside(path, options)
+    return read_array(path, options) if volume is None else volume
+
+
+def read_array(path: Path, options: ReadOptions) -> Volume:
+    """Read one array of an N5 store, as it is."""
     with library_errors(str(path), "N5"):
         place = _choose(path, options)
         array = _array(place)
@@ -153,6 +160,8 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
     if not path.is_dir() or not holds_n5(path):
         return []
     try:
+        if shapes := bigdataviewer.level_shapes(path, options):
+            return shapes
         return [_array(place).shape for place in _levels(inside(path, options.array))]
     except (OSError, ValueError, TypeError, KeyError, DataError, UsageError):
         return []  # said where it is read

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
 from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import DESCRIBES, Axis, axis, described_by, labelled_volume
@@ -49,6 +50,9 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         source = f"{path}:{variable.name}"
         axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
         _warn_of_curvilinear(variable, attributes, source)
+        beside = _beside(variable)
+        _refuse_mesh(beside, source)
+        axes = with_neighbours(axes, beside, source, options.spacing is not None)
         name = f"{volume_name(path)}:{variable.name}"
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"
@@ -67,6 +71,25 @@ def _warn_of_curvilinear(variable: Any, attributes: dict[str, Any], source: str)
             f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
             "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=2,
         )  # fmt: skip
+
+
+def _beside(variable: Any) -> dict[str, Neighbour]:
+    """List the variables along one of a variable's dimensions in its group."""
+    return {
+        name: Neighbour.of(one.shape, lambda one=one: (one[:], one.__dict__), *one.dimensions)
+        for name, one in variable.group().variables.items()
+        if len(one.dimensions) == 1 and one.dimensions[0] in variable.dimensions
+    }
+
+
+def _refuse_mesh(beside: dict[str, Neighbour], source: str) -> None:
+    """Raise DataError where x and y change along one axis together: cells of a mesh, stations or a path (CF, 9)."""
+    along = {axis(name, 1, None, one.read()[1]).role: one.along for name, one in beside.items()}
+    if "x" in along and along["x"] == along.get("y"):
+        raise DataError(
+            f"{source}: values of a mesh or at stations (x and y both lie along {along['x']}); expected a grid: "
+            "remap them first (cdo remapbil)"
+        )
 
 
 def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
@@ -106,7 +129,11 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
         and name.rpartition("/")[2] not in described
     }  # fmt: skip
     if wanted is not None and wanted.strip("/") in found:
-        return found[wanted.strip("/")]
+        fits = {wanted.strip("/"): found[wanted.strip("/")]}
+    grids = on_grids({name: (v.shape, np.dtype(v.dtype).str) for name, v in fits.items()}, str(path))
+    fits = {name: fits[name] for name in grids}
+    if wanted is not None and wanted.strip("/") in fits:
+        return fits[wanted.strip("/")]
     deep = {name: variable for name, variable in fits.items() if sum(n > 1 for n in variable.shape) >= 3} or fits
     rows = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
     return list(deep.values())[choose(list(deep), rows, wanted, str(path), "variable")]
@@ -119,8 +146,7 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
         found = group.variables.get(name)
         if found is not None and found.shape == (size,) and np.dtype(found.dtype).kind in "iuf":
             stated = {key: found.getncattr(key) for key in found.ncattrs()}
-            scale, offset = float(stated.get("scale_factor", 1.0)), float(stated.get("add_offset", 0.0))
-            return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, stated)
+            return axis(name, size, np.asarray(found[:]), stated)
         group = group.parent
     return axis(name, size)
 

@@ -8,6 +8,9 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO
@@ -15,6 +18,7 @@ from typing import IO
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
@@ -23,6 +27,7 @@ from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
 _HEADER = 1 << 16
+MAX_BESIDE = 1 << 23  # bytes of an array of coordinates
 
 
 def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -42,11 +47,13 @@ def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.d
 
 
 def _volume(
-    values: np.ndarray, shape: tuple[int, ...], fortran: bool, options: ReadOptions, source: str, name: str
-) -> Volume:
+    values: np.ndarray, shape: tuple[int, ...], fortran: bool, options: ReadOptions, source: str, name: str,
+    beside: Mapping[str, Neighbour] | None = None,
+) -> Volume:  # fmt: skip
     """Make a volume of values in file order; axes are z, y, x, and at most one of components at either end."""
     array = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
-    axes = [Axis("", size) for size in shape]
+    on_grids({name.rpartition(":")[2]: (shape, values.dtype.str)}, source)
+    axes = with_neighbours([Axis("", n) for n in shape], beside or {}, source, options.spacing is not None)
     return labelled_volume(array, array.dtype, axes, {}, options, source, name)
 
 
@@ -67,9 +74,15 @@ def read_npz(path: Path, options: ReadOptions) -> Volume:
             members = {name: info for name, info in members.items() if info.filename.endswith(".npy")}
             name = _choose(archive, members, options.array, path)
             values, shape, fortran = _member(archive, members[name], path)
+            small = [key for key, info in members.items() if info.file_size <= MAX_BESIDE and key != name]
+            lines = {}
+            for key in small:
+                with suppress(zipfile.BadZipFile, EOFError, ValueError, zlib.error):  # objects, or damaged
+                    lines[key] = np.load(io.BytesIO(archive.read(members[key])), allow_pickle=False)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise DataError(f"{path}: damaged .npz file ({error}); check that it is whole") from error
-    return _volume(values, shape, fortran, options, f"{path}:{name}", f"{volume_name(path)}:{name}")
+        raise DataError(f"{path}: damaged .npz file ({str(error)[:200]}); check that it is whole") from error
+    beside = {key: Neighbour.of(line.shape, lambda line=line: (line, {})) for key, line in lines.items()}
+    return _volume(values, shape, fortran, options, f"{path}:{name}", f"{volume_name(path)}:{name}", beside)
 
 
 def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wanted: str | None, path: Path) -> str:
@@ -83,10 +96,12 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
         with archive.open(info) as stream:
             head = io.BytesIO(stream.read(_HEADER))
         try:
-            shapes[name], _, _ = _header(head, f"{path}:{name}")
+            shape, _, dtype = _header(head, f"{path}:{name}")
+            shapes[name] = shape, dtype.str
         except (DataError, ValueError):
             continue
-    deep = [name for name, shape in shapes.items() if sum(n > 1 for n in shape) >= 3] or list(members)
+    known = on_grids(shapes, str(path)) or list(members)
+    deep = [name for name in known if sum(n > 1 for n in shapes.get(name, ((), ""))[0]) >= 3] or known
     return deep[choose(deep, deep, None, str(path))]
 
 

@@ -7,7 +7,11 @@ unpickles.
 
 from __future__ import annotations
 
+import base64
 import json
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +19,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import hex_color
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.types import Volume
 
 _CODECS = {
@@ -43,12 +49,30 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
         array = _array(zarr, place)
-        attributes = dict(array.attrs)
+        attributes = _marked(array)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
-        return labelled_volume(
+        axes = with_neighbours(axes, _beside(zarr, path, place), str(place), options.spacing is not None)
+        volume = labelled_volume(
             lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
             name_in(path, place), array.chunks,
         )  # fmt: skip
+        if (labels := _ome(place.parent).get("image-label")) is None:
+            return volume
+        return replace(volume, segments=segments_in(lambda: _segments(labels), str(place)))
+
+
+def _segments(labels: dict[str, Any]) -> list[Segment]:
+    """Return the segments of OME-Zarr's ``image-label``: named by the first text of their properties."""
+    colors = {int(one["label-value"]): [v / 255 for v in one["rgba"]] for one in labels.get("colors") or []}
+    properties = {int(one["label-value"]): one for one in labels.get("properties") or []}
+    found = []
+    for number in colors.keys() | properties.keys():
+        named = {key: text for key, text in properties.get(number, {}).items() if isinstance(text, str)}
+        name = next((named[key] for key in ("name", "class", "label") if key in named), next(iter(named.values()), ""))
+        red, green, blue, opacity = colors.get(number, (0.0, 0.0, 0.0, None))
+        color = None if opacity is None else (red, green, blue)
+        found.append(Segment(number, name, color, opacity=opacity if number else 0.0))
+    return found
 
 
 def _array(zarr: Any, place: Path) -> Any:
@@ -61,6 +85,21 @@ def _array(zarr: Any, place: Path) -> Any:
     if server:
         server.allow(min(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize, MAX_CHUNK))
     return array
+
+
+def _marked(array: Any) -> dict[str, Any]:
+    """Return an array's attributes with its ``_FillValue`` where xarray puts it.
+
+    That is the fill value of a version 2 array with named dimensions, where it is not 0, Zarr's default, for values
+    that are not packed; version 3 has floats of 8 bytes as base64.
+    """
+    attributes = dict(array.attrs)
+    if "_ARRAY_DIMENSIONS" in attributes and (array.fill_value or "scale_factor" in attributes):
+        attributes.setdefault("_FillValue", array.fill_value)
+    text = attributes.get("_FillValue")
+    if isinstance(text, str) and len(text) == 12:
+        attributes["_FillValue"] = np.frombuffer(base64.b64decode(text), "<f8")
+    return attributes
 
 
 def name_in(path: Path, place: Path) -> str:
@@ -116,6 +155,7 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
     here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
+        on_grids({here.name: (facts["shape"], _type(facts))}, str(path))
         return here, facts
     level = _multiscale(here)
     if number is not None and not level:
@@ -127,10 +167,17 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
         if place.resolve().is_relative_to(path.resolve()):
             return place, _metadata(place)
     fits = _arrays(here if facts else path)
-    names = [p.relative_to(path).as_posix() for p, _ in fits]
+    shown = {p.relative_to(path).as_posix(): (p, f) for p, f in fits}
+    names = on_grids({name: (f["shape"], _type(f)) for name, (_, f) in shown.items()}, str(path))
+    fits = [shown[name] for name in names]
     rows = [f"{name} {facts['shape']}" for name, (_, facts) in zip(names, fits, strict=True)]
     how = f"choose one as {path}:/PATH (or with --array)"
     return fits[choose(names, rows, None if facts else wanted, str(path), how=how)]
+
+
+def _type(facts: dict[str, Any]) -> str:
+    """Return the type of an array's values, as either version names it."""
+    return str(facts.get("data_type", facts.get("dtype")))
 
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
@@ -190,17 +237,38 @@ def _axes(
             axes.append(axis(name, size))
             continue
         _check_codecs(beside, coordinate)
-        centres = np.asarray(_array(zarr, beside)[:size])
-        numbers = centres.dtype.kind in "iuf"
-        axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
+        stored = _array(zarr, beside)
+        centres = np.asarray(stored[:size]) if stored.dtype.kind in "iuf" else None
+        axes.append(axis(name, size, centres, _marked(stored)))
     return axes
+
+
+def _beside(zarr: Any, path: Path, place: Path) -> dict[str, Neighbour]:
+    """List the arrays along one axis in the group of another; none where a server does not list folders."""
+
+    def line(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
+        array = _array(zarr, folder)
+        return np.asarray(array[:]), _marked(array)
+
+    found = {}
+    with suppress(OSError, NotImplementedError):
+        for folder in place.parent.iterdir() if place != path else ():
+            facts = _metadata(folder) if folder.is_dir() and not folder.is_symlink() and folder != place else {}
+            if facts.get("node_type") == "array":
+                found[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
+    return found
+
+
+def _ome(group: Path) -> dict[str, Any]:
+    """Return the attributes of a group that OME-Zarr defines; from version 0.5 on they lie in ``ome``."""
+    attributes = _attributes(group)
+    inner = attributes.get("ome")
+    return inner if isinstance(inner, dict) else attributes
 
 
 def _multiscale(group: Path) -> dict[str, Any]:
     """Return the first image of an OME-Zarr group; empty where it has none."""
-    attributes = _attributes(group)
-    inner = attributes.get("ome")
-    images = (inner if isinstance(inner, dict) else attributes).get("multiscales")
+    images = _ome(group).get("multiscales")
     if isinstance(images, list) and images and isinstance(images[0], dict) and images[0].get("datasets"):
         return images[0]
     return {}
@@ -242,9 +310,7 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
 
 def _rendering(group: Path, count: int) -> tuple[tuple[str, ...], tuple[tuple[float, float, float] | None, ...]]:
     """Return names and RGB of the channels by the rendering settings (``omero``); none where their number differs."""
-    attributes = _attributes(group)
-    inner = attributes.get("ome")
-    omero = (inner if isinstance(inner, dict) else attributes).get("omero")
+    omero = _ome(group).get("omero")
     channels = omero.get("channels") if isinstance(omero, dict) else None
     if not isinstance(channels, list) or len(channels) != count or not all(isinstance(c, dict) for c in channels):
         return (), ()

@@ -19,6 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Files, Source, choose_series, headers_in, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
@@ -97,6 +98,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
         slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
         slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
+        slices, unit = in_suv(slices, [header for _, header in chosen], options.suv, path)
         normal = np.cross(*slices[0].rows)
         slices.sort(key=lambda s: float(s.position @ normal))
         spacing, direction, heights = _geometry(slices, path, options)
@@ -110,7 +112,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         f"{path.resolve().name.removesuffix('.dcm').removesuffix('.zip')}{title}", slope, intercept,
         "LPS" if slices[0].placed else None, all(s.hounsfield for s in slices),
         None if reference is None else str(reference),
-        modality=printable(str(slices[0].header.get("Modality", "")))[:16],
+        modality=printable(str(slices[0].header.get("Modality", "")))[:16], value_unit=unit,
     )  # fmt: skip
     return volume if heights is None else _resampled(volume, heights, options, path)
 
@@ -196,10 +198,13 @@ def _frame(source: Source, header: Any, groups: list[Any], k: int, options: Read
     cosines = item("PlaneOrientationSequence", "ImageOrientationPatient")
     between = item("PixelMeasuresSequence", "PixelSpacing")
     placed = position is not None and cosines is not None
-    if options.spacing is None and (not placed or between is None):
+    stated = {"ImagePositionPatient": position, "ImageOrientationPatient": cosines, "PixelSpacing": between}
+    missing = [key for key, value in stated.items() if value is None]
+    if options.spacing is None and missing:
+        width = "" if between is None else f" (PixelSpacing is {between[1]:g} x {between[0]:g})"
         raise DataError(
-            f"{source}: no ImagePositionPatient, ImageOrientationPatient and PixelSpacing; expected all, or --spacing "
-            "X Y Z to stack images in the order of their numbers"
+            f"{source}: no {', '.join(missing)}{width}; expected it, or --spacing X Y Z to stack images in the "
+            "order of their numbers"
         )
     x, y, z = options.spacing or (1.0, 1.0, 1.0)
     if not placed:
@@ -269,10 +274,13 @@ def _dose_offset(source: Source, header: Any, k: int, normal: np.ndarray) -> np.
 
 
 def _tiles(mosaic: _Slice, n: int, stated: np.ndarray | None) -> Iterator[_Slice]:
-    """Yield the ``n`` slices of a mosaic; its position is that of a slice of its own size around the same centre."""
+    """Yield the ``n`` slices of a mosaic; its position is that of a slice of its own size around the same centre.
+
+    Tiles have whole pixels; what they do not fill on the right and below is padding (as nibabel and dcm2niix have it).
+    """
     header, edge = mosaic.header, math.ceil(math.sqrt(n))
     rows, columns = int(header.Rows), int(header.Columns)
-    if rows % edge or columns % edge:
+    if min(rows, columns) < edge:
         raise DataError(
             f"{mosaic.source}: a mosaic of {columns} x {rows} pixels with {n} slices; expected {edge} tiles a side"
         )
@@ -282,7 +290,7 @@ def _tiles(mosaic: _Slice, n: int, stated: np.ndarray | None) -> Iterator[_Slice
     step = float(header.get("SpacingBetweenSlices") or header.get("SliceThickness") or 0)
     if step <= 0:
         raise DataError(f"{mosaic.source}: a mosaic without SpacingBetweenSlices; expected it, or --spacing X Y Z")
-    shift = (columns - columns // edge) / 2 * mosaic.spacing[0], (rows - rows // edge) / 2 * mosaic.spacing[1]
+    shift = (columns - columns / edge) / 2 * mosaic.spacing[0], (rows - rows / edge) / 2 * mosaic.spacing[1]
     first = mosaic.position + np.array(shift) @ mosaic.rows
     for k in range(n):
         yield replace(mosaic, frame=k, position=first + k * step * normal, tiles=edge)
@@ -398,5 +406,6 @@ def _decoded(one: _Slice) -> np.ndarray:
         values = apply_modality_lut(values, dataset)
     if one.tiles > 1:
         rows, columns = (n // one.tiles for n in values.shape[:2])
+        values = values[: rows * one.tiles, : columns * one.tiles]
         values = values.reshape(one.tiles, rows, one.tiles, columns).swapaxes(1, 2)
     return values

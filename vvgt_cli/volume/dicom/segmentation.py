@@ -7,7 +7,6 @@ another thing, contours, and not read: no library that is kept fills them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +17,11 @@ from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.types import Volume, triple
 
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
 EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A segment as a header describes it.
-
-    Attributes:
-        number: its voxels' value.
-        name: its label.
-        color: RGB in [0, 1]; None where the file says none.
-        terms: (scheme, value, meaning) of category, type, type modifier, region and region modifier, "" where it says
-            none.
-    """
-
-    number: int
-    name: str
-    color: tuple[float, float, float] | None
-    terms: tuple[tuple[str, str, str], ...]
 
 
 def is_segmentation(header: Any) -> bool:
@@ -151,10 +133,12 @@ def read_segmentation(path: Path, options: ReadOptions) -> Volume:
             ) from None
     steps = found.affine[:3, 2::-1]  # of column, row and slice
     spacing = np.linalg.norm(steps, axis=0)
+    own = segments_in(lambda: [one for one in segments(source) if one.number in chosen], source)
     return Volume(
         np.ascontiguousarray(found.array), options.spacing_or((spacing[0], spacing[1], spacing[2])),
         tuple(found.affine[:3, 3].tolist()), tuple((steps / spacing).ravel().tolist()),
         path.resolve().name.removesuffix(".dcm"), space="LPS", reference=str(read.FrameOfReferenceUID),
+        segments=own,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom import is_dicom
+from vvgt_cli.volume.dicom.pet import TAGS as PET
 from vvgt_cli.volume.dicom.segmentation import is_segmentation
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES
 from vvgt_cli.volume.headers import printable
@@ -36,8 +37,9 @@ Source = Path | zipfile.Path
 HEAD = 1024  # bytes that tell DICOM from other formats
 MAX_FILES = 100_000  # files
 TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
-TAGS = [  # all that is read of a header but its pixels: those of scanners hold up to a megabyte of other things
+TAGS: list[Any] = [  # all that is read of a header but its pixels: scanners' hold up to a megabyte of other things
     *ATTRIBUTES,
+    *PET,
     *("SOPClassUID", "SOPInstanceUID", "Modality", "SeriesDescription", "SeriesInstanceUID", "SeriesNumber"),
     *("InstanceNumber", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "FrameOfReferenceUID"),
     *("Rows", "Columns", "SamplesPerPixel", "NumberOfFrames", "PhotometricInterpretation", "SliceThickness"),

@@ -51,6 +51,7 @@ def is_minc(head: bytes) -> bool:
     return classic or (head.startswith(HDF5) and b"minc-2.0" in head)
 
 
+MASKS = Reader("masks", (), lazy("medical.masks.read_masks"), holds=lazy("medical.masks.mask_files"), whole=True)
 FORMATS = (
     Reader("NIfTI", (".nii", ".nii.gz", ".hdr", ".hdr.gz"), lazy("medical.nifti.read_nifti"), is_nifti, ("time",)),
     Reader("Analyze", (".img", ".img.gz"), lazy("medical.nifti.read_analyze"), is_analyze, ("time",), by_name=True),
@@ -71,4 +72,5 @@ FORMATS = (
         "MetaImage", (".mha", ".mhd"), lazy("medical.metaimage.read_metaimage"),
         lambda head: _META.match(head) is not None, by_name=True,
     ),
+    MASKS,
 )  # fmt: skip

@@ -5,22 +5,29 @@ Format: https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/MghFormat; all numb
 
 from __future__ import annotations
 
+import gzip
+import io
 import math
 import struct
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import read_head
+from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.medical import MGH_HEADER, MGH_TYPES, is_mgh
 from vvgt_cli.volume.medical.nifti import Frames, load_frames
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import FLAT, Volume
 
 DATA = 284  # where values begin
+COLOR_TABLE = struct.pack(">ii", 1, -2)  # behind them: the tag of a colour table, and its version
 # without "good RAS": steps of 1 mm on the coronal slices of FreeSurfer's own volumes
 _CORONAL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -40,4 +47,30 @@ def read_mgh(path: Path, options: ReadOptions) -> Volume:
     origin = centre - np.array(sizes[:3]) / 2 @ axes
     frames = Frames(path, np.dtype(">" + MGH_TYPES[kind]), tuple(sizes), DATA, encoding)
     field, _ = load_frames(frames, options, str(path))
-    return placed(field, axes, origin, options, volume_name(path), space="RAS")
+    volume = placed(field, axes, origin, options, volume_name(path), space="RAS")
+    behind = DATA + math.prod(sizes) * frames.dtype.itemsize
+    try:
+        with (gzip.open if encoding == "gzip" else open)(path, "rb") as file:
+            file.seek(behind)
+            table = file.read(MAX_HEADER).partition(COLOR_TABLE)[2]
+    except (OSError, EOFError, zlib.error):  # the values are there
+        table = b""
+    return replace(volume, segments=segments_in(lambda: table_entries(table), str(path))) if table else volume
+
+
+def table_entries(content: bytes) -> list[Segment]:
+    """Return the entries of a colour table of version 2 (colortab.cpp: CTABreadFromBinaryV2); T is transparency."""
+    table = io.BytesIO(content)
+
+    def number() -> int:
+        return int(struct.unpack(">i", table.read(4))[0])
+
+    def text() -> str:
+        return table.read(number()).split(b"\0")[0].decode("utf-8", "replace")
+
+    _, _, found = number(), text(), list[Segment]()  # entries that there may be, file that they come from
+    for _ in range(number()):
+        label, name, *color = number(), text(), number(), number(), number(), number()
+        red, green, blue, clear = (value / 255 for value in color)
+        found.append(Segment(label, name, (red, green, blue), opacity=1 - clear if label else 0.0))
+    return found

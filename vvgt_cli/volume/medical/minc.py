@@ -5,6 +5,7 @@ The values of a slice run from image-min to image-max. Format: https://en.wikibo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.arrays.conventions import text_of
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import magnitude, select_component
+from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, volume_name
@@ -54,7 +56,7 @@ class _Image:
 
 
 def read_minc(path: Path, options: ReadOptions) -> Volume:
-    """Read a MINC file as float32. A fourth axis is time."""
+    """Read a MINC file as float32. An axis that is neither of space nor named ``time`` is of components."""
     with open(path, "rb") as file:
         packed = file.read(len(HDF5)) == HDF5
     with library_errors(str(path), "MINC"):
@@ -131,32 +133,43 @@ def _ends(
 
 
 def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
-    shape = image.shape
-    spatial = image.names[-3:]
-    if len(shape) not in (3, 4) or min(shape) < 1 or set(spatial) != set(AXES) or image.dtype.kind not in "iuf":
+    spatial = [k for k, name in enumerate(image.names) if name in AXES]
+    times = [k for k, name in enumerate(image.names) if name == "time"]
+    parts = [k for k in range(len(image.names)) if k not in (*spatial, *times)]
+    if len(spatial) != 3 or len({*image.names}) != len(image.shape) or len(times + parts) > 2 or len(parts) > 1 or (
+        min(image.shape) < 1 or image.dtype.kind not in "iuf"
+    ):  # fmt: skip
         raise DataError(
-            f"{path}: axes {', '.join(image.names)} of {shape} values of type {image.dtype}; expected three in space, "
-            "and time before them"
+            f"{path}: axes {', '.join(image.names)} of {image.shape} values of type {image.dtype}; expected three in "
+            "space, and at most one each of time and components"
         )
-    step = options.step(shape[0] if len(shape) == 4 else 1, str(path))
-    if options.component not in (None, 0):
-        raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
-    lead = (step,) if len(shape) == 4 else ()
-    read, chunk = _scaled(image, lead, path), (1, *shape[-2:])
-    field = stored_or_loaded(read, np.dtype(np.float32), shape[-3:], chunk, str(path), options.stored)
-    return placed(field, *_place(image.axes, spatial, path), options, volume_name(path), space="RAS")
+    n, shape = math.prod(image.shape[k] for k in parts), tuple(image.shape[k] for k in spatial)
+    fixed = dict.fromkeys(times, options.step(image.shape[times[0]] if times else 1, str(path)))
+    select_component(np.zeros((1, 1, 1, n)), options.component, str(path), label="each voxel")  # or raise
+    chosen = range(n) if options.component == "magnitude" else [int(options.component or 0)]
+    read = [_scaled(image, spatial, fixed | dict.fromkeys(parts, k), path) for k in chosen]
+
+    def norm(slices: Slices) -> np.ndarray:
+        return magnitude(np.stack([part(slices) for part in read], -1))
+
+    one = norm if len(read) > 1 else read[0]
+    field = stored_or_loaded(one, np.dtype(np.float32), shape, (1, *shape[1:]), str(path), options.stored)
+    names = tuple(image.names[k] for k in spatial)
+    return placed(field, *_place(image.axes, names, path), options, volume_name(path), space="RAS")
 
 
-def _scaled(image: _Image, lead: tuple[int, ...], path: Path) -> Callable[[Slices], np.ndarray]:
-    """Make a function that reads the values of a box, scaled."""
+def _scaled(image: _Image, spatial: list[int], fixed: dict[int, int], path: Path) -> Callable[[Slices], np.ndarray]:
+    """Make a function that reads the values of a box, scaled, at ``fixed`` places of the axes that are not spatial."""
     low, high = _valid(image, path)
 
     def part(slices: Slices) -> np.ndarray:
-        z, y, x = (range(*s.indices(n)) for s, n in zip(slices, image.shape[-3:], strict=True))
+        z, y, x = (range(*s.indices(image.shape[k])) for s, k in zip(slices, spatial, strict=True))
         out = np.empty((len(z), len(y), len(x)), np.float32)
         deep = max(SLAB // max(len(y) * len(x), 1), 1)
         for k in range(0, len(z), deep):
-            index = (*lead, slice(z.start + k, min(z.start + k + deep, z.stop)), slices[1], slices[2])
+            box = (slice(z.start + k, min(z.start + k + deep, z.stop)), *slices[1:])
+            at: dict[int, Any] = fixed | dict(zip(spatial, box, strict=True))
+            index = tuple(at[axis] for axis in range(len(image.shape)))
             values = image.read(index)
             if image.ends is not None and image.dtype.kind != "f":
                 first, last = (_along(end, index) for end in image.ends)

@@ -20,9 +20,11 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, load_block, read_head
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.medical import NIFTI_MAGIC, byte_order, is_analyze, is_nifti
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.segments import segments_in, segments_of_xml
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
@@ -32,6 +34,7 @@ _DTYPES = {
 _SPM = {130: "i1", 132: "u2", 136: "u4"}
 _COLORS = {128: 3, 2304: 4}  # bytes a voxel
 _OTHERS = {1: "bits", 32: "complex64", 1536: "128-bit floats", 1792: "complex128", 2048: "complex256"}
+_VECTORS = {*range(1004, 1011), 2003, 2004, *range(2006, 2010), 2016, 2017}  # intents (nifti1.h, FSL's) of components
 HEADER = 540  # bytes of the longer one
 
 
@@ -70,11 +73,12 @@ def parse_header(head: bytes, name: str) -> Header:
         offset, slope, intercept = get("3f", 108)
         q_code, s_code = get("2h", 252)
         quatern, sform, units, (start,) = get("6f", 256), get("12f", 280), head[123], get("f", 136)
+        (intent,) = get("h", 68)
     else:
         magic, dim, (code,), pixdim = head[4:8], get("8q", 16), get("h", 12), get("8d", 104)
         (offset,), (slope, intercept) = get("q", 168), get("2d", 176)
         q_code, s_code = get("2i", 344)
-        quatern, sform, (units,), (start,) = get("6d", 352), get("12d", 400), get("i", 500), get("d", 216)
+        quatern, sform, (units, intent), (start,) = get("6d", 352), get("12d", 400), get("2i", 500), get("d", 216)
     if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
         raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
     if code not in _DTYPES and code not in _COLORS:
@@ -86,8 +90,9 @@ def parse_header(head: bytes, name: str) -> Header:
         raise DataError(f"{name}: vox_offset {offset}; expected 0 or more")
     single = NIFTI_MAGIC[magic]
     least = {1: 352, 2: 544}[version] if single else 0
+    dims = dim[1 : dim[0] + 1]
     return Header(
-        dim[1 : dim[0] + 1],
+        (*dims[:3], 1, dims[3]) if intent in _VECTORS and len(dims) == 4 else dims,
         np.dtype(order + _DTYPES.get(code, "u1")),
         single,
         max(int(offset), least),
@@ -159,12 +164,21 @@ def other_of_pair(path: Path, suffix: str) -> Path | None:
 def read_nifti(path: Path, options: ReadOptions) -> Volume:
     """Read a NIfTI file; plain files are memory-mapped. The fourth axis is time, those beyond it are components.
 
-    Where the fourth axis is the only one beyond space, ``component`` is taken for it too.
+    The fourth is of components, too, where the intent is a vector. Where it is the only one beyond space, ``component``
+    is taken for it in any case.
 
-    sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
+    sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume. An extension with a
+    table of labels in XML (Workbench, TotalSegmentator) gives its segments.
     """
     head, encoding = read_head(path, HEADER)
-    return _volume(parse_header(head, str(path)), path, encoding, options)
+    header = parse_header(head, str(path))
+    volume = _volume(header, path, encoding, options)
+    if header.offset <= HEADER + 4 or not header.single:
+        return volume
+    text = read_head(path, min(header.offset, MAX_HEADER))[0]
+    if not (table := re.search(rb"<LabelTable\b.*?</LabelTable>", text, re.DOTALL)):
+        return volume
+    return replace(volume, segments=segments_in(lambda: segments_of_xml(table[0]), str(path)))
 
 
 def _volume(header: Header, path: Path, encoding: str, options: ReadOptions) -> Volume:

@@ -25,8 +25,9 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed, unit_rows
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 
 _ENCODINGS = {
     "raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2", "text": "text", "txt": "text",
@@ -34,6 +35,7 @@ _ENCODINGS = {
 }  # fmt: skip
 _SPATIAL_KINDS = {"domain", "space", "???", "none"}
 MAX_FILES = 100_000
+_SEGMENT = re.compile(r"Segment([0-9]{1,9})_(\w+):=")
 _SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
@@ -50,9 +52,13 @@ def read_header(path: Path) -> tuple[HeaderFields, int]:
             if not text:
                 break
             key, colon, value = text.partition(":")
-            if not text.startswith("#") and colon and not value.startswith("="):
-                name = key.strip().lower().replace(" ", "")  # teem takes most names with and without blanks
-                fields[{"centerings": "centers"}.get(name, name)] = value.strip()
+            if text.startswith("#") or not colon:
+                continue
+            if value.startswith("="):  # a key and a value that teem leaves to programs
+                fields[f"{key}:="] = value[1:].strip()
+                continue
+            name = key.strip().lower().replace(" ", "")  # teem takes most names with and without blanks
+            fields[{"centerings": "centers"}.get(name, name)] = value.strip()
         return fields, file.tell()
 
 
@@ -250,6 +256,9 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
     vectors = _vectors(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
     place = _place(fields, vectors, axis, sizes, options) | {"options": options, "name": volume_name(path)}
+    if any(_SEGMENT.fullmatch(key) for key in fields):
+        layer = options.component if isinstance(options.component, int) else None
+        place["segments"] = segments_in(lambda: segments(fields, layer), str(path))
     if isinstance(block, Packed):
         return placed(block, **place)
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
@@ -268,6 +277,35 @@ def _volume(path: Path, fields: HeaderFields, block: np.ndarray, sizes: list[int
         )
     field, _ = select_component(block, component, str(path), label=label, color=color)
     return placed(field, **place)
+
+
+def segments(fields: HeaderFields, layer: int | None = None) -> list[Segment]:
+    """Return the segments in a header of 3D Slicer's .seg.nrrd, of one layer or of all, or raise DataError."""
+    found, stated = [], dict[str, dict[str, str]]()
+    for key, value in fields.items():
+        if match := _SEGMENT.fullmatch(key):
+            stated.setdefault(match[1], {})[match[2]] = value
+    for index, one in stated.items():
+        color, label = one.get("Color", "").split(), one.get("LabelValue", str(int(index) + 1))
+        try:
+            rgb = triple(map(float, color)) if color else None
+            segment = Segment(int(label), one.get("Name", one.get("ID", "")), rgb, _terms(one.get("Tags", "")))
+        except ValueError:
+            text = f"{fields.name}: segment {index}: label {label[:40]!r}, colour {color[:5]}; expected numbers"
+            raise DataError(text) from None
+        found += [segment] if layer is None or one.get("Layer", "0") == str(layer) else []
+    return found
+
+
+def _terms(tags: str) -> tuple[tuple[str, str, str], ...]:
+    """Return `Segment.terms` of the tags of a segment; none if they are not as 3D Slicer writes them.
+
+    The entry is ``context~category~type~modifier~context~region~modifier``, each code ``scheme^value^meaning``.
+    """
+    entry = next((tag for tag in tags.split("|") if tag.startswith("TerminologyEntry:")), "")
+    fields = entry.partition(":")[2].split("~")
+    codes = [triple(code) for k, field in enumerate(fields) if k not in (0, 4) and len(code := field.split("^")) == 3]
+    return tuple(codes) if len(codes) == 5 and len(fields) == 7 else ()
 
 
 def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:

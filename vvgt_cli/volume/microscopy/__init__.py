@@ -1,4 +1,4 @@
-"""Files of microscopes: Leica, Nikon and Zeiss; Imaris' are HDF5 files, which `arrays.hdf5` hands over."""
+"""Files of microscopes: Leica, Nikon, Zeiss, BigDataViewer; Imaris' are HDF5 files, which `arrays.hdf5` hands over."""
 
 from __future__ import annotations
 
@@ -13,5 +13,9 @@ FORMATS = (
         lambda head: head[:4] == b"\x70\0\0\0" and head[8:9] == b"\x2a", _TAKES,
     ),
     Reader("ND2", (".nd2",), lazy("microscopy.nikon.read_nd2"), lambda head: head.startswith(ND2_MAGIC), _TAKES),
+    Reader(
+        "BigDataViewer", (), lazy("microscopy.bigdataviewer.read_bdv"), lambda head: b"<SpimData" in head, _TAKES,
+        levels=lazy("microscopy.bigdataviewer.level_shapes"),
+    ),
     Reader("CZI", (".czi",), lazy("microscopy.zeiss.read_czi"), lambda head: head.startswith(b"ZISRAWFILE"), _TAKES),
 )  # fmt: skip

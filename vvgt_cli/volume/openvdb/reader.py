@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import choose, select_component
+from vvgt_cli.volume.components import choose, listed, select_component
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
@@ -27,9 +29,11 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
+LOOKS = dict.fromkeys(("density", "smoke"), "smoke") | dict.fromkeys(("flame", "flames", "temperature", "heat"), "fire")
+
 
 def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
-    """Choose the grid of a name; without one the only grid of scalars, else the only grid.
+    """Choose the grid of a name; without one "density", the only grid of scalars, or else the only grid.
 
     Raises:
         UsageError: no such grid, or several and no choice.
@@ -38,6 +42,13 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
     how = "choose one with --grid NAME"
     if wanted is None:
         found = [g for g in grids if g.readable and g.components == 1] or grids
+        densities = [g for g in found if g.name == "density"]
+        if len(found) > len(densities) == 1:
+            found = densities
+            others = listed([g.label for g in grids if g is not found[0]])
+            warnings.warn(
+                f"{source}: grid density; --grid, or a --layer with array=, takes another: {others}", stacklevel=3
+            )
         names = [g.label for g in found]
     else:
         found, names = grids, [g.label for g in grids]
@@ -86,6 +97,8 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
         placement.at(lo),
         placement.direction,
         volume_name(path),
+        quantity=printable(grid.name),
+        preset=LOOKS.get(grid.name, ""),
     )
 
 

@@ -1,4 +1,4 @@
-"""Formats of plain values: raw files, and what Inviwo, Amira and VolVis put before or beside them."""
+"""Formats of plain values: raw files, and what Inviwo, Amira, VGStudio and VolVis put before or beside them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,10 @@ FORMATS = (
     Reader(
         "Inviwo .dat", (".dat",), lazy("plain.inviwo.read_inviwo"),
         lambda head: _INVIWO.search(head) is not None, by_name=True,
+    ),
+    Reader(
+        "VGStudio", (".vgi",), lazy("plain.vgi.read_vgi"),
+        lambda head: re.match(rb"\s*\{\w+\}\s*\[", head) is not None, takes=("array",),
     ),
     Reader("SLC", (".slc",), lazy("plain.slc.read_slc"), lambda head: re.match(rb"11111\s+\d", head) is not None),
 )  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 import mmap
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,9 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.segments import Segment, segments_in
 from vvgt_cli.volume.space import one_unit, placed
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 
 _TYPES = ("byte", "short", "ushort", "int", "float", "double")
 _STREAM = re.compile(  # place, type, components, name, number, encoding, length
@@ -76,7 +78,24 @@ def _placed(field: np.ndarray, fields: HeaderFields, text: str, path: Path, opti
     stated = re.search(r'\bUnits\s*\{[^}]*?\bCoordinates\s+"([^"\n]*)"', text)
     _, unit = one_unit(["" if stated is None else stated[1]], str(path), options.spacing is not None)
     origin = (np.append(low, 1.0) @ matrix)[:3]
-    return placed(field, step[:, None] * matrix[:3, :3], origin, options, volume_name(path), unit=unit)
+    own = re.search(r"\bMaterials\s*\{((?:[^{}]|\{[^{}]*\})*)\}", text)
+    volume = placed(field, step[:, None] * matrix[:3, :3], origin, options, volume_name(path), unit=unit)
+    if own is None or not re.search(r"\bLabels\b", text):
+        return volume
+    return replace(volume, segments=segments_in(lambda: _materials(own[1]), str(path)))
+
+
+def _materials(text: str) -> list[Segment]:
+    """Return the segments of Amira's materials, ``NAME { Id N, Color R G B }``; the first is 0, the exterior.
+
+    Values of a label field count them in their order, whatever their Id is.
+    """
+    found = []
+    for number, (name, inner) in enumerate(re.findall(r'([^\s{}"]+|"[^"\n]*")\s*\{([^{}]*)\}', text)):
+        color = re.search(r"\bColor\s+([^,\n]+)", inner)
+        rgb = None if color is None else triple(float(word) for word in color[1].split()[:3])
+        found.append(Segment(number, name.strip('"'), rgb))
+    return found
 
 
 def _values(

@@ -96,6 +96,7 @@ def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
 
 
 def lazy_pages(
+    open_file: Callable[[Path], Any],
     path: Path,
     number: int,
     lead: tuple[int, ...],
@@ -107,6 +108,7 @@ def lazy_pages(
     """Wrap the slices of a series that are pages, as (z, y, x).
 
     Args:
+        open_file: makes a `tifffile.TiffFile` of the path.
         path: the file.
         number: of the series.
         lead: sizes of the axes that count pages.
@@ -124,9 +126,7 @@ def lazy_pages(
 
     @cache
     def opened() -> tuple[Any, Any, Pages]:
-        import tifffile
-
-        file = tifffile.TiffFile(path)
+        file = open_file(path)
         return file, file.series[number], Pages(path)  # the file to keep it open
 
     def read(k: int) -> np.ndarray:

@@ -33,7 +33,8 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.tiff.decode import Pages
-from vvgt_cli.volume.tiff.pages import MAX_PAGES, check_pages, lazy_pages
+from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
+from vvgt_cli.volume.tiff.pages import check_pages, lazy_pages
 from vvgt_cli.volume.types import Volume, triple
 
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
@@ -70,11 +71,9 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         options: see `ReadOptions`.
         slices: how many slices a volume has, if the file is one of them.
     """
-    import tifffile
-
     check_pages(path)
-    with library_errors(str(path), "TIFF"), _silent(), tifffile.TiffFile(path) as file:
-        root = ome_root(file.ome_metadata, path) if file.is_ome and file.ome_metadata else None
+    with library_errors(str(path), "TIFF"), _silent(), open_tiff(path) as file:
+        root = ElementTree.fromstring(file.ome_metadata) if file.is_ome and file.ome_metadata else None
         count_planes(file)
         series, number = _series(file, options.array, path)
         facts = _facts(file, root, series, number, path)
@@ -85,7 +84,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
             _whole(series, path)
             lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
             turned = layout.axes.index("X") < layout.axes.index("Y")
-            field: Any = lazy_pages(path, number, lead, inner, index, np.dtype(series.dtype), turned)
+            field: Any = lazy_pages(open_tiff, path, number, lead, inner, index, np.dtype(series.dtype), turned)
         else:
             values = _values(file, series, layout, index, path)
             field = _arranged(values, layout, index, several, path, options.stored and mapped)
@@ -145,7 +144,7 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
     """Return the facts of a series; check that its pages are those that they describe."""
     facts = Facts()
     if root is not None:
-        facts = ome_facts(root, number, len(file.series))
+        facts = ome_facts(root, number, series.name, len(file.series), path)
         if series.kind not in ("ome", "imagej", "mmstack"):
             raise DataError(f"{path}: its OME-XML does not fit its pages; check that the file is whole")
     if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
@@ -261,7 +260,6 @@ def _whole(series: Any, path: Path) -> None:
 
 
 MICROMETRE = 1e-6  # metres
-_MOST_FILES = 10_000
 _OTHER_NAMES = {"A": "angstrom", "in": "inch", "inches": "inch", "pixels": "pixel"}
 _PER = {2: "inch", 3: "cm"}  # ResolutionUnit, tag 296
 
@@ -301,74 +299,25 @@ class Facts:
         return (x or across, y or across, z or across), [*self.assumed, *width, *depth]
 
 
-def ome_root(xml: str, path: Path) -> ElementTree.Element:
-    """Parse OME-XML that is safe to be read by a library, and return its root.
+def ome_facts(root: ElementTree.Element, series: int, name: str, count: int, path: Path) -> Facts:
+    """Return the facts of image ``series`` of ``count``, by its ``name`` where others of the XML have no pages.
 
-    Raises:
-        DataError: XML that declares entities, is damaged, or names sizes, ranges or files that cannot be.
+    Raise DataError where several images, or none, have that name.
     """
-    if "<!DOCTYPE" in xml or "<!ENTITY" in xml:
-        raise DataError(f"{path}: OME-XML that declares entities; expected plain OME-XML")
-    try:
-        root = ElementTree.fromstring(xml)
-    except ElementTree.ParseError as error:
-        raise DataError(f"{path}: damaged OME-XML ({error}); check that the file is whole") from error
-    names: set[str] = set()
-    for element in root.iter():
-        _check_element(element, path)
-        if _tag(element) == "UUID" and element.get("FileName"):
-            names.add(str(element.get("FileName")))
-    if len(names) > _MOST_FILES:
-        raise DataError(f"{path}: OME-XML of {len(names)} files; expected at most {_MOST_FILES}")
-    for name in sorted(names - {path.name}):
-        if Path(name).name != name or "\\" in name:
-            raise DataError(f"{path}: OME-XML names the file {name!r}; expected names in its own folder")
-        beside = path.with_name(name)
-        if not beside.is_file():
-            raise DataError(f"{path}: OME-XML names the file {name}, which is not beside it; fetch the whole set")
-        check_pages(beside)
-    return root
-
-
-def _check_element(element: ElementTree.Element, path: Path) -> None:
-    tag = _tag(element)
-    if tag == "BinaryOnly":
-        raise DataError(
-            f"{path}: one of a set whose OME-XML is in {element.get('MetadataFile', 'another file')}; give that file "
-            "if it is a TIFF, else export the image as one OME-TIFF"
-        )
-    if tag == "Pixels":
-        sizes = [int(element.get(f"Size{axis}", 0)) for axis in "XYZCT"]
-        if min(sizes) < 1 or math.prod(sizes[2:]) > MAX_PAGES:
-            raise DataError(f"{path}: OME-XML of sizes {sizes}; expected at least 1 and at most {MAX_PAGES} planes")
-        if sorted(element.get("DimensionOrder", "")) != list("CTXYZ"):
-            raise DataError(f"{path}: OME-XML with DimensionOrder {element.get('DimensionOrder')!r}; expected as XYZCT")
-    if tag == "TiffData":
-        numbers = [int(value) for key, value in element.items() if key in ("IFD", "NumPlanes", "PlaneCount")]
-        if any(not 0 <= n <= MAX_PAGES for n in numbers):
-            raise DataError(f"{path}: OME-XML with TiffData of {numbers}; expected 0 to {MAX_PAGES}")
-    if tag.startswith("Along") and element.get("Start") is not None:
-        start, stop, step = (
-            float(element.get(key, default)) for key, default in (("Start", 0), ("End", 0), ("Step", 1))
-        )
-        if not abs(stop - start) <= 1e6 * abs(step):
-            raise DataError(f"{path}: OME-XML with {tag} from {start} to {stop} by {step}; expected at most 10^6 steps")
-
-
-def _tag(element: ElementTree.Element) -> str:
-    return str(element.tag).rpartition("}")[2]
-
-
-def ome_facts(root: ElementTree.Element, series: int, count: int) -> Facts:
-    """Return the facts of image ``series`` of ``count``; none where the XML has another number of images."""
-    images = [p for image in root if _tag(image) == "Image" for p in image if _tag(p) == "Pixels"]
+    images = [(image.get("Name", ""), p) for image in root if ome_tag(image) == "Image" for p in image]
+    images = [(title, p) for title, p in images if ome_tag(p) == "Pixels"]
     if len(images) != count:
-        return Facts()
-    pixels = images[series]
+        named = [(title, p) for title, p in images if title == name]
+        if len(named) != 1:
+            raise DataError(
+                f"{path}: OME-XML of {len(images)} images, pages of {count}; expected as many: is the set whole?"
+            )
+        images, series = named, 0
+    pixels = images[series][1]
     sizes = {f"PhysicalSize{axis}": pixels.get(f"PhysicalSize{axis}") for axis in "XYZ"}
     units = [pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
     names, colors = [], []
-    for channel in (c for c in pixels if _tag(c) == "Channel"):
+    for channel in (c for c in pixels if ome_tag(c) == "Channel"):
         name, samples = channel.get("Name", ""), int(channel.get("SamplesPerPixel", 1))
         names += [name] if samples == 1 else [f"{name}:{k}" for k in range(min(samples, 1000))]
         colors += [_color(channel.get("Color"))] * min(samples, 1000)

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed, select_component
-from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
+from vvgt_cli.volume.headers import fields_of_sections
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
@@ -198,7 +198,7 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, spacing: Spacing 
         DataError: a size in the log is no number.
     """
     paths = [path for path in sorted(first.parent.iterdir()) if path.suffix.lower() in _SUFFIXES and path.is_file()]
-    logs = [log for path in paths if (log := _fields(path)).keys() & _SIZES.keys()]
+    logs = [log for path in paths if (log := fields_of_sections(path)).keys() & _SIZES.keys()]
     own = [log for log in logs if first.name.startswith(Path(log.name).stem)]
     if not logs:
         return None
@@ -220,17 +220,6 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, spacing: Spacing 
         return (x, y, z), unit
     warnings.warn(f"{log.name}: voxel sizes {x:g} {y:g} {z:g} {unit} not used: {problem}; try --spacing", stacklevel=2)
     return None
-
-
-def _fields(path: Path) -> HeaderFields:
-    """Return the fields of a log, ``section/key`` in lower case."""
-    fields, section = HeaderFields(str(path)), ""
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        for line in file.read(MAX_HEADER).splitlines():
-            key, equals, value = line.partition("=")
-            section = line.strip().strip("[]").lower() if line.startswith("[") else section
-            fields.update({f"{section}/{key.strip().lower()}": value.strip()} if equals else {})
-    return fields
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

@@ -33,7 +33,7 @@ from vvgt_cli.volume.vtk import GRIDS, INDEX, INDEXES, SINGLE, is_index, is_lega
 from vvgt_cli.volume.vtk.grids import arrays_of, check_legacy_grid, check_xml_grid, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
-from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
 from vvgt_cli.volume.vtk.programs import PROGRAMS, read_program
 from vvgt_cli.volume.vtk.resample import MAX_EDGE
 
@@ -316,9 +316,7 @@ def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
         reader = _reader(path, kind, head)
         reader.SetFileName(str(path))
         reader.Update()
-        found, error = reader.GetOutputDataObject(0), message()
-    if error or reader.GetErrorCode() or found is None:
-        raise DataError(f"{path}: VTK cannot read it ({error or 'no message'}); is the file whole?")
+        found = checked(reader.GetOutputDataObject(0), reader, message, path, "it")
     yield from leaves_of(found)
 
 

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.libraries import library_errors, read_part
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name

@@ -84,10 +84,11 @@ class Parser:
         if coding not in ("ASCII", "BINARY"):
             raise self.bad(f"coding is {coding[:40]!r}; expected ASCII or BINARY")
         self.binary = coding == "BINARY"
-        kind = self.words() or ["nothing"]
-        if kind[-1].upper() not in self.KINDS:
+        first, *kind = self.words() or ["nothing"]
+        if first.upper() != "DATASET" or "".join(kind[:1]).upper() not in self.KINDS:
+            shown = "".join(kind[:1]).lower().replace("_", " ")[:40] if first.upper() == "DATASET" else ""
             raise DataError(
-                f"{self.path}: a legacy VTK file with dataset {printable(kind[-1][:40])}; expected "
+                f"{self.path}: a legacy VTK file of a {printable(shown) or 'field without a grid'}; expected "
                 f"{' or '.join(self.KINDS)}; resample it first (ParaView: Resample To Image) and save it as .vti"
             )
         while (words := self.words()) is not None:

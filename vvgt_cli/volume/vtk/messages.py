@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from vvgt_cli.errors import DataError
 
 
 @contextmanager
@@ -32,3 +35,13 @@ def quiet_vtk() -> Iterator[Any]:
     finally:
         vtkOutputWindow.SetInstance(before)
         vtkLogger.SetStderrVerbosity(verbosity)
+
+
+def checked(found: Any, reader: Any, message: Any, path: object, what: str) -> Any:
+    """Return what a reader found; warn of its warnings, and raise DataError that it cannot read ``what`` for errors."""
+    error, note = message(errors=True), message()
+    if error or reader.GetErrorCode() or found is None:
+        raise DataError(f"{path}: VTK cannot read {what} ({error or note or 'no message'}); is the file whole?")
+    if note:
+        warnings.warn(f"{path}: VTK says: {note}", stacklevel=3)
+    return found

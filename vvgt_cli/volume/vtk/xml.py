@@ -24,12 +24,13 @@ from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array, selected_dtype
 from vvgt_cli.volume.headers import printable, type_of
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
 from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
+from vvgt_cli.volume.vtk import xml_kind
 from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
-from vvgt_cli.volume.vtk.messages import quiet_vtk
+from vvgt_cli.volume.vtk.messages import checked, quiet_vtk
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
@@ -195,6 +196,22 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     return Volume(values, *place, volume_name(path), quantity=printable(info.name))
 
 
+def time_value(path: Path) -> float | None:
+    """Return the time that a VTK XML file of one dataset states (TimeValue), None of any other file."""
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+    from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
+
+    with open(path, "rb") as file:
+        if xml_kind(file.read(HEAD_BYTES)) is None:
+            return None
+    with quiet_vtk():
+        reader = vtkXMLGenericDataObjectReader()
+        reader.SetFileName(str(path))
+        reader.UpdateInformation()
+    times = list(reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or [])
+    return float(times[0]) if len(times) == 1 else None
+
+
 def image_values(document: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
     """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
@@ -318,9 +335,7 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
         image = reader.GetOutput()
         data = image.GetPointData() if info.where == "point" else image.GetCellData()
         array = data.GetArray(info.name) if info.name else data.GetArray(0)
-        error = message()
-    if error or reader.GetErrorCode() or array is None:
-        raise DataError(f"{path}: VTK cannot read array {info.name!r} ({error or 'no message'}); is the file whole?")
+        checked(array, reader, message, path, f"array {info.name!r}")
     values = vtk_to_numpy(array)
     if values.size != count(shape):
         raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")

@@ -1,0 +1,146 @@
+"""Coordinates that lie beside an array whose axes nothing states, and arrays of particles, which lie on no grid."""
+
+import json
+from pathlib import Path
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import xarray
+import zarr
+
+from tests.ramps import X, Y, Z, check_grid, ramp
+from tests.refused import refused
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.library.inputs import _labelled
+from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.stored import loaded
+
+VALUES = ramp(X, Y, Z)
+PLACES = np.random.default_rng(0).random((50, 3))
+LINES = {"x": X, "y": Y, "z": Z}
+
+
+def write(folder: Path, form: str, arrays: dict, attributes: dict | None = None) -> str:
+    """Arrays by path in a file or folder of a form, and attributes of some of them."""
+    path = folder / f"v.{form}"
+    if form == "h5":
+        with h5py.File(path, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+                file[name].attrs.update((attributes or {}).get(name, {}))
+    elif form == "npz":
+        np.savez(path, **arrays)
+    elif form == "nc":
+        with netCDF4.Dataset(path, "w") as file:
+            sizes = sorted({n for values in arrays.values() for n in values.shape})
+            for n in sizes:
+                file.createDimension(f"n{n}", n)
+            for name, values in arrays.items():
+                file.createVariable(name, values.dtype, [f"n{n}" for n in values.shape])[:] = values
+    else:
+        group = zarr.open_group(path, mode="w", zarr_format=2 if form == "zarr" else 3)
+        for name, values in arrays.items():
+            group.create_array(name, data=values)
+    return str(path)
+
+
+@pytest.mark.parametrize("form", ["h5", "npz", "nc", "zarr", "v3.zarr"])
+def test_coordinates_beside_an_array_place_it(tmp_path: Path, form: str) -> None:
+    named = {f"{letter}_coords": line for letter, line in LINES.items()}
+    path = write(tmp_path, form, {"field": VALUES, **named})
+    check_grid(read_volume(path))
+    check_grid(loaded(read_volume(path, ReadOptions(stored=True))))
+    assert read_volume(path, ReadOptions(spacing=(1, 2, 3))).spacing == (1, 2, 3)
+
+
+def test_members_that_are_no_numbers_are_no_coordinates(tmp_path: Path) -> None:
+    np.savez(tmp_path / "v.npz", field=VALUES, facts=np.array({"a": 1}, object), **LINES)
+    check_grid(read_volume(str(tmp_path / "v.npz")))
+
+
+@pytest.mark.parametrize("form", ["h5", "npz", "nc", "zarr"])
+def test_arrays_that_may_be_coordinates_are_named(tmp_path: Path, form: str) -> None:
+    path = write(tmp_path, form, {"field": VALUES, "energies": Z, "other": np.arange(7.0)})
+    with pytest.warns(
+        UserWarning, match=r"states no spacing.* lie, as long as its axes, energies \(step 2\); --spacing"
+    ):
+        assert read_volume(path).spacing == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "attributes", "unit"),
+    [
+        ({"field": VALUES[:, ::-1], "x": X, "y": Y[::-1], "z": Z}, {}, ""),
+        ({"field": VALUES, "X (um)": X, "Y (um)": Y, "Z (um)": Z}, {}, "um"),
+        ({"field": VALUES.T, "x_mm": X, "y_mm": Y, "z_mm": Z}, {}, "mm"),
+        ({"field": VALUES, "x": X[None], "y": Y[None], "z": Z[:, None]}, {key: {"units": "nm"} for key in "xyz"}, "nm"),
+        ({"fields/rho": VALUES, "coords/x": X, "coords/y": Y, "coords/z": Z}, {}, ""),
+        ({"data": VALUES} | {f"dim{k}": line for k, line in enumerate((Z, Y, X), 1)},
+         {"dim3": {"name": "x", "units": "[n_m]"}, "dim1": {"name": "z", "units": "[n_m]"},
+          "dim2": {"name": "y", "units": "[n_m]"}}, "nm"),
+        ({"data": VALUES} | {f"dim{k}": line[:2] for k, line in enumerate((Z, Y, X))}, {}, ""),
+    ],
+)  # fmt: skip
+def test_names_of_coordinates_in_hdf5(tmp_path: Path, arrays: dict, attributes: dict, unit: str) -> None:
+    path = write(tmp_path, "h5", arrays, attributes)
+    volume = read_volume(path)
+    check_grid(volume)
+    assert volume.unit == unit
+
+
+def test_coordinates_that_fit_in_several_ways_are_named(tmp_path: Path) -> None:
+    cube = ramp(X[:3], Y[:3], Z[:3])
+    path = write(tmp_path, "h5", {"field": cube, "x": X[:3], "y": Y[:3], "z": Z[:3]})
+    with pytest.warns(UserWarning, match="states no spacing"):
+        assert read_volume(path).spacing == (1, 1, 1)
+    same = write(tmp_path, "npz", {"field": cube, "x": Z[:3], "y": Z[:3], "z": Z[:3]})
+    assert read_volume(same).spacing == (2, 2, 2)
+    uneven = write(tmp_path, "npz", {"field": VALUES, "x": X, "y": Y, "z": Z**2})
+    refused(UsageError, "axis z has steps .*--dims X Y Z", read_volume, uneven)
+
+
+def test_coordinates_of_an_xarray_along_other_dimensions() -> None:
+    lines = {name: (f"n{name}", line) for name, line in LINES.items()}
+    check_grid(_labelled(xarray.DataArray(VALUES, lines, dims=("nz", "ny", "nx")), ReadOptions(), "v"))
+
+
+@pytest.mark.parametrize(
+    ("form", "arrays"),
+    [
+        *((form, {"Coordinates": PLACES, "Masses": PLACES[:, 0]}) for form in ("h5", "npz", "nc", "zarr")),
+        ("h5", {"PartType0/POS": PLACES.T.astype("f4"), "PartType0/Velocities": PLACES, "table": np.ones((4, 5))}),
+        ("h5", {"particles/all/position/value": np.stack([PLACES] * 4), "particles/all/velocity/value": PLACES[None]}),
+        ("nc", {"coordinates": np.stack([PLACES[:, :2]] * 4)}),  # AMBER
+    ],
+)
+def test_particles_are_no_picture(tmp_path: Path, form: str, arrays: dict) -> None:
+    path = write(tmp_path, form, arrays)
+    refused(DataError, "particles .*, which lie on no grid; .*deposit them first", read_volume, path)
+    first = next(iter(arrays))
+    refused(DataError, f"particles .*{first}", read_volume, path, ReadOptions(array=first))
+    beside = write(tmp_path, form, arrays | {"density": VALUES})
+    assert read_volume(beside).dims == VALUES.shape[::-1]
+
+
+def test_values_at_stations_are_no_picture(tmp_path: Path) -> None:
+    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
+        for name, size in (("time", 2), ("height", 3), ("cell", 20)):
+            file.createDimension(name, size)
+        for name in ("lon", "lat"):
+            file.createVariable(name, "f8", ("cell",))[:] = np.arange(20.0)
+        file.createVariable("t", "f4", ("time", "height", "cell"))[:] = 1
+    refused(DataError, "x and y both lie along cell", read_volume, str(tmp_path / "v.nc"))
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_frames_of_velox_are_time_steps(tmp_path: Path, blocks: bool) -> None:
+    frames = np.arange(4 * 5 * 3, dtype="u2").reshape(4, 5, 3)
+    facts = {"BinaryResult": {"PixelSize": {"width": "2e-10", "height": "5e-10"}, "PixelUnitX": "m", "PixelUnitY": "m"}}
+    text = np.frombuffer(json.dumps(facts).encode().ljust(300, b"\0"), np.uint8)
+    path = write(tmp_path, "h5", {"Data/Image/1a/Data": frames, "Data/Image/1a/Metadata": np.stack([text] * 3, 1)})
+    refused(SeveralSteps, "3 time steps", read_volume, path)
+    volume = read_volume(path, ReadOptions(time=2, stored=blocks))
+    np.testing.assert_array_equal(volume.data[:][0], frames[:, :, 2])
+    np.testing.assert_allclose((*volume.spacing[:2], volume.unit == "m"), (2e-10, 5e-10, 1))

@@ -1,1 +1,0 @@
-"""Command line: parses, calls, prints; imports numpy only when a command runs."""

@@ -1,0 +1,160 @@
+"""What lies beside an array whose axes nothing states: coordinates under common names; and arrays of particles."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.headers import text_of
+from vvgt_cli.volume.labelled import Axis, axis, even
+from vvgt_cli.volume.space import metres
+
+GROUPS = re.compile(r"coord(inate)?s?|grid|axes|mesh|dim(ension)?s?", re.I)  # that hold coordinates
+_LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*)[)\]]*", re.I)
+_SUFFIXES = re.compile(r"|s|c|v|ax(?:is|es)|grid|(?:coord(?:inate)?|cent(?:er|re)|value|val|pos(?:ition)?)s?", re.I)
+_NUMBERED = re.compile(r"(?:dim|axis|coord)_?(\d)", re.I)
+_PLACES = re.compile(r"(?:particles?_?)?(?:coord(?:inate)?s?|pos(?:ition)?s?|xyz)", re.I)
+_VECTORS = re.compile(r"(?:particles?_?)?(?:vel(?:ocity|ocities)?|accelerations?|forces?|moment(?:um|a))", re.I)
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """An array along one axis that lies beside another array.
+
+    Attributes:
+        size: of its axis.
+        read: returns its stored values (size,) and its attributes.
+        along: name of its axis, where axes have names; "".
+    """
+
+    size: int
+    read: Callable[[], tuple[np.ndarray, Mapping[str, Any]]]
+    along: str = ""
+
+    @classmethod
+    def of(cls, shape: Sequence[int], read: Any, along: str = "") -> Neighbour:
+        """Make a neighbour of an array of any shape; one of more than one axis has no size."""
+        sizes = [n for n in shape or () if n > 1]
+        return cls(sizes[0] if len(sizes) == 1 else 0, read, along)
+
+
+def with_neighbours(
+    axes: Sequence[Axis], beside: Mapping[str, Neighbour], source: str, spacing_given: bool
+) -> list[Axis]:
+    """Return an array's axes with the coordinates beside it, where names and sizes assign them in one way.
+
+    Otherwise one message names the neighbours whose sizes fit, and the axes stay as they are, as they do if any has
+    coordinates or a spacing is given. Names are letters (``x``, ``x_coords``, ``z_um``), words of CF (``lon``) or
+    numbers for all axes (``dim1``, ``dim2``, ``dim3`` of EMD, where two values stand for an even axis).
+    """
+    if spacing_given or any(a.centres is not None for a in axes):
+        return [*axes]
+    if (numbered := _numbered(axes, beside)) is not None:
+        return numbered
+    fits = {name: one for name, one in beside.items() if any(_lies_along(one, a) for a in axes)}
+    some = {name: _read(name, one) for name, one in itertools.islice(fits.items(), 50)}
+    read = {name: a for name, a in some.items() if a is not None}
+    named = {role: [name for name, a in read.items() if a.role == role and _ascends(a)] for role in "tzyx"}
+    chosen = [names[0] for names in named.values() if len(names) == 1]
+    if len(axes) < 4 and all(read[name].role == "t" for name in chosen):
+        chosen = []
+    ways = [
+        dict(zip(order, chosen, strict=True))
+        for order in itertools.permutations(range(len(axes)), len(chosen))
+        if chosen and all(_lies_along(fits[name], axes[k], read[name]) for k, name in zip(order, chosen, strict=True))
+    ]
+    along: list[list[Any]] = [[read[way[k]].centres if k in way else None for k in range(len(axes))] for way in ways]
+    if ways and all(np.array_equal(a, b) for way in along for a, b in zip(way, along[0], strict=True)):
+        return [read[ways[0][k]] if k in ways[0] else a for k, a in enumerate(axes)]
+    if read:
+        steps = listed([f"{name} ({_step(a)})" for name, a in read.items()], ", ", 4)
+        warnings.warn(
+            f"{source}: states no spacing, which is taken as 1; beside it lie, as long as its axes, {steps}; --spacing "
+            "X Y Z sets it", stacklevel=3,
+        )  # fmt: skip
+    return [*axes]
+
+
+def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axis] | None:
+    """Return axes with coordinates whose names count the axes from 0 or 1; None unless all are there and ascend."""
+    matches = {int(m[1]): one for name, one in beside.items() if (m := _NUMBERED.fullmatch(name))}
+    first = min(matches, default=0)
+    found = []
+    for k, old in enumerate(axes):
+        one = matches.get(k + first)
+        if one is None or first > 1 or one.size not in (2, old.size):
+            return None
+        values, attributes = one.read()
+        unit = text_of(attributes.get("units", "")).strip("[]").replace("_", "")  # EMD: [n_m]
+        line = values if one.size == old.size else values[0] + np.arange(old.size) * (values[1] - values[0])
+        found.append(axis(text_of(attributes.get("name", "")), old.size, line, {"units": unit}))
+    return found if all(a.size == 1 or _ascends(a) for a in found) else None
+
+
+def _read(name: str, one: Neighbour) -> Axis | None:
+    """Read a neighbour as an axis, with the role and the unit that are in its name; None where it holds no numbers."""
+    values, attributes = one.read()
+    if values.dtype.kind not in "iuf":
+        return None
+    leaf = name.rpartition("/")[2]
+    letter = _LETTER.fullmatch(leaf)
+    stated = dict(attributes)
+    if letter and (_SUFFIXES.fullmatch(letter[2]) or metres(letter[2])):
+        stated = {"axis": letter[1], "units": letter[2] if metres(letter[2]) else ""} | stated
+    return axis(leaf, one.size, np.ravel(values), stated)
+
+
+def _lies_along(one: Neighbour, a: Axis, read: Axis | None = None) -> bool:
+    """Tell whether a neighbour can lie along an axis, by size and by the names that either has."""
+    if one.size != a.size or a.size < 2 or (one.along and one.along != a.name):
+        return False
+    return read is None or bool(one.along) or a.role in ("", read.role)
+
+
+def _ascends(a: Axis) -> bool:
+    steps = np.diff(a.centres if a.centres is not None else [])
+    return bool(np.isfinite(steps).all() and ((steps > 0).all() or (steps < 0).all()))
+
+
+def _step(a: Axis) -> str:
+    if a.centres is None or not _ascends(a) or not even(a.centres):
+        return "uneven"
+    return f"step {abs(a.centres[-1] - a.centres[0]) / (a.size - 1):.4g}"
+
+
+def on_grids(arrays: Mapping[str, tuple[Sequence[int], str]], source: str) -> list[str]:
+    """Return the names of the arrays, given with shape and type, that are no places or vectors of particles.
+
+    Raises:
+        DataError: there are particles, and nothing with three axes beside them.
+    """
+    places = any(_of_particles(name, shape, dtype) for name, (shape, dtype) in arrays.items())
+    particles = [name for name, (shape, dtype) in arrays.items() if _of_particles(name, shape, dtype, places)]
+    rest = [name for name in arrays if name not in particles]
+    if particles and not any(sum(n > 1 for n in arrays[name][0]) >= 3 for name in rest):
+        shape = " x ".join(map(str, arrays[particles[0]][0]))
+        raise DataError(
+            f"{source}: particles ({listed([particles[0]])}: {shape}), which lie on no grid; expected values on one: "
+            "deposit them first (yt's arbitrary_grid, pynbody, swiftsimio) and save that as .npy or HDF5"
+        )
+    return rest
+
+
+def _of_particles(name: str, shape: Sequence[int], dtype: str, beside: bool = False) -> bool:
+    """Tell whether an array holds places or vectors of particles (N, 2 or 3), ``beside`` places also of several steps.
+
+    The name is that of the group in H5MD, where arrays are called ``value``.
+    """
+    if "f" not in dtype or len(shape) not in (2, 3):
+        return False
+    leaf = re.sub("/values?$", "", name).rpartition("/")[2]
+    rows = shape[-1] in (2, 3) or (len(shape) == 2 and shape[0] in (2, 3))
+    return rows and bool(_PLACES.fullmatch(leaf) or ((len(shape) == 2 or beside) and _VECTORS.fullmatch(leaf)))
