@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -87,16 +85,3 @@ def on_device(scene: Scene, device: str, report: Callable[[str], None]) -> Scene
     from vvgt_cli.dvr.cuda import DeviceRays
 
     return replace(scene, rays=DeviceRays(scene, report))
-
-
-def load_ahead() -> None:
-    """Begin to load the kernels of steps, in the background: the first picture waits for the rest."""
-
-    def run() -> None:
-        from vvgt_cli.jit.gpu import load
-        from vvgt_cli.refine.on_device import KERNELS
-
-        with contextlib.suppress(Exception):  # of the driver or the compiler: whoever takes a step meets it again
-            load(KERNELS)
-
-    threading.Thread(target=run, daemon=True).start()
