@@ -48,7 +48,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     loss_gradient(image, target, *weights, grad, squares)
     pairs = moments(p, colors, image, grad)
     slopes = own_axes_backward(means, factors, colors, camera, p, pairs)
-    state.step = 1
+    state.taken = 1
     still = np.zeros(5), state.CLIPS, state.spread, *state.BETAS, 1  # rates 0: the scene stays as it is
     tiles_y = -(-camera.height // 16)
     return {

@@ -393,7 +393,7 @@ def checkpoint() -> list[Seed]:
     seeds = []
     for method in ("frame", "3dgs"):
         state, judge, record = fresh(method)
-        judge.kept = tuple(state.arrays)
+        judge.kept = {name: array for name, array in state.saved().items() if name.startswith("array_")}
         with tempfile.TemporaryDirectory() as folder:
             save(f"{folder}/run.npz", "key", state, judge, record, {"step": 3})
             data = Path(f"{folder}/run.npz").read_bytes()

@@ -1,11 +1,14 @@
 """Views and steps on a CUDA device: what of them runs on the CPU against its twins there; all of it where a GPU is."""
 
+import pickle
 from dataclasses import replace
 
 import numba as nb
 import numpy as np
 import pytest
 
+from tests import simulated_gpu
+from tests.processes import python
 from tests.test_dvr_backends import scene, view
 from vvgt_cli import device
 from vvgt_cli.cameras import default_views
@@ -14,12 +17,15 @@ from vvgt_cli.dvr import RenderSettings, Scene, cuda, render_view, render_views
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import DILATION, MAX_ALPHA, MIN_ALPHA
-from vvgt_cli.gaussians.rules import INRIA, RULES
+from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.refine.loop import begin, step
+from vvgt_cli.refine import OptimizeOptions, shared
+from vvgt_cli.refine import on_device as on_gpu
+from vvgt_cli.refine.loop import begin
+from vvgt_cli.refine.on_device import unfit
+from vvgt_cli.refine.states import OwnAxes
 from vvgt_cli.splat import render
+from vvgt_cli.splat.reference import render_reference
 
 OPTIONS = OptimizeOptions.of("frame")
 
@@ -70,97 +76,49 @@ def gaussians(count=600, seed=0):
     )  # fmt: skip
 
 
-def dense(means, opacities, colors, camera, rule, covars):
-    """A picture as gsplat makes it, every Gaussian in every pixel."""
-    torch = pytest.importorskip("torch")
-    turn, shift = (torch.as_tensor(a, dtype=torch.float32) for a in (camera.rotation, camera.translation))
-    x, y, z = (means @ turn.T + shift).unbind(1)
-    zero = torch.zeros_like(z)
-    slope = torch.stack([camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2], 1)
-    slope = slope.reshape(-1, 2, 3) @ turn
-    spread = slope @ covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) @ slope.transpose(
-        1, 2
-    ) + rule.dilation * torch.eye(2)
-    order = z.argsort()
-    place = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)[order]
-    rows, cols = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    off = torch.stack([cols, rows], -1)[:, :, None] - place
-    power = 0.5 * torch.einsum("hwki,kij,hwkj->hwk", off, torch.linalg.inv(spread[order]), off)
-    alpha = (opacities[order] * torch.exp(-power)).clamp(max=MAX_ALPHA)
-    alpha = torch.where((alpha >= MIN_ALPHA) & (power <= 6), alpha, 0)
-    behind = torch.cumprod(1 - alpha, dim=2)
-    weight = alpha * torch.cat([torch.ones_like(alpha[..., :1]), behind[..., :-1]], 2)
-    return weight @ colors[order], 1 - behind[..., -1:]
+def test_simulated_steps_are_those_of_the_cpu(monkeypatch, tmp_path):
+    """Pictures before, and all that is kept after steps: by rules, of all or some Gaussians, with weights of views."""
+    rng = np.random.default_rng(2)
+    targets = [render(simulated_gpu.gaussians(seed=1), camera) for camera in simulated_gpu.CAMERAS]
+    weights = [rng.random(target.shape[:2], np.float32) for target in targets]
+    monkeypatch.setattr(shared, "LEAST", simulated_gpu.LEAST)
+    cases, hosts = simulated_gpu.cases(), {}
+    for case, (start, options, free, _) in cases.items():
+        hosts[case] = OwnAxes(start, simulated_gpu.CAMERAS, options, free)
+    given, out = tmp_path / "given", tmp_path / "out"
+    given.write_bytes(pickle.dumps((targets, weights, hosts)))
+    python("-m", "tests.simulated_gpu", given, out, variables=simulated_gpu.SIMULATED)
+    ends = pickle.loads(out.read_bytes())
+    for case, (start, _, _, weighted) in cases.items():
+        state = hosts[case]
+        begun = [array.copy() for array in state.arrays]
+        exact = render_reference(start, simulated_gpu.CAMERAS[0])
+        np.testing.assert_allclose(ends[case]["picture"], exact, atol=1e-5, err_msg=case)
+        host = simulated_gpu.take(state, case, targets, weights if weighted else None)
+        assert (state.shared is None) == (case != "inria")
+        for name, array in host.items():
+            size = np.abs(array - begun[int(name[-1])] if name.startswith("array") else array).mean()
+            assert np.abs(ends[case][name] - array).mean() <= 1e-3 * size, (case, name)
 
 
-@pytest.fixture
-def descent(monkeypatch):
-    pytest.importorskip("torch")
-    from vvgt_cli.refine import on_device as module
-
-    def made(start, cameras, options, free=None, device="cpu"):
-        return frame(start, cameras, options, free, "cpu", dense)
-
-    frame = module.OwnAxesOnDevice
-    monkeypatch.setattr(module, "OwnAxesOnDevice", made)
-    return module
+def test_what_a_device_does_not_do_is_named():
+    assert unfit(gaussians(), replace(OPTIONS, rule=RULES["viser"])) is None
+    assert unfit(gaussians(), OptimizeOptions.of("3dgs")) == "the method 3dgs"
+    assert unfit(gaussians(), replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
+    lit = replace(gaussians(), harmonics=np.zeros((600, 3, 3), np.float32))
+    assert unfit(lit, OPTIONS) == "colours that depend on the view"
 
 
-@pytest.mark.parametrize(("count", "some"), [(600, False), (300, False), (600, True)])
-def test_steps_are_those_of_the_cpu(descent, count, some):
-    start, cameras = gaussians(count), default_views("train", 4, size=40)
-    images = [render(gaussians(count, 1), camera) for camera in cameras]
-    free = np.arange(count) % 3 > 0 if some else None
-    there, here = replace(OPTIONS, device="torch"), OPTIONS
-    pair = [(options, begin(start, cameras, options, free)) for options in (here, there)]
-    errors = [None, None]
-    for n in range(8):
-        for i, (options, state) in enumerate(pair):
-            errors[i] = step(state, cameras[n % 4], images[n % 4], options, errors[i], n / 8, 1.0)
-    np.testing.assert_allclose(errors[1], errors[0], rtol=2e-3)
-    first = begin(start, cameras, here, free)
-    for begun, a, b in zip(first.arrays, *(state.arrays for _, state in pair), strict=True):
-        moved = np.abs(a - begun).mean()
-        assert np.abs(a - b).mean() < 0.03 * moved  # opacities above 0.99 end elsewhere, order of sums
-    kept = pair[1][1].saved()
-    assert {k: v.shape for k, v in kept.items()} == {k: v.shape for k, v in pair[0][1].saved().items()}
-    again = begin(start, cameras, there, free)
-    again.restore(kept)
-    np.testing.assert_array_equal(again.arrays[0], pair[1][1].arrays[0])
+def test_a_device_that_fails_in_a_step_says_so(monkeypatch):
+    def fail(*_):
+        raise RuntimeError("CUDA error:\nlost")
 
-
-def test_the_loss_is_that_of_the_cpu(descent):
-    import torch
-
-    from vvgt_cli.refine.loss import loss_gradient
-    from vvgt_cli.refine.texture import add_texture_gradient
-
-    options = replace(OPTIONS, l1=0.3)
-    image, target = np.random.default_rng(3).random((2, 30, 44, 4), np.float32)
-    grad, squares = np.empty_like(image), np.empty(30)
-    loss_gradient(image, target, *map(np.float32, (options.l1, options.l2, options.alpha)), grad, squares)
-    add_texture_gradient(image, target, options.texture, grad)
-    found, error = descent.loss_slope(torch.from_numpy(image), torch.from_numpy(target), options)
-    np.testing.assert_allclose(found.numpy(), grad, atol=2e-4)
-    np.testing.assert_allclose(float(error), np.sqrt(squares.sum() / (3.5 * 30 * 44)), rtol=1e-5)
-
-
-def test_what_a_device_does_not_do_is_named(descent):
-    assert descent.unfit(gaussians(), OPTIONS) is None
-    assert descent.unfit(gaussians(), replace(OPTIONS, rule=RULES["compensated"].at(0.37))) is None
-    assert descent.unfit(gaussians(), OptimizeOptions.of("3dgs")) == "the method 3dgs"
-    assert descent.unfit(gaussians(), replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
-    assert (
-        descent.unfit(gaussians(), replace(OPTIONS, rule=RULES["viser"]))
-        == "the rule viser, by which gsplat does not draw"
-    )
-
-
-def test_a_device_that_fails_in_a_step_says_so(descent, monkeypatch):
-    state = begin(gaussians(), default_views("train", 2, size=40), replace(OPTIONS, device="torch"))
-    monkeypatch.setattr(state, "draw", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("CUDA error:\nlost")))
-    with pytest.raises(DeviceFailed, match="CUDA error: lost"):
-        step(state, state.cameras[0], np.zeros((40, 40, 4), np.float32), replace(OPTIONS, device="torch"), None, 0, 1)
+    monkeypatch.setattr(on_gpu, "free_bytes", fail)
+    with pytest.raises(DeviceFailed, match="RuntimeError: CUDA error: lost"):
+        begin(gaussians(), default_views("train", 2, size=40), replace(OPTIONS, device="cuda"))
+    monkeypatch.setattr(on_gpu, "free_bytes", lambda: 0.0)
+    with pytest.raises(DeviceFailed, match=r"steps need 0\.0 GB, of which 0\.0 are free"):
+        begin(gaussians(), default_views("train", 2, size=40), replace(OPTIONS, device="cuda"))
 
 
 def test_a_machine_without_a_gpu_is_told_what_is_missing(vvgt, monkeypatch, tmp_path):
@@ -186,9 +144,7 @@ def test_labels_and_layers_stay_on_the_cpu():
 
 @pytest.fixture
 def gpu():
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("gsplat")
-    if not torch.cuda.is_available():
+    if device.missing() or device.first_gpu() is None:
         pytest.skip("no CUDA device")
 
 
@@ -201,16 +157,16 @@ def test_a_gpu_draws_the_kernels_views(gpu, lit):
     assert not said
 
 
-@pytest.mark.parametrize("rule", [INRIA, RULES["compensated"]])
-def test_gsplat_draws_and_steps_as_the_kernels_do(gpu, rule):
-    start, cameras = gaussians(2000), default_views("train", 4, size=120)
-    images = [render(gaussians(2000, 1), camera, rule) for camera in cameras]
-    found = []
-    for where in ("cpu", "cuda"):
-        options = replace(OPTIONS, rule=rule, device=where)
-        state, error = begin(start, cameras, options), None
+@pytest.mark.parametrize(("rule", "count"), [("inria", 2000), ("compensated", 300), ("three", 30_000)])
+def test_a_gpu_steps_as_the_kernels_do_and_repeats_to_the_byte(gpu, rule, count):
+    start, cameras, rule = gaussians(count), default_views("train", 4, size=120), RULES[rule]
+    images, ends = [render(gaussians(count, 1), camera, rule) for camera in cameras], []
+    for where in ("cpu", "cuda", "cuda"):
+        state = begin(start, cameras, replace(OPTIONS, rule=rule, device=where))
+        first = state.picture(cameras[0], rule)
         for n in range(12):
-            error = step(state, cameras[n % 4], images[n % 4], options, error, n / 12, 1.0)
-        found.append(error)
-    np.testing.assert_allclose(found[1], found[0], rtol=0.01)
-    assert rule.dilation == DILATION
+            state.step(cameras[n % 4], images[n % 4], n / 12, 1.0)
+        ends.append(state.saved() | {"first": first})
+    np.testing.assert_allclose(ends[1]["first"], ends[0]["first"], atol=1e-4)
+    np.testing.assert_allclose(ends[1]["error"], ends[0]["error"], rtol=0.005)
+    assert all(np.array_equal(ends[1][name], ends[2][name]) for name in ends[1])

@@ -9,7 +9,7 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.refine import OptimizeOptions, optimize
-from vvgt_cli.refine.loop import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify, step
+from vvgt_cli.refine.loop import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
 from vvgt_cli.splat import project, render
 from vvgt_cli.splat.render import moments, screen_slopes
 
@@ -91,7 +91,7 @@ def test_what_a_gaussian_has_learned_goes_with_it():
     options = OptimizeOptions.of("3dgs", steps=30, max_gaussians=90)
     state = Densified(g, CAMERAS, options)
     for camera, image in zip(CAMERAS, target, strict=True):
-        step(state, camera, image, options, None, 0.0, 1.0)
+        state.step(camera, image, 0.0, 1.0)
     before = [moment[0].copy() for moment in state.running]
     state.slopes[:] = np.where(np.arange(60) < 7, 1.0, 0.0)
     state._densify()
@@ -119,12 +119,12 @@ def test_opacities_are_reset_where_there_is_time_to_recover():
     g, options = cloud(sigma=0.1), OptimizeOptions.of("3dgs", steps=4000)
     state = Densified(g, CAMERAS, options)
     target = views(g)
-    state.step = 400
-    step(state, CAMERAS[0], target[0], options, None, 0.1, 1.0)
+    state.taken = 400
+    state.step(CAMERAS[0], target[0], 0.1, 1.0)
     assert opacity(state.gaussians()).max() < 0.0101
     short = Densified(g, CAMERAS, options)
-    short.step = 20
-    step(short, CAMERAS[0], target[0], options, None, 0.1, 1.0)
+    short.taken = 20
+    short.step(CAMERAS[0], target[0], 0.1, 1.0)
     assert opacity(short.gaussians()).max() > 0.3
 
 

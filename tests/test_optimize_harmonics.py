@@ -13,13 +13,14 @@ from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.judge import Judge
-from vvgt_cli.refine.loop import SLOPE, Densified, begin, densify, step
+from vvgt_cli.refine.loop import SLOPE, Densified, begin, densify
 from vvgt_cli.refine.states import GIVEN
-from vvgt_cli.splat import blend, render
+from vvgt_cli.splat import render
 
 CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)
 TEST = default_views("test", size=40)
@@ -56,7 +57,8 @@ def test_harmonics_of_the_start_move_slower_than_those_from_zero():
     padded[:, truth.degree**2 - 1 :] = 0  # its highest degree begins at zero
     for harmonics in (np.zeros_like(given), given, padded):
         state = begin(replace(truth, harmonics=harmonics), CAMERAS, OptimizeOptions(steps=10))
-        step(state, CAMERAS[0], images[0], OptimizeOptions(steps=10), 0.05, 0.0, 1.0)
+        state.error = 0.05
+        state.step(CAMERAS[0], images[0], 0.0, 1.0)
         end = state.gaussians()
         moved.append(np.abs(end.harmonics - harmonics).max() / np.abs(end.colors - truth.colors).max())
     assert moved[1] == pytest.approx(GIVEN * moved[0], rel=0.02)
@@ -72,7 +74,7 @@ def test_zeros_that_no_gradient_moves_leave_the_bytes_of_degree_0():
         state = begin(start.of_degree(degree), CAMERAS, options)
         state.harmonic_rate = 0.0
         for n in range(10):
-            step(state, CAMERAS[n], images[n], options, 0.05, n / 10, 1.0)
+            state.step(CAMERAS[n], images[n], n / 10, 1.0)
         ends.append(state.gaussians())
     assert not ends[1].harmonics.any()
     for field, array in ends[0].arrays().items():
@@ -85,8 +87,7 @@ def test_states_draw_and_return_what_they_were_given(method):
     state = begin(g, CAMERAS, OptimizeOptions.of(method, steps=4))
     np.testing.assert_array_equal(state.gaussians().harmonics, g.harmonics)
     c = CAMERAS[3]
-    image = blend(state.project(c), np.maximum(state.colors_from(c), 0), c.height, c.width)
-    np.testing.assert_allclose(image, render(g, c), atol=1e-4)
+    np.testing.assert_allclose(state.picture(c, INRIA), render(g, c), atol=1e-4)
 
 
 def test_negative_base_colours_are_kept_where_harmonics_may_make_up_for_them():
@@ -107,7 +108,7 @@ def test_clones_splits_and_moments_go_with_their_harmonics():
     state = Densified(g, CAMERAS, OptimizeOptions.of("3dgs", steps=30, max_gaussians=90))
     images = views(shiny(seed=1), CAMERAS)
     for camera, image in zip(CAMERAS[:6], images, strict=False):
-        step(state, camera, image, OptimizeOptions.of("3dgs", steps=30), None, 0.0, 1.0)
+        state.step(camera, image, 0.0, 1.0)
     state.slopes[:] = np.where(np.arange(60) < 7, 1.0, 0.0)
     state._densify()
     assert len(state.arrays) == len(state.running) == 6
@@ -119,15 +120,15 @@ def test_a_checkpoint_holds_them(method, tmp_path):
     g, options = shiny(), OptimizeOptions.of(method, steps=9)
     images = views(shiny(seed=1), CAMERAS)
     path, states = str(tmp_path / "a.npz"), [begin(g, CAMERAS, options) for _ in range(2)]
-    walk = {"error": None, "speed": 1.0, "elapsed": 0.0, "looked": 0}
+    walk = {"speed": 1.0, "elapsed": 0.0, "looked": 0}
     for n in range(3):
-        step(states[0], CAMERAS[n], images[n], options, 0.1, 0.1, 1.0)
+        states[0].step(CAMERAS[n], images[n], 0.1, 1.0)
     judges = [Judge(state, None, OptimizeRecord()) for state in states]
     save(path, "key", states[0], judges[0], OptimizeRecord(), walk)
     assert resume(path, "key", states[1], judges[1], OptimizeRecord()) == walk
     for n in range(3, 6):
         for state in states:
-            step(state, CAMERAS[n], images[n], options, 0.1, 0.1, 1.0)
+            state.step(CAMERAS[n], images[n], 0.1, 1.0)
     first, second = (state.gaussians() for state in states)
     for field, array in first.arrays().items():
         assert array.tobytes() == getattr(second, field).tobytes()

@@ -9,7 +9,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.metrics import C1, C2, ssim
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.refine.loop import begin, step
+from vvgt_cli.refine.loop import begin
 from vvgt_cli.refine.loss import loss_gradient
 from vvgt_cli.refine.options import TEXTURE
 from vvgt_cli.refine.ssim import KERNEL, add_ssim_gradient
@@ -134,6 +134,6 @@ def test_steps_of_our_method_follow_the_texture_term():
     for options in (usual, replace(usual, texture=0.0)):
         state = begin(start, [camera], options)
         for _ in range(4):
-            step(state, camera, target, options, 0.05, 0.0, 1.0)
+            state.step(camera, target, 0.0, 1.0)
         ends.append(state.gaussians().colors)
     assert np.abs(ends[0] - ends[1]).max() > 1e-4

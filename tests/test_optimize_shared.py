@@ -154,7 +154,7 @@ def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
     m = v = np.zeros((13, count))
     for n in (1, 2, 3):
         slopes = (rng.normal(size=(13, count)) * size).astype(np.float32)
-        state.first[:], state.second[:], state.step = m, v, n
+        state.first[:], state.second[:], state.taken = m, v, n
         factor = state.shared.factor
         floors, _, weights = state.common(slopes)
         m, v = 0.6 * m + 0.4 * slopes, 0.999 * v + 0.001 * slopes.astype(np.float64) ** 2
@@ -204,7 +204,7 @@ def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():
     code = (
-        "import hashlib; from tests.test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.step = 1\n"
+        "import hashlib; from tests.test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.taken = 1\n"
         "w = s.common(np.random.default_rng(0).normal(size=(13, 12_500)).astype(np.float32))\n"
         "print(hashlib.sha256(b''.join(a.tobytes() for a in w)).hexdigest())"
     )
@@ -215,7 +215,7 @@ def test_weights_are_the_same_bytes_for_any_number_of_threads():
 def test_few_gaussians_share_nothing_and_have_the_whole_rate():
     state = OwnAxes(many(shared.LEAST - 1), CAMERAS)
     assert state.shared is None
-    state.step = 1
+    state.taken = 1
     floors, given, _ = state.common(np.ones((13, shared.LEAST - 1), np.float32))
     assert given.size == 0
     assert floors.max() <= 1e-15
@@ -236,7 +236,7 @@ def test_steps_stay_finite_where_gaussians_are_extreme(kind):
         rows[:, 5] = np.inf if kind == "infinite" else float(kind)
     before = [array.copy() for array in state.arrays]
     for step in (1, 2):
-        state.step = step
+        state.taken = step
         common = state.common(rows)
         assert all(np.isfinite(part).all() for part in common)
         assert np.abs(common[2]).max() < 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,7 +12,7 @@ from vvgt_cli.errors import DataError, UsageError
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-PACKAGES = {"numba_cuda": "numba-cuda", "torch": "torch", "gsplat": "gsplat"}  # modules, and what installs them
+PACKAGES = {"numba_cuda": "numba-cuda"}  # modules, and what installs them
 FREE = 0.5  # of a GPU's memory, below which "auto" leaves it to others
 
 
@@ -86,15 +85,3 @@ def on_device(scene: Scene, device: str, report: Callable[[str], None]) -> Scene
     from vvgt_cli.dvr.cuda import DeviceRays
 
     return replace(scene, rays=DeviceRays(scene, report))
-
-
-def load_ahead() -> None:
-    """Begin to load what steps need, in the background: it takes as long as a closed form."""
-
-    def load() -> None:
-        import torch
-        from gsplat.cuda._backend import _C  # noqa: F401 # built at its first import
-
-        torch.eye(2, device="cuda") @ torch.eye(2, device="cuda")  # the context, and the library of products
-
-    threading.Thread(target=load, daemon=True).start()

@@ -22,7 +22,6 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.conversion.warm_start import WarmStart
-from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -39,6 +38,7 @@ from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_de
 from vvgt_cli.look.suggest import fitting
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
+from vvgt_cli.refine import load_ahead
 from vvgt_cli.score.record import ConversionReport, Run
 
 QUICKEST = 0.5  # least pace, where the closed form took less time than estimated

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +27,8 @@ from vvgt_cli.dvr.kernel import (
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.march import LEAP, direction, shade_segment
 from vvgt_cli.dvr.vectors import add, lane, zeros4
-from vvgt_cli.jit.cache import source_digest
 from vvgt_cli.jit.decorators import inlined
+from vvgt_cli.jit.gpu import cuda, free_bytes, gpu_kernel, sent, size_of
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import Scene
@@ -112,39 +112,20 @@ def _store(
     out[n, 0], out[n, 1], out[n, 2], out[n, 3] = red / rays, green / rays, blue / rays, alpha / rays
 
 
-@cache
-def _key() -> int:
-    """Return a number other than 0 that stands for all that the kernels are made of."""
-    return 1 + (int(source_digest(_kernels.__wrapped__), 16) >> 4)  # of 16 hexadecimal digits: within int64
+@gpu_kernel(fastmath=FLAGS, max_registers=REGISTERS)
+def plain_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+    """Apply `_store` to a pixel, without a light."""
+    n = cuda.grid(1)
+    if n < out.shape[0]:
+        _store(data, None, camera, step, width, places, offsets, out, n)
 
 
-@cache
-def _kernels(key: int) -> tuple[Any, Any]:
-    """Return the device's kernels, without a light and with one.
-
-    numba-cuda keeps them on disk by their own code and the numbers around it: ``key`` stands for what they call.
-    """
-    import numba.cuda
-
-    cuda: Any = numba.cuda  # which numba-cuda replaces
-    config: Any = numba.config
-    config.CUDA_LOW_OCCUPANCY_WARNINGS = False
-
-    kernel = cuda.jit(cache=True, fastmath=FLAGS, max_registers=REGISTERS)
-
-    @kernel
-    def plain_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
-        n = cuda.grid(1)
-        if n < out.shape[0] and key != 0:
-            _store(data, None, camera, step, width, places, offsets, out, n)
-
-    @kernel
-    def lit_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
-        n = cuda.grid(1)
-        if n < out.shape[0] and key != 0:
-            _store(data, data[3], camera, step, width, places, offsets, out, n)
-
-    return plain_pixels, lit_pixels
+@gpu_kernel(fastmath=FLAGS, max_registers=REGISTERS)
+def lit_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+    """Apply `_store` to a pixel, with the light that lies in ``data``."""
+    n = cuda.grid(1)
+    if n < out.shape[0]:
+        _store(data, data[3], camera, step, width, places, offsets, out, n)
 
 
 def scene_arrays(scene: Scene) -> tuple[Any, ...]:
@@ -171,14 +152,11 @@ class DeviceRays:
         Raises:
             MemoryError: more bytes than are free there.
         """
-        from numba import cuda
-
         data = scene_arrays(self.scene)
-        needed, (free, _) = _bytes(data), cuda.current_context().get_memory_info()
+        needed, free = size_of(data), free_bytes()
         if needed > free:
             raise MemoryError(f"the volume needs {needed / 1e9:.1f} GB, of which {free / 1e9:.1f} are free")
-        found: tuple[Any, ...] = _sent(data)
-        return found
+        return tuple(sent(data))
 
     def __call__(self, *args: Any) -> None:
         """Draw pixels; arguments as of `march.render_tiles` from ``eye`` on."""
@@ -198,32 +176,16 @@ class DeviceRays:
         self, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, _order: np.ndarray,
         offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
     ) -> None:  # fmt: skip
-        from numba import cuda
-
         places = np.flatnonzero(mask)
         if not len(places):
             return
         data, pixels = self.on_device, cuda.device_array((len(places), 4), np.float32)
         camera = np.zeros((5, 4))
         camera[0, :3], camera[1:4, :3], camera[4] = eye, basis, lens
-        sent = map(cuda.to_device, (places.astype(np.int32), np.ascontiguousarray(offsets, np.float64)))
-        render = _kernels(_key())[self.scene.light is not None]
+        there = sent((camera, places.astype(np.int32), np.asarray(offsets, np.float64)))
+        render = plain_pixels if self.scene.light is None else lit_pixels
         blocks = -(-len(places) // THREADS)
-        render[blocks, THREADS](data, cuda.to_device(camera), step, mask.shape[1], *sent, pixels)
-        share = len(offsets) / (known + len(offsets))
-        out[mask] = (1 - share) * out[mask] + share * pixels.copy_to_host()
-
-
-def _sent(value: Any) -> Any:
-    """Return arrays, or tuples of them, with the arrays on the device."""
-    from numba import cuda
-
-    if isinstance(value, tuple):
-        made = map(_sent, value)
-        return value._make(made) if hasattr(value, "_make") else tuple(made)
-    return cuda.to_device(value) if isinstance(value, np.ndarray) else value
-
-
-def _bytes(value: Any) -> int:
-    """Return the bytes of arrays, or tuples of them."""
-    return sum(map(_bytes, value)) if isinstance(value, tuple) else getattr(value, "nbytes", 0)
+        render[blocks, THREADS](data, there[0], step, mask.shape[1], *there[1:], pixels)
+        rows, share = out.reshape(-1, 4), np.float32(len(offsets) / (known + len(offsets)))
+        drawn = pixels.copy_to_host()
+        rows[places] = drawn if known == 0 else (1 - share) * rows[places] + share * drawn

@@ -99,9 +99,16 @@ def options_of(function: Any) -> list[tuple[str, str]] | None:
 # What code is compiled for.
 
 
+@cache
+def _host() -> tuple[str, str, str]:
+    """Return the target, the processor and its features as numba finds them, which asks the system each time."""
+    found: tuple[str, str, str] = cpu_target.target_context.codegen().magic_tuple()
+    return found
+
+
 def processor() -> tuple[Any, ...]:
     """Return what machine code depends on: the target, the processor, its features and numba's settings."""
-    triple, name, found = cpu_target.target_context.codegen().magic_tuple()
+    triple, name, found = _host()
     return triple, name, features(found), [getattr(config, setting, None) for setting in SETTINGS]
 
 

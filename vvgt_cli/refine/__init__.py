@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -42,11 +44,23 @@ def optimize(
 
     Raises:
         DataError: no views, or images or weights that do not fit their cameras.
-        UsageError: weights of training views on another device than the CPU.
     """
     from vvgt_cli.refine.loop import run
 
     return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free, weights)
 
 
-__all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]
+def load_ahead() -> None:
+    """Begin to load the kernels of a CUDA device, in the background: the first picture waits for the rest."""
+
+    def run() -> None:
+        from vvgt_cli.jit.gpu import load
+        from vvgt_cli.refine.on_device import KERNELS
+
+        with contextlib.suppress(Exception):  # of the driver or the compiler: whoever takes a step meets it again
+            load(KERNELS)
+
+    threading.Thread(target=run, daemon=True).start()
+
+
+__all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "load_ahead", "optimize"]

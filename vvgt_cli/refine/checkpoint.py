@@ -29,7 +29,7 @@ _FAULTS = (
     *(zipfile.BadZipFile, struct.error),
 )
 
-STEPPED = 4  # raised when the same start and options step otherwise, or what is kept has other names
+STEPPED = 5  # raised when the same start and options step otherwise, or what is kept has other names
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
@@ -50,7 +50,7 @@ def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> 
 def save(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord, walk: dict[str, Any]) -> None:
     """Replace the file at ``path``, or raise DataError; ``walk`` is plain values."""
     arrays: dict[str, Any] = {f"state_{name}": array for name, array in state.saved().items()}
-    arrays |= {f"best_{i}": array for i, array in enumerate(judge.kept or ())}
+    arrays |= {f"best_{name}": array for name, array in (judge.kept or {}).items()}
     about = {"key": key, "walk": walk, "best": judge.best, "idle": judge.idle, "record": asdict(record)}
     with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), **arrays)
@@ -72,10 +72,9 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
         own = state.saved()
         saved = {name.removeprefix("state_"): array for name, array in arrays.items() if name.startswith("state_")}
         _check_like(saved, own)
-        kept = [arrays[name] for name in sorted(arrays) if name.startswith("best_")]
+        kept = {name.removeprefix("best_"): array for name, array in arrays.items() if name.startswith("best_")}
         if kept:
-            own = {name: array for name, array in own.items() if name.startswith("array_")}
-            _check_like({f"array_{i}": array for i, array in enumerate(kept)}, own)
+            _check_like(kept, {name: array for name, array in own.items() if name.startswith("array_")})
         state.restore(saved)
         best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
         described = {field: about["record"][field] for field in asdict(record)}
@@ -83,7 +82,7 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
     except _FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
-    judge.best, judge.idle, judge.kept = best, idle, tuple(kept) or None
+    judge.best, judge.idle, judge.kept = best, idle, kept or None
     for field, value in described.items():
         setattr(record, field, value)
     return walk

@@ -9,7 +9,6 @@ from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.images.metrics import mean_psnr
 from vvgt_cli.refine.options import Check, OptimizeRecord
 from vvgt_cli.refine.states import State
-from vvgt_cli.splat import blend
 
 GAIN = 0.01  # dB: less is none
 FALLEN = 3.0  # dB below the best: rates were too large
@@ -22,7 +21,7 @@ class Judge:
         """Judge ``state`` by the views of ``check``, drawn by ``rule``; scores go into ``record``."""
         self.state, self.check, self.record, self.rule = state, check, record, rule
         self.best: float | None = None
-        self.kept: tuple[np.ndarray, ...] | None = None
+        self.kept: dict[str, np.ndarray] | None = None  # of what the state has saved, its arrays
         self.idle = 0
 
     def measure(self, seconds: float, settling: bool = False) -> bool:
@@ -38,8 +37,7 @@ class Judge:
         cameras, views, blocks, weights = (*self.check, None, None)[:4]
         for i, camera in enumerate(cameras):
             part = None if blocks is None else blocks[i]
-            projection = self.state.project(camera, self.rule)
-            image = blend(projection, np.maximum(self.state.colors_from(camera), 0), camera.height, camera.width, part)
+            image = self.state.picture(camera, self.rule, part)
             images.append(image if part is None else part.pick(image))
         now = mean_psnr(views, images, weights)
         record.checks.append((record.steps, seconds, now))
@@ -47,14 +45,15 @@ class Judge:
         gained = self.best is None or now > self.best + GAIN
         self.idle = 0 if gained else self.idle + ((settling and self.state.STEADY) or fallen)
         if self.best is None or now > self.best:
-            self.best, self.kept, record.kept = now, tuple(a.copy() for a in self.state.arrays), record.steps
+            self.best, record.kept = now, record.steps
+            self.kept = {k: array.copy() for k, array in self.state.saved().items() if k.startswith("array_")}
         if fallen:
             self._put_back()
         return fallen
 
     def _put_back(self) -> None:
         assert self.kept is not None
-        self.state.arrays = tuple(kept.copy() for kept in self.kept)
+        self.state.restore(self.state.saved() | {name: array.copy() for name, array in self.kept.items()})
 
     def result(self, start: Gaussians) -> Gaussians:
         """Return the best state as Gaussians; the input itself where nothing was better."""

@@ -14,20 +14,19 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.judge import Judge
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.refine.states import MEMORY, Fields, OwnAxes, State
-from vvgt_cli.splat import Projection, blend
+from vvgt_cli.refine.states import Fields, OnHost, OwnAxes, State
+from vvgt_cli.splat import Projection
 from vvgt_cli.splat.render import moments, screen_slopes
 
 SLOWER = 0.5  # rates after a fall
@@ -52,8 +51,6 @@ def run(
     _fit("training", cameras, images, None, weights)
     if check is not None:
         _fit("check", *check)
-    if weights is not None and options.device != "cpu":
-        raise UsageError(f"weights of views with device {options.device}; expected the CPU, which alone uses them")
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)
@@ -75,7 +72,7 @@ def run(
         view = next(order)
         share = _share(options, record.steps, course.elapsed)
         weight = None if weights is None else weights[view]
-        course.error = step(state, cameras[view], images[view], options, course.error, share, course.speed, weight)
+        state.step(cameras[view], images[view], share, course.speed, weight)
         record.steps += 1
         expected = _expected(options, record.steps, course.elapsed)
         if progress:
@@ -99,7 +96,6 @@ def run(
 class _Course:
     """Values that change from step to step beside the state."""
 
-    error: float | None = None
     speed: float = 1.0
     elapsed: float = 0.0
     scored: int = 0
@@ -121,56 +117,13 @@ def begin(
     gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
 ) -> State:
     """Return the state that a method descends on: Gaussians that carry values with the look that they have."""
+    kinds: dict[str, Callable[..., OnHost]] = {"frame": OwnAxes, "adam": Fields, "3dgs": Densified}
     gaussians = replace(gaussians, live=None)
-    if options.method == "3dgs":
-        return Densified(gaussians, cameras, options)
-    if options.method == "adam":
-        return Fields(gaussians, cameras)
     if options.device == "cpu":
-        return OwnAxes(gaussians, cameras, options.rule, free)
+        return kinds[options.method](gaussians, cameras, options, free)
     from vvgt_cli.refine.on_device import OwnAxesOnDevice
 
-    return OwnAxesOnDevice(gaussians, cameras, options, free, options.device)
-
-
-def step(
-    state: State,
-    camera: Camera,
-    target: np.ndarray,
-    options: OptimizeOptions,
-    error: float | None,
-    share: float,
-    speed: float,
-    weight: np.ndarray | None = None,
-) -> float:
-    """Forward, loss, backward, update for one view; takes and returns the running RMS error.
-
-    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``. ``weight`` (h, w): of differences.
-    """
-    if options.device != "cpu":
-        there: Any = state  # an `OwnAxesOnDevice`
-        return float(there.step_on(camera, target, options, error, share, speed))
-    from vvgt_cli.refine.loss import loss_gradient
-    from vvgt_cli.refine.ssim import add_ssim_gradient
-    from vvgt_cli.refine.texture import add_texture_gradient
-
-    projection = state.project(camera, options.rule)
-    image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
-    seen = image if weight is None else target + weight[..., None] * (image - target)
-    grad = np.empty_like(image)
-    l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)
-    squares = np.empty(camera.height)
-    loss_gradient(seen, target, l1, l2, alpha, grad, squares)
-    if options.ssim > 0:
-        add_ssim_gradient(seen, target, options.ssim, grad)
-    if options.texture > 0:
-        add_texture_gradient(seen, target, options.texture, grad)
-    if weight is not None:
-        grad *= weight[..., None]
-    now = math.sqrt(squares.sum() / ((3 + options.alpha) * camera.height * camera.width))
-    error = now if error is None else MEMORY * error + (1 - MEMORY) * now
-    state.descend(camera, projection, image, grad, error, share, speed)
-    return error
+    return OwnAxesOnDevice(gaussians, cameras, options, free)
 
 
 def spread_views(cameras: Sequence[Camera], seed: int) -> Iterator[int]:
@@ -250,9 +203,11 @@ class Densified(Fields):
 
     STEADY = False
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> None:
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
+    ) -> None:
         """Take the limit of Gaussians, or their number, and the random seed from ``options``."""
-        super().__init__(gaussians, cameras)
+        super().__init__(gaussians, cameras, options, free)
         self.limit = max(options.max_gaussians or len(gaussians), 1)
         self.rng = np.random.default_rng(options.seed)
         eyes = np.array([camera.position for camera in cameras])
@@ -270,7 +225,6 @@ class Densified(Fields):
         projection: Projection,
         image: np.ndarray,
         grad: np.ndarray,
-        error: float,
         share: float,
         speed: float,
     ) -> None:
@@ -281,13 +235,13 @@ class Densified(Fields):
         self.slopes += screen_slopes(projection, pairs) * (0.5 * max(camera.width, camera.height) / size)
         self.seen += projection.extent[:, 2] > projection.extent[:, 0]
         self.update(camera, projection, pairs, seen, (self.RATES[0] * FINAL_RATE**share, *self.RATES[1:]))
-        if FIRST <= share <= LAST and share >= self.share + EVERY and self.step >= self.last + FEWEST:
+        if FIRST <= share <= LAST and share >= self.share + EVERY and self.taken >= self.last + FEWEST:
             self._densify()
-            self.last, self.share = self.step, share
+            self.last, self.share = self.taken, share
         if share <= LAST and share >= self.share_reset + RESET:
-            if self.step >= self.last_reset + RECOVERY:
+            if self.taken >= self.last_reset + RECOVERY:
                 self._reset()
-            self.last_reset, self.share_reset = self.step, share
+            self.last_reset, self.share_reset = self.taken, share
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on."""

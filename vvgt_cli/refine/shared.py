@@ -135,21 +135,22 @@ class SharedSteps:
         """
         found = np.empty((KNOWN, FEATURES), np.float32)
         steps.regress(self.solver, directions, self.factor, found)
-        self.remember(found.astype(np.float64) / self.factor)
-        return found
-
-    def remember(self, plain: np.ndarray) -> None:
-        """Adapt `factor` to a prediction (KNOWN, FEATURES), ``plain`` without that factor."""
+        plain = found.astype(np.float64) / self.factor
         size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
         if 0 < size < math.inf:
             cosine = float((plain * self.before).sum()) / size
             self.agreement = RECALL * self.agreement + (1 - RECALL) * cosine
             self.factor = min(max(self.factor * math.exp(PACE * (self.agreement - AGREEING)), BOUNDS[0]), BOUNDS[1])
         self.before = plain
+        return found
+
+    def last(self) -> np.ndarray:
+        """Return the last prediction (KNOWN x FEATURES), its factor and agreement, in one array."""
+        return np.append(self.before, (self.factor, self.agreement))
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return what the next steps depend on."""
-        return {"last": np.append(self.before, (self.factor, self.agreement))}
+        return {"last": self.last()}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""

@@ -1,20 +1,25 @@
-"""States of gradient descent: a state renders itself, takes steps, and can be put back to where it was."""
+"""States of gradient descent: a state takes steps, draws itself, and can be put back to where it was."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import SH_C0, Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
+from vvgt_cli.refine.loss import picture_slope
+from vvgt_cli.refine.options import OptimizeOptions
 from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
-from vvgt_cli.splat import Projection, project
+from vvgt_cli.splat import Projection, blend, project
 from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
 MEMORY = 0.9  # share of the running error that a step keeps
@@ -25,6 +30,8 @@ MEDIAN = 512  # of the sample that the median is of, or less than twice as many;
 GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
 OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
+
+DEFAULT = OptimizeOptions()
 
 
 def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
@@ -40,7 +47,97 @@ def _has_harmonics(harmonics: np.ndarray | None) -> bool:
     return bool(harmonics[:, degree**2 - 1 :].any())
 
 
-class OwnAxes:
+class State(Protocol):
+    """What a descent works on, whatever its method and wherever it is.
+
+    Attributes:
+        STEADY: what falls far behind its best can be put back there, and a run without gain is at its end.
+    """
+
+    STEADY: bool
+
+    def step(
+        self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
+    ) -> None:
+        """Step towards a view, ``target`` (h, w, 4); ``share`` in [0, 1] of the run lies behind.
+
+        Rates are multiplied by ``speed``, differences from the view by ``weight`` (h, w).
+        """
+
+    def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
+        """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Return all that the next steps depend on and that the start does not give again; the fields ``array_i``."""
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+
+    def gaussians(self) -> Gaussians:
+        """Return the current Gaussians, as a file has them."""
+
+
+class OnHost(ABC):
+    """A state whose steps the CPU takes.
+
+    Attributes:
+        arrays: what is descended on, colours and harmonics last.
+        error: running RMS error of the pictures.
+        taken: number of steps.
+    """
+
+    STEADY = True
+    arrays: tuple[np.ndarray, ...]
+
+    def __init__(self, options: OptimizeOptions) -> None:
+        """Begin before the first step."""
+        self.options, self.error, self.taken = options, math.nan, 0
+
+    def step(
+        self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
+    ) -> None:
+        """Draw, differentiate the loss, and `descend`; arguments as of `State.step`."""
+        projection = self.project(camera, self.options.rule)
+        image = blend(projection, np.maximum(self.colors_from(camera), 0), camera.height, camera.width)
+        grad, now = picture_slope(image, target, self.options, weight)
+        self.error = now if math.isnan(self.error) else MEMORY * self.error + (1 - MEMORY) * now
+        self.descend(camera, projection, image, grad, share, speed)
+
+    def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
+        """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
+        colors = np.maximum(self.colors_from(camera), 0)
+        return blend(self.project(camera, rule), colors, camera.height, camera.width, blocks)
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Return the fields, and what is counted."""
+        counted = {"step": np.array(self.taken), "error": np.array(self.error)}
+        return {f"array_{i}": array for i, array in enumerate(self.arrays)} | counted
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.taken, self.error = int(saved["step"]), float(saved["error"])
+
+    @abstractmethod
+    def colors_from(self, camera: Camera) -> np.ndarray:
+        """Return (K, 3) colours as the camera sees them, which may be negative."""
+
+    @abstractmethod
+    def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        """Return the projection of the current Gaussians, by ``rule``."""
+
+    @abstractmethod
+    def descend(
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, share: float, speed: float
+    ) -> None:
+        """Take one step from a picture and the slope of the loss by it, (h, w, 4); others as of `State.step`."""
+
+    @abstractmethod
+    def gaussians(self) -> Gaussians:
+        """Return the current Gaussians, as a file has them."""
+
+
+class OwnAxes(OnHost):
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
@@ -55,15 +152,16 @@ class OwnAxes:
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
-    STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
     def __init__(
-        self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA, free: np.ndarray | None = None
-    ) -> None:
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions = DEFAULT,
+        free: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Keep only ``free`` (K,) bool moving; None: all."""
+        super().__init__(options)
         scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
-        self.arrays: tuple[np.ndarray, ...] = (
+        self.arrays = (
             gaussians.means.copy(),
             np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
             gaussians.opacity_logits.copy(),
@@ -75,11 +173,11 @@ class OwnAxes:
         self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
         self.first, self.second = (np.zeros((steps.COUNT, len(gaussians)), np.float32) for _ in range(2))
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
-        self.spread = rule.dilation * pixel**2
-        self.step = 0
+        self.spread = options.rule.dilation * pixel**2
         # what has been descended on before is not wrong alike any more
         self.shared = shared_steps(*self.arrays[:4]) if free is None else None
         self.weakest = 0.0 if free is None and self.shared is None else WEAKEST if free is None else GOING_ON
+        self.own_rates = self.RATES * self.OWN if self.weakest else self.RATES
         self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
@@ -93,41 +191,37 @@ class OwnAxes:
         return project_factors(means, factors, logits, camera, rule)
 
     def descend(
-        self,
-        camera: Camera,
-        projection: Projection,
-        image: np.ndarray,
-        grad: np.ndarray,
-        error: float,
-        share: float,
-        speed: float,
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, share: float, speed: float
     ) -> None:
-        """Take one step; ``error``: RMS of pictures so far, ``share`` completed, ``speed``: a factor of rates."""
+        """Take one step, with harmonics where there are any."""
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
         slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
-        rates, pace = self.rates(error, share, speed)
+        rates, pace = self.rates(share, speed)
         steps.own_axes(
             slopes.rows, rates, self.CLIPS, self.spread,
-            *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
+            *self.BETAS, self.taken, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
             rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
-            steps.adam(values, slope, rate, *self.BETAS, self.step, first, second)
+            steps.adam(values, slope, rate, *self.BETAS, self.taken, first, second)
         if len(self.fixed):
             for array, there in zip(self.arrays, self.there, strict=True):
                 array[self.fixed] = there
 
-    def rates(self, error: float, share: float, speed: float) -> tuple[np.ndarray, float]:
+    def pace(self, share: float, speed: float) -> float:
+        """Count a step, and return the factor of its rates but for that of the running error."""
+        self.taken += 1
+        return speed * min(1.0, 2 * (1 - share)) * min(1.0, self.taken / WARM_UP)
+
+    def rates(self, share: float, speed: float) -> tuple[np.ndarray, float]:
         """Count a step, and return the rates of its fields as of `RATES`, and the factor that they share."""
-        self.step += 1
-        pace = speed * min(1.0, 2 * (1 - share))
-        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
-        return self.RATES * self.OWN * pace if self.weakest else self.RATES * pace, pace
+        pace = self.pace(share, speed) * min(self.LARGEST, math.sqrt(self.error / self.ERROR))
+        return self.own_rates * pace, pace
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what is added to Adam's divisors, features and shared weights; from slopes ``rows`` (COUNT, K)."""
@@ -135,7 +229,7 @@ class OwnAxes:
             return np.full(len(rows), EPSILON, np.float32), *NONE
         every, count = sample_of(rows.shape[1])
         directions, sizes = np.empty((2, len(rows), count), np.float32)
-        steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.step, every, directions, sizes)
+        steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.taken, every, directions, sizes)
         few = sizes[:, :: max(count // MEDIAN, 1)]
         medians = [np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few]
         most = np.array([OUTLIER * median for median in medians], np.float64)
@@ -147,17 +241,15 @@ class OwnAxes:
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on and that the start does not give again."""
-        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
-        named |= {f"running_{i}": array for i, array in enumerate(self.running)}
+        named = super().saved() | {f"running_{i}": array for i, array in enumerate(self.running)}
         named |= self.shared.saved() if self.shared is not None else {}
-        return named | {"first": self.first.T, "second": self.second.T, "step": np.array(self.step)}
+        return named | {"first": self.first.T, "second": self.second.T}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
-        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        super().restore(saved)
         self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
-        self.step = int(saved["step"])
         if self.shared is not None:
             self.shared.restore(saved)
 
@@ -174,18 +266,20 @@ class OwnAxes:
         return Gaussians(means, log_scales, quaternions(axes), logits, *colors)
 
 
-class Fields:
+class Fields(OnHost):
     """Adam on the fields of `Gaussians` with the rates of 3DGS (Kerbl et al. 2023), nothing else of theirs."""
 
     RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * SH_C0, 2.5e-3 / 20)  # lengths: 1.6e-4 x an extent of 3.3
     BETAS = 0.9, 0.999
-    STEADY = True
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        """Begin at ``gaussians``, with moments of 0."""
-        self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in gaussians.arrays().values())
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions = DEFAULT,
+        free: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """Begin at ``gaussians``, with moments of 0; all of them move."""
+        super().__init__(options)
+        self.arrays = tuple(array.copy() for array in gaussians.arrays().values())
         self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
-        self.step = 0
 
     def colors_from(self, camera: Camera) -> np.ndarray:
         """Return (K, 3) colours as the camera sees them, which may be negative."""
@@ -196,14 +290,7 @@ class Fields:
         return project(self.gaussians(), camera, rule)
 
     def descend(
-        self,
-        camera: Camera,
-        projection: Projection,
-        image: np.ndarray,
-        grad: np.ndarray,
-        error: float,
-        share: float,
-        speed: float,
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, share: float, speed: float
     ) -> None:
         """Take one step; error and schedule do not matter: 3DGS' rates are constant over so few steps."""
         seen = self.colors_from(camera)
@@ -215,29 +302,25 @@ class Fields:
         """Apply Adam with ``rates`` to the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
-        self.step += 1
+        self.taken += 1
         found = [getattr(slopes, field) for field in gaussians.arrays()]
         used = rates[: len(found)]
         for array, slope, rate, (first, second) in zip(self.arrays, found, used, self.running, strict=True):
             values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
-            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
+            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.taken, moment, square)
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on."""
-        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        named = super().saved()
         for i, (first, second) in enumerate(self.running):
             named |= {f"first_{i}": first, f"second_{i}": second}
-        return named | {"step": np.array(self.step)}
+        return named
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
-        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        super().restore(saved)
         self.running = [(saved[f"first_{i}"], saved[f"second_{i}"]) for i in range(len(self.arrays))]
-        self.step = int(saved["step"])
 
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians."""
         return Gaussians(*self.arrays)
-
-
-State = OwnAxes | Fields

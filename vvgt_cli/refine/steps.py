@@ -23,9 +23,18 @@ _jit = inlined(error_model="numpy")  # a division that could raise is none of ve
 
 
 @_jit
-def _clip(value: float, bound: float) -> float:
+def clip(value: float, bound: float) -> float:
     """Limit ``value`` to +-``bound``."""
     return min(max(value, -bound), bound)
+
+
+@_jit
+def adam_parts(g: float, m: float, v: float, betas: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """Return Adam's moments after a slope g, and its direction's numerator and divisor; ``betas`` as of `_turn`."""
+    beta1, beta2, fix1, fix2 = betas
+    m = beta1 * m + (ONE - beta1) * g
+    v = beta2 * v + (ONE - beta2) * g * g
+    return m, v, m * fix1, math.sqrt(v * fix2)
 
 
 @_jit
@@ -38,15 +47,13 @@ def _turn(
     ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``betas`` beta1, beta2
     and what undoes their start from zero; ``floors`` (COUNT,) are added to the divisors.
     """
-    beta1, beta2, fix1, fix2 = betas
     start, lanes = U(begin), U(count)
     for field in range(U(COUNT)):
         for i in range(lanes):
-            g, k = slopes[field, start + i], start + i
-            m = beta1 * first[field, k] + (ONE - beta1) * g
-            v = beta2 * second[field, k] + (ONE - beta2) * g * g
+            k = start + i
+            m, v, towards, size = adam_parts(slopes[field, k], first[field, k], second[field, k], betas)
             first[field, k], second[field, k] = m, v
-            buf[field * _P1 + i] = m * fix1 / (math.sqrt(v * fix2) + floors[field])
+            buf[field * _P1 + i] = towards / (size + floors[field])
 
 
 @inlined(error_model="numpy", fastmath={"contract"})
@@ -74,42 +81,70 @@ def _share(features: np.ndarray, chunk: int, weights: np.ndarray, known: np.ndar
 
 
 @_jit
-def _gain(buf: np.ndarray, at: int, spread: float) -> float:
-    """Return how much further an axis may go than a long one: a column of M, from ``at`` on.
+def _gain(x: float, y: float, z: float, spread: float) -> float:
+    """Return how much further an axis may go than a long one: a column of M.
 
     The dilation, of variance ``spread``, hides part of its step.
     """
-    x, y, z = buf[at], buf[at + U(3) * _P1], buf[at + U(6) * _P1]
     return math.sqrt(min(ONE + spread / max(x * x + y * y + z * z, f32(1e-30)), NINE))
+
+
+@_jit
+def _bend(row: tuple[float, ...], e: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return a row of ``M (I - E + E^2 / 2)``; ``e``: 00, 11, 22, 01, 02, 12."""
+    m0, m1, m2 = row
+    e00, e11, e22, e01, e02, e12 = e
+    s0 = m0 * e00 + m1 * e01 + m2 * e02  # M E
+    s1 = m0 * e01 + m1 * e11 + m2 * e12
+    s2 = m0 * e02 + m1 * e12 + m2 * e22
+    return (
+        m0 - s0 + HALF * (s0 * e00 + s1 * e01 + s2 * e02),
+        m1 - s1 + HALF * (s0 * e01 + s1 * e11 + s2 * e12),
+        m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22),
+    )
+
+
+@_jit
+def move_one(
+    way: tuple[float, ...], m: tuple[float, ...], rates: tuple[float, ...], clips: tuple[float, ...], spread: float
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Return what is subtracted from a mean, and the rows of M after the step.
+
+    ``way`` (9): directions of d and E, ``m`` (9) M row by row; ``rates`` and ``clips`` of d, E on and off the diagonal.
+    """
+    r0, r1, r2 = rates
+    c0, c1 = clips
+    p0, p1, p2 = _gain(m[0], m[3], m[6], spread), _gain(m[1], m[4], m[7], spread), _gain(m[2], m[5], m[8], spread)
+    d0, d1, d2 = clip(way[0] * r0 * p0, c0), clip(way[1] * r0 * p1, c0), clip(way[2] * r0 * p2, c0)
+    e = (
+        clip(way[3] * r1 * min(p0 * p0, FOUR), c1), clip(way[4] * r1 * min(p1 * p1, FOUR), c1),
+        clip(way[5] * r1 * min(p2 * p2, FOUR), c1), clip(way[6] * r2 * min(p0 * p1, FOUR), c1),
+        clip(way[7] * r2 * min(p0 * p2, FOUR), c1), clip(way[8] * r2 * min(p1 * p2, FOUR), c1),
+    )  # fmt: skip
+    back = (
+        m[0] * d0 + m[1] * d1 + m[2] * d2, m[3] * d0 + m[4] * d1 + m[5] * d2, m[6] * d0 + m[7] * d1 + m[8] * d2
+    )  # fmt: skip
+    return back, _bend(m[:3], e), _bend(m[3:6], e), _bend(m[6:], e)
 
 
 @_jit
 def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], spread: float) -> None:
     """Write what is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
-    r0, r1, r2 = rates
-    c0, c1 = clips
     for i in range(U(LANES)):
-        at = i + PLACE
-        p0, p1, p2 = _gain(buf, at, spread), _gain(buf, at + _P1, spread), _gain(buf, at + U(2) * _P1, spread)
-        d0 = _clip(buf[i] * r0 * p0, c0)
-        d1 = _clip(buf[i + _P1] * r0 * p1, c0)
-        d2 = _clip(buf[i + U(2) * _P1] * r0 * p2, c0)
-        e00 = _clip(buf[i + U(3) * _P1] * r1 * min(p0 * p0, FOUR), c1)
-        e11 = _clip(buf[i + U(4) * _P1] * r1 * min(p1 * p1, FOUR), c1)
-        e22 = _clip(buf[i + U(5) * _P1] * r1 * min(p2 * p2, FOUR), c1)
-        e01 = _clip(buf[i + U(6) * _P1] * r2 * min(p0 * p1, FOUR), c1)
-        e02 = _clip(buf[i + U(7) * _P1] * r2 * min(p0 * p2, FOUR), c1)
-        e12 = _clip(buf[i + U(8) * _P1] * r2 * min(p1 * p2, FOUR), c1)
-        for row in range(3):
-            here = at + U(3 * row) * _P1
-            m0, m1, m2 = buf[here], buf[here + _P1], buf[here + U(2) * _P1]
-            buf[i + U(row) * _P1] = m0 * d0 + m1 * d1 + m2 * d2
-            s0 = m0 * e00 + m1 * e01 + m2 * e02  # M E
-            s1 = m0 * e01 + m1 * e11 + m2 * e12
-            s2 = m0 * e02 + m1 * e12 + m2 * e22
-            buf[here] = m0 - s0 + HALF * (s0 * e00 + s1 * e01 + s2 * e02)
-            buf[here + _P1] = m1 - s1 + HALF * (s0 * e01 + s1 * e11 + s2 * e12)
-            buf[here + U(2) * _P1] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
+        p = i + PLACE
+        way = (
+            buf[i], buf[i + _P1], buf[i + _P2], buf[i + _P3], buf[i + _P4], buf[i + U(5) * _P1], buf[i + U(6) * _P1],
+            buf[i + U(7) * _P1], buf[i + U(8) * _P1],
+        )  # fmt: skip
+        m = (
+            buf[p], buf[p + _P1], buf[p + _P2], buf[p + _P3], buf[p + _P4], buf[p + U(5) * _P1], buf[p + U(6) * _P1],
+            buf[p + U(7) * _P1], buf[p + U(8) * _P1],
+        )  # fmt: skip
+        back, row0, row1, row2 = move_one(way, m, rates, clips, spread)
+        buf[i], buf[i + _P1], buf[i + _P2] = back
+        buf[p], buf[p + _P1], buf[p + _P2] = row0
+        buf[p + _P3], buf[p + _P4], buf[p + U(5) * _P1] = row1
+        buf[p + U(6) * _P1], buf[p + U(7) * _P1], buf[p + U(8) * _P1] = row2
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2")
@@ -151,7 +186,7 @@ def own_axes(
                 colors[k, axis] = max(colors[k, axis] - tint, least)
             for entry in range(9):
                 factors[k, entry // 3, entry % 3] = buf[at + PLACE + U(entry) * _P1]
-            logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
+            logits[k] -= clip(buf[at + U(9) * _P1] * by_logit, farthest)
 
 
 @parallel_kernel("f4:2 f4:2 f4:2 f8 f8 i8 i8 f4:2 f4:2", error_model="numpy")
@@ -164,14 +199,13 @@ def adam_sizes(
     One in ``every`` runs of `RUN` Gaussians is read, in that order; ``slopes`` (COUNT, K) are new, ``first``,
     ``second`` (COUNT, K) the running moments without them.
     """
-    b1, b2, fix1, fix2 = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    betas = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     for row in iterations(thread, COUNT):
         for begin in range(0, sizes.shape[1], RUN):
             for i in range(U(begin), U(min(begin + RUN, sizes.shape[1]))):
                 k = i + U(begin * (every - 1))
-                g = slopes[row, k]
-                towards[row, i] = (b1 * first[row, k] + (ONE - b1) * g) * fix1
-                sizes[row, i] = math.sqrt((b2 * second[row, k] + (ONE - b2) * g * g) * fix2)
+                parts = adam_parts(slopes[row, k], first[row, k], second[row, k], betas)
+                towards[row, i], sizes[row, i] = parts[2], parts[3]
 
 
 @parallel_kernel("f4:2 f8:1 f8 f4:2 f4:1", error_model="numpy")

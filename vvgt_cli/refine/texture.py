@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 from vvgt_cli.refine.ssim import KERNEL, blur
 
@@ -54,19 +54,24 @@ def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, plan
             planes[6, y, x] = square
 
 
+@inlined(error_model="numpy")
+def smooth_share(red: float, green: float, blue: float, squares: float) -> float:
+    """Return C / (C + v), from the means of a view's channels under the window, and of the sum of their squares."""
+    variance = max(squares - (red * red + green * green + blue * blue), f32(0)) * f32(1 / 3)  # mean of the channels
+    share: float = f32(SMOOTH) / (f32(SMOOTH) + variance)
+    return share
+
+
 @parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")
 def weigh(thread: ThreadSlice, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray) -> None:
     """Replace the first three ``planes`` (7, h, w) by the errors less their blur, times C / (C + v).
 
     ``blurred`` (7, h, w) is the blur of what `part_planes` gave; ``sums`` (h,) gets the term's sum of each row.
     """
-    smooth, third = f32(SMOOTH), f32(1 / 3)
     for y in iterations(thread, planes.shape[1]):
         total = 0.0
         for x in range(planes.shape[2]):
-            b0, b1, b2 = blurred[3, y, x], blurred[4, y, x], blurred[5, y, x]
-            variance = max(blurred[6, y, x] - (b0 * b0 + b1 * b1 + b2 * b2), f32(0)) * third  # mean of the channels
-            share = smooth / (smooth + variance)
+            share = smooth_share(blurred[3, y, x], blurred[4, y, x], blurred[5, y, x], blurred[6, y, x])
             for c in range(3):
                 error = planes[c, y, x] - blurred[c, y, x]
                 planes[c, y, x] = share * error

@@ -63,13 +63,32 @@ _exact = inlined()
 
 
 @tile_jit
+def slope_at(
+    raw: float, t: float, behind: float, own: float, rule: tuple[float, ...]
+) -> tuple[float, float, float, float]:
+    """Return a pixel's weight T alpha, dL/dalpha, and transmittance and what is ``behind`` after a Gaussian.
+
+    ``raw`` is its alpha, not clamped, ``t`` T before it, ``own`` its colour times dL/d(image) plus dL/d(alpha).
+    """
+    min_alpha, max_alpha, end = rule[0], rule[1], rule[5]
+    weight = min(raw, max_alpha) * t if raw >= min_alpha else ZERO
+    after = t - weight
+    ended = after < end
+    weight = ZERO if ended else weight
+    behind -= weight * own
+    slope = t * (own - behind / after)
+    slope = slope if weight > ZERO and raw < max_alpha else ZERO
+    return weight, slope, -abs(t) if ended else after, behind
+
+
+@tile_jit
 def _sweep(fetched: np.ndarray, at: int, rule: tuple[float, ...], buf: np.ndarray, sums: np.ndarray) -> None:
     """Add up a column's terms of the Gaussian at ``at`` into the seven rows of ``sums`` (7 x TILE,)."""
     a, b, c, u, v = fetched[at], fetched[at + U(1)], fetched[at + U(2)], fetched[at + U(3)], fetched[at + U(4)]
     opacity = fetched[at + U(5)]
     red, green, blue = max(fetched[at + RED], ZERO), max(fetched[at + GREEN], ZERO), max(fetched[at + BLUE], ZERO)
     y0, y1 = U(fetched[at + FIRST_ROW]), U(fetched[at + END_ROW])
-    min_alpha, max_alpha, floor, factor, offset, end = rule
+    floor, factor, offset = rule[2], rule[3], rule[4]
     shift = opacity * offset
     for i in range(_END):
         sums[i] = ZERO
@@ -79,18 +98,9 @@ def _sweep(fetched: np.ndarray, at: int, rule: tuple[float, ...], buf: np.ndarra
         for i in range(_T):
             j = y * _T + i
             raw = alpha_at(f32(np.int32(i)) + HALF - u, a, h, q, opacity, floor, factor, offset)
-            t = buf[j]
-            weight = min(raw, max_alpha) * t if raw >= min_alpha else ZERO
-            after = t - weight
-            ended = after < end
-            weight = ZERO if ended else weight
             own = red * buf[j + PLANE_2] + green * buf[j + PLANE_3] + blue * buf[j + PLANE_4] + buf[j + PLANE_5]
-            behind = buf[j + PLANE_1] - weight * own
-            slope = t * (own - behind / after)
-            slope = slope if weight > ZERO and raw < max_alpha else ZERO
+            weight, slope, buf[j], buf[j + PLANE_1] = slope_at(raw, buf[j], buf[j + PLANE_1], own, rule)
             g = (raw + shift) * slope
-            buf[j] = -abs(t) if ended else after
-            buf[j + PLANE_1] = behind
             sums[_A0 + i] += g
             g *= dy
             sums[_A1 + i] += g
@@ -184,10 +194,10 @@ def moments(
 
 
 @_exact
-def _total(first: np.ndarray, pairs: np.ndarray, k: int) -> tuple[float, ...]:
-    """Sum of Gaussian k's pairs, 9 float64, in a fixed order; a tuple: an array would be allocated for each."""
+def total_of(pairs: np.ndarray, begin: int, end: int) -> tuple[float, ...]:
+    """Sum of a Gaussian's pairs, 9 float64, in a fixed order; a tuple: an array would be allocated for each."""
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = 0.0
-    for p in range(first[k], first[k + 1]):
+    for p in range(begin, end):
         s0, s1, s2 = s0 + pairs[p, 0], s1 + pairs[p, 1], s2 + pairs[p, 2]
         s3, s4, s5 = s3 + pairs[p, 3], s4 + pairs[p, 4], s5 + pairs[p, 5]
         s6, s7, s8 = s6 + pairs[p, 6], s7 + pairs[p, 7], s8 + pairs[p, 8]
@@ -211,7 +221,7 @@ def screen(thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, flat: np.n
     for k in iterations(thread, flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
-            total = _total(first, pairs, k)
+            total = total_of(pairs, first[k], first[k + 1])
             du, dv, _, _, _ = _screen(flat, k, total, 0.0, 0.0)
             out[k] = np.sqrt(du * du + dv * dv)
 
@@ -259,7 +269,7 @@ def own_axes(
             i = k - begin
             seen[i] = extent[k, 2] > extent[k, 0]
             if seen[i]:
-                total = _total(first, pairs, k)
+                total = total_of(pairs, first[k], first[k + 1])
                 _load_slope(buf, i, k, flat, means, factors, total)
                 out[9, k] = total[0] * (1.0 - flat[k, 6])
                 out[10, k] = total[6] if colors[k, 0] >= 0.0 else 0.0
@@ -331,7 +341,7 @@ def standard(
         out_colors[k] = 0.0
         if extent[k, 2] <= extent[k, 0]:
             continue
-        total = _total(first, pairs, k)
+        total = total_of(pairs, first[k], first[k + 1])
         _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
         x, y, z = to_camera(means, k, rot, trans)
         du, dv, h00, h01, h11 = _screen(flat, k, total, rule[0], rule[1])

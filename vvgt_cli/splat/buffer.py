@@ -63,22 +63,27 @@ prefetch: Any = (lambda rows, index, column: None) if config.DISABLE_JIT else in
 
 
 @tile_jit
+def fetch_one(k: int, at: int, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int, fetched: np.ndarray) -> None:
+    """Copy Gaussian k, without its colour, into ``fetched`` from ``at`` on."""
+    s, left, top = f32(-0.125), f32(ox), f32(oy)
+    fetched[at] = s * HALF * flat[k, 2]
+    fetched[at + U(1)] = s * flat[k, 3]
+    fetched[at + U(2)] = s * HALF * flat[k, 4]
+    fetched[at + U(3)] = flat[k, 0] - left
+    fetched[at + U(4)] = flat[k, 1] - top
+    fetched[at + U(5)] = flat[k, 5]
+    fetched[at + FIRST_ROW] = f32(max(extent[k, 1] - oy, 0))
+    fetched[at + END_ROW] = f32(min(extent[k, 3] - oy, TILE))
+
+
+@tile_jit
 def fetch(
     entries: np.ndarray, begin: int, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int, fetched: np.ndarray
 ) -> int:
     """Copy up to `CHUNK` entries from ``begin`` into ``fetched`` (CHUNK x FIELDS,), no colours; return their number."""
     count: int = min(CHUNK, entries.shape[0] - begin)
-    s, left, top = f32(-0.125), f32(ox), f32(oy)
     for i in range(count):
-        k, at = entries[begin + i], U(i) * FIELDS
-        fetched[at] = s * HALF * flat[k, 2]
-        fetched[at + U(1)] = s * flat[k, 3]
-        fetched[at + U(2)] = s * HALF * flat[k, 4]
-        fetched[at + U(3)] = flat[k, 0] - left
-        fetched[at + U(4)] = flat[k, 1] - top
-        fetched[at + U(5)] = flat[k, 5]
-        fetched[at + FIRST_ROW] = f32(max(extent[k, 1] - oy, 0))
-        fetched[at + END_ROW] = f32(min(extent[k, 3] - oy, TILE))
+        fetch_one(entries[begin + i], U(i) * FIELDS, extent, flat, ox, oy, fetched)
     for index in range(begin + count, min(begin + 2 * CHUNK, entries.shape[0])):
         k = entries[index]
         prefetch(extent, k, 0)

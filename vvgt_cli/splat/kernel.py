@@ -140,6 +140,15 @@ def project_factors(
         _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
+@_jit
+def tiles_of(extent: np.ndarray, k: int) -> tuple[int, int, int, int]:
+    """Return the tiles that Gaussian k lies in: first column and row, and their ends; none where it is unseen."""
+    if extent[k, 2] <= extent[k, 0]:
+        return 0, 0, 0, 0
+    x1, y1 = ((extent[k, 2] - 1) >> SHIFT) + 1, ((extent[k, 3] - 1) >> SHIFT) + 1
+    return extent[k, 0] >> SHIFT, extent[k, 1] >> SHIFT, x1, y1
+
+
 @kernel("u4:1")
 def stable_order(keys: np.ndarray) -> np.ndarray:
     """Order (K,) int64 that sorts ``keys`` (K,) uint32, equal ones as they come (radix sort, 11 bits a pass)."""
@@ -185,10 +194,7 @@ def count_pairs(
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
             prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
-            if extent[k, 2] <= extent[k, 0]:
-                continue
-            x0, x1 = extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1
-            y0, y1 = extent[k, 1] >> SHIFT, ((extent[k, 3] - 1) >> SHIFT) + 1
+            x0, y0, x1, y1 = tiles_of(extent, k)
             first[k + 1] = (x1 - x0) * (y1 - y0)
             for ty in range(y0, y1):
                 for tx in range(x0, x1):
@@ -208,10 +214,9 @@ def file_pairs(
             k = order[index]
             prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
             slot = first[k]
-            if extent[k, 2] <= extent[k, 0]:
-                continue
-            for ty in range(extent[k, 1] >> SHIFT, ((extent[k, 3] - 1) >> SHIFT) + 1):
-                for tx in range(extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1):
+            x0, y0, x1, y1 = tiles_of(extent, k)
+            for ty in range(y0, y1):
+                for tx in range(x0, x1):
                     place = mine[U(ty * tiles_x + tx)]
                     members[U(place)], slots[U(place)] = k, slot
                     mine[U(ty * tiles_x + tx)] = place + 1

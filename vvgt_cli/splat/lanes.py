@@ -42,12 +42,31 @@ def pose_of(rot: np.ndarray, trans: np.ndarray) -> tuple[float, ...]:
 
 
 @_lane_jit
+def place_of(k: int, means: np.ndarray, factors: np.ndarray) -> tuple[float, ...]:
+    """Return Gaussian k's centre and M, row by row, of ``means`` (K, 3), ``factors`` (K, 3, 3): 12 numbers."""
+    return (
+        np.float64(means[k, 0]), np.float64(means[k, 1]), np.float64(means[k, 2]),
+        np.float64(factors[k, 0, 0]), np.float64(factors[k, 0, 1]), np.float64(factors[k, 0, 2]),
+        np.float64(factors[k, 1, 0]), np.float64(factors[k, 1, 1]), np.float64(factors[k, 1, 2]),
+        np.float64(factors[k, 2, 0]), np.float64(factors[k, 2, 1]), np.float64(factors[k, 2, 2]),
+    )  # fmt: skip
+
+
+@_lane_jit
 def load_place(buf: np.ndarray, j: int, k: int, means: np.ndarray, factors: np.ndarray) -> None:
-    """Load Gaussian k's centre and M from ``means`` (K, 3), ``factors`` (K, 3, 3) into lane j of planes 0 to 11."""
-    buf[j], buf[j + _P1], buf[j + _P2] = means[k, 0], means[k, 1], means[k, 2]
-    buf[j + _P3], buf[j + _P4], buf[j + _P5] = factors[k, 0, 0], factors[k, 0, 1], factors[k, 0, 2]
-    buf[j + _P6], buf[j + _P7], buf[j + _P8] = factors[k, 1, 0], factors[k, 1, 1], factors[k, 1, 2]
-    buf[j + _P9], buf[j + _P10], buf[j + _P11] = factors[k, 2, 0], factors[k, 2, 1], factors[k, 2, 2]
+    """Load `place_of` Gaussian k into lane j of planes 0 to 11."""
+    place = place_of(k, means, factors)
+    buf[j], buf[j + _P1], buf[j + _P2], buf[j + _P3], buf[j + _P4], buf[j + _P5] = place[:6]
+    buf[j + _P6], buf[j + _P7], buf[j + _P8], buf[j + _P9], buf[j + _P10], buf[j + _P11] = place[6:]
+
+
+@_lane_jit
+def _lane_place(buf: np.ndarray, i: int) -> tuple[float, ...]:
+    """Return the 12 numbers of `place_of` that lane i holds."""
+    return (
+        buf[i], buf[i + _P1], buf[i + _P2], buf[i + _P3], buf[i + _P4], buf[i + _P5],
+        buf[i + _P6], buf[i + _P7], buf[i + _P8], buf[i + _P9], buf[i + _P10], buf[i + _P11],
+    )  # fmt: skip
 
 
 @_lane_jit
@@ -58,9 +77,9 @@ def put_column(buf: np.ndarray, j: int, axis: int, column: tuple[float, float, f
 
 
 @_lane_jit
-def _centre(buf: np.ndarray, i: int, pose: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return lane i's centre in camera coordinates."""
-    m0, m1, m2 = buf[i], buf[i + _P1], buf[i + _P2]
+def _centre(place: tuple[float, ...], pose: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return a Gaussian's centre in camera coordinates."""
+    m0, m1, m2 = place[0], place[1], place[2]
     return (
         pose[0] * m0 + pose[1] * m1 + pose[2] * m2 + pose[9],
         pose[3] * m0 + pose[4] * m1 + pose[5] * m2 + pose[10],
@@ -70,10 +89,9 @@ def _centre(buf: np.ndarray, i: int, pose: tuple[float, ...]) -> tuple[float, fl
 
 @_lane_jit
 def _axis(
-    buf: np.ndarray, at: int, pose: tuple[float, ...], jx: float, jy: float, jxz: float, jyz: float
+    a: float, b: float, c: float, pose: tuple[float, ...], jx: float, jy: float, jxz: float, jyz: float
 ) -> tuple[float, float, float, float, float]:
-    """Return a column of W M (3) and of N = J W M (2); ``at`` the lane in the column's plane less 3 planes."""
-    a, b, c = buf[at + _P3], buf[at + _P6], buf[at + _P9]
+    """Return W (a, b, c), a column of W M (3), and J W (a, b, c), one of N (2)."""
     v0 = pose[0] * a + pose[1] * b + pose[2] * c
     v1 = pose[3] * a + pose[4] * b + pose[5] * c
     v2 = pose[6] * a + pose[7] * b + pose[8] * c
@@ -81,118 +99,152 @@ def _axis(
 
 
 @_lane_jit
-def project_lanes(buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, ...], rule: tuple[float, ...]) -> None:
-    """Project by EWA (Zwicker et al. 2001): centre (px), conic and opacity as drawn replace planes 0 to 5.
+def project_one(
+    place: tuple[float, ...], opacity: float, pose: tuple[float, ...], lens: tuple[float, ...], rule: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Project a Gaussian by EWA (Zwicker et al. 2001).
 
-    Then opacity over the least that is drawn (0 where nothing is seen), sxx, syy (px^2), and depth, in planes 6 to 9.
-    Plane `OPACITY` holds what was given.
+    Returns centre (px), conic and opacity as drawn, opacity over the least that is drawn (0 where nothing is seen),
+    sxx, syy (px^2), and depth: 10 numbers.
     """
     dilation, compensate, min_alpha, _, min_variance = rule
     fx, fy = lens[0], lens[1]
+    x, y, z = _centre(place, pose)
+    inv = 1.0 / z
+    jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
+    _, _, _, a0, b0 = _axis(place[3], place[6], place[9], pose, jx, jy, jxz, jyz)
+    _, _, _, a1, b1 = _axis(place[4], place[7], place[10], pose, jx, jy, jxz, jyz)
+    _, _, _, a2, b2 = _axis(place[5], place[8], place[11], pose, jx, jy, jxz, jyz)
+    sxx = a0 * a0 + a1 * a1 + a2 * a2
+    sxy = a0 * b0 + a1 * b1 + a2 * b2
+    syy = b0 * b0 + b1 * b1 + b2 * b2
+    own = sxx * syy - sxy * sxy
+    sxx += dilation
+    syy += dilation
+    det = sxx * syy - sxy * sxy
+    drawn = opacity * math.sqrt(max(own, 0.0) / det) if compensate > 0.0 else opacity
+    half = 0.5 * (sxx - syy)
+    longest = 0.5 * (sxx + syy) + math.sqrt(half * half + sxy * sxy)
+    seen = (z > NEAR) & (det > 0.0) & (det < np.inf) & (drawn >= min_alpha) & (longest >= min_variance)
+    per_det = 1.0 / det
+    return (
+        fx * x * inv + lens[2], fy * y * inv + lens[3], syy * per_det, -sxy * per_det, sxx * per_det, drawn,
+        drawn / min_alpha if seen else 0.0, sxx, syy, z,
+    )  # fmt: skip
+
+
+@_lane_jit
+def project_lanes(buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, ...], rule: tuple[float, ...]) -> None:
+    """Replace planes 0 to 9 by `project_one`; plane `OPACITY` holds the opacity that was given."""
     for i in range(U(LANES)):
-        x, y, z = _centre(buf, i, pose)
-        inv = 1.0 / z
-        jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
-        _, _, _, a0, b0 = _axis(buf, i, pose, jx, jy, jxz, jyz)
-        _, _, _, a1, b1 = _axis(buf, i + _P1, pose, jx, jy, jxz, jyz)
-        _, _, _, a2, b2 = _axis(buf, i + _P2, pose, jx, jy, jxz, jyz)
-        sxx = a0 * a0 + a1 * a1 + a2 * a2
-        sxy = a0 * b0 + a1 * b1 + a2 * b2
-        syy = b0 * b0 + b1 * b1 + b2 * b2
-        own = sxx * syy - sxy * sxy
-        sxx += dilation
-        syy += dilation
-        det = sxx * syy - sxy * sxy
-        opacity = buf[i + OPACITY]
-        drawn = opacity * math.sqrt(max(own, 0.0) / det) if compensate > 0.0 else opacity
-        half = 0.5 * (sxx - syy)
-        longest = 0.5 * (sxx + syy) + math.sqrt(half * half + sxy * sxy)
-        seen = (z > NEAR) & (det > 0.0) & (det < np.inf) & (drawn >= min_alpha) & (longest >= min_variance)
-        per_det = 1.0 / det
-        buf[i], buf[i + _P1] = fx * x * inv + lens[2], fy * y * inv + lens[3]
-        buf[i + _P2], buf[i + _P3], buf[i + _P4] = syy * per_det, -sxy * per_det, sxx * per_det
-        buf[i + _P5] = drawn
-        buf[i + _P6] = drawn / min_alpha if seen else 0.0
-        buf[i + _P7], buf[i + _P8], buf[i + _P9] = sxx, syy, z
+        drawn = project_one(_lane_place(buf, i), buf[i + OPACITY], pose, lens, rule)
+        buf[i], buf[i + _P1], buf[i + _P2], buf[i + _P3], buf[i + _P4] = drawn[:5]
+        buf[i + _P5], buf[i + _P6], buf[i + _P7], buf[i + _P8], buf[i + _P9] = drawn[5:]
+
+
+@_lane_jit
+def reach_of(ratio: float, farthest: float) -> float:
+    """Return twice the exponent to which a Gaussian is drawn, from its opacity over the least; -1 if it is unseen."""
+    return 2.0 * min(math.log(ratio), farthest) if ratio > 0.0 else -1.0
+
+
+@_lane_jit
+def box_of(
+    u: float, v: float, reach: float, sxx: float, syy: float, width: float, height: float
+) -> tuple[float, float, float, float]:
+    """Return the pixel box x0, y0, x1, y1 of a Gaussian at (u, v), by its `reach_of`; zeros where nothing is seen."""
+    seen = reach >= 0.0
+    reach = max(reach, 0.0)
+    ex, ey = math.sqrt(reach * sxx), math.sqrt(reach * syy)
+    x0, x1 = max(math.ceil(u - ex - 0.5), 0.0), min(math.floor(u + ex - 0.5) + 1.0, width)
+    y0, y1 = max(math.ceil(v - ey - 0.5), 0.0), min(math.floor(v + ey - 0.5) + 1.0, height)
+    seen = seen & (x1 > x0) & (y1 > y0)
+    return x0 if seen else 0.0, y0 if seen else 0.0, x1 if seen else 0.0, y1 if seen else 0.0
 
 
 @_lane_jit
 def boxes(buf: np.ndarray, farthest: float, width: float, height: float) -> None:
-    """Write pixel boxes x0, y0, x1, y1 into planes 10, 11, 13, 14, after `project_lanes`; 0 where nothing is seen."""
+    """Write `box_of` into planes 10, 11, 13, 14, after `project_lanes`."""
     for i in range(U(LANES)):
-        ratio = buf[i + _P6]
-        buf[i + _P6] = 2.0 * min(math.log(ratio), farthest) if ratio > 0.0 else -1.0
+        buf[i + _P6] = reach_of(buf[i + _P6], farthest)
     for i in range(U(LANES)):
-        reach = buf[i + _P6]
-        seen = reach >= 0.0
-        reach = max(reach, 0.0)
-        ex, ey = math.sqrt(reach * buf[i + _P7]), math.sqrt(reach * buf[i + _P8])
-        u, v = buf[i], buf[i + _P1]
-        x0, x1 = max(math.ceil(u - ex - 0.5), 0.0), min(math.floor(u + ex - 0.5) + 1.0, width)
-        y0, y1 = max(math.ceil(v - ey - 0.5), 0.0), min(math.floor(v + ey - 0.5) + 1.0, height)
-        seen = seen & (x1 > x0) & (y1 > y0)
-        buf[i + _P10], buf[i + _P11] = x0 if seen else 0.0, y0 if seen else 0.0
-        buf[i + OPACITY + _P1], buf[i + OPACITY + _P2] = x1 if seen else 0.0, y1 if seen else 0.0
+        x0, y0, x1, y1 = box_of(buf[i], buf[i + _P1], buf[i + _P6], buf[i + _P7], buf[i + _P8], width, height)
+        buf[i + _P10], buf[i + _P11], buf[i + OPACITY + _P1], buf[i + OPACITY + _P2] = x0, y0, x1, y1
+
+
+@_lane_jit
+def store_one(
+    k: int, box: tuple[float, ...], drawn: tuple[float, ...], opacity: float, z: float, flat: np.ndarray,
+    depth: np.ndarray, extent: np.ndarray,
+) -> None:  # fmt: skip
+    """Store row k of ``flat``, ``depth``, ``extent``: 0 if unseen; ``drawn`` (6): centre, conic, opacity as drawn."""
+    extent[k, 0], extent[k, 1], extent[k, 2], extent[k, 3] = int(box[0]), int(box[1]), int(box[2]), int(box[3])
+    if box[2] > box[0]:
+        depth[k] = z
+        flat[k, 0], flat[k, 1], flat[k, 2], flat[k, 3] = drawn[0], drawn[1], drawn[2], drawn[3]
+        flat[k, 4], flat[k, 5], flat[k, 6] = drawn[4], drawn[5], opacity
+    else:
+        depth[k] = 0.0
+        flat[k, 0] = flat[k, 1] = flat[k, 2] = flat[k, 3] = flat[k, 4] = flat[k, 5] = flat[k, 6] = 0.0
 
 
 @_lane_jit
 def store_projected(
     buf: np.ndarray, begin: int, count: int, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray
 ) -> None:
-    """Store the first ``count`` lanes in rows from ``begin`` on of ``flat``, ``depth``, ``extent``; 0 if unseen."""
+    """Store the first ``count`` lanes in rows from ``begin`` on, as `store_one` does."""
     for i in range(count):
-        k, j = begin + i, U(i)
-        x0, y0, x1, y1 = buf[j + _P10], buf[j + _P11], buf[j + OPACITY + _P1], buf[j + OPACITY + _P2]
-        extent[k, 0], extent[k, 1], extent[k, 2], extent[k, 3] = int(x0), int(y0), int(x1), int(y1)
-        if x1 > x0:
-            depth[k] = buf[j + _P9]
-            flat[k, 0], flat[k, 1], flat[k, 2], flat[k, 3] = buf[j], buf[j + _P1], buf[j + _P2], buf[j + _P3]
-            flat[k, 4], flat[k, 5], flat[k, 6] = buf[j + _P4], buf[j + _P5], buf[j + OPACITY]
-        else:
-            depth[k] = 0.0
-            flat[k, 0] = flat[k, 1] = flat[k, 2] = flat[k, 3] = flat[k, 4] = flat[k, 5] = flat[k, 6] = 0.0
+        j = U(i)
+        box = buf[j + _P10], buf[j + _P11], buf[j + OPACITY + _P1], buf[j + OPACITY + _P2]
+        drawn = buf[j], buf[j + _P1], buf[j + _P2], buf[j + _P3], buf[j + _P4], buf[j + _P5]
+        store_one(begin + i, box, drawn, buf[j + OPACITY], buf[j + _P9], flat, depth, extent)
+
+
+@_lane_jit
+def slope_one(
+    place: tuple[float, ...], sums: tuple[float, ...], conic: tuple[float, ...], pose: tuple[float, ...],
+    lens: tuple[float, ...], dilation: float, compensate: float,
+) -> tuple[float, ...]:  # fmt: skip
+    """Return the gradients of d (3) and E (6), by the first six sums of `splat.backward` and the conic as drawn."""
+    fx, fy = lens[0], lens[1]
+    x, y, z = _centre(place, pose)
+    du, dv, h00, h01, h11 = screen_slope(
+        conic[0], conic[1], conic[2], sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], dilation, compensate
+    )
+    inv = 1.0 / z
+    jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
+    a0, a1, a2, m0, n0 = _axis(place[3], place[6], place[9], pose, jx, jy, jxz, jyz)
+    b0, b1, b2, m1, n1 = _axis(place[4], place[7], place[10], pose, jx, jy, jxz, jyz)
+    c0, c1, c2, m2, n2 = _axis(place[5], place[8], place[11], pose, jx, jy, jxz, jyz)
+    p0, q0 = 2.0 * (h00 * m0 + h01 * n0), 2.0 * (h01 * m0 + h11 * n0)  # dL/dN, a column each
+    p1, q1 = 2.0 * (h00 * m1 + h01 * n1), 2.0 * (h01 * m1 + h11 * n1)
+    p2, q2 = 2.0 * (h00 * m2 + h01 * n2), 2.0 * (h01 * m2 + h11 * n2)
+    d00, d02 = p0 * a0 + p1 * b0 + p2 * c0, p0 * a2 + p1 * b2 + p2 * c2  # dL/dJ
+    d11, d12 = q0 * a1 + q1 * b1 + q2 * c1, q0 * a2 + q1 * b2 + q2 * c2
+    dx, dy, dz = centre_slope(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
+    return (
+        dx * a0 + dy * a1 + dz * a2, dx * b0 + dy * b1 + dz * b2, dx * c0 + dy * c1 + dz * c2,
+        p0 * m0 + q0 * n0, p1 * m1 + q1 * n1, p2 * m2 + q2 * n2,
+        2.0 * (p0 * m1 + q0 * n1), 2.0 * (p0 * m2 + q0 * n2), 2.0 * (p1 * m2 + q1 * n2),
+    )  # fmt: skip
 
 
 @_lane_jit
 def slope_lanes(
     buf: np.ndarray, pose: tuple[float, ...], lens: tuple[float, ...], dilation: float, compensate: float
 ) -> None:
-    """Differentiate the projection: gradients of d (3) and E (6) of each lane replace planes 0 to 8.
+    """Replace planes 0 to 8 by `slope_one`.
 
     Planes 0 to 11 hold centre and M, those from `TOTALS` on the nine sums of `splat.backward`, those from `CONIC` on
     the conic as drawn.
     """
-    fx, fy = lens[0], lens[1]
     for i in range(U(LANES)):
-        x, y, z = _centre(buf, i, pose)
-        du, dv, h00, h01, h11 = _screen(buf, i + U(TOTALS) * _P1, i + U(CONIC) * _P1, dilation, compensate)
-        inv = 1.0 / z
-        jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
-        a0, a1, a2, m0, n0 = _axis(buf, i, pose, jx, jy, jxz, jyz)
-        b0, b1, b2, m1, n1 = _axis(buf, i + _P1, pose, jx, jy, jxz, jyz)
-        c0, c1, c2, m2, n2 = _axis(buf, i + _P2, pose, jx, jy, jxz, jyz)
-        p0, q0 = 2.0 * (h00 * m0 + h01 * n0), 2.0 * (h01 * m0 + h11 * n0)  # dL/dN, a column each
-        p1, q1 = 2.0 * (h00 * m1 + h01 * n1), 2.0 * (h01 * m1 + h11 * n1)
-        p2, q2 = 2.0 * (h00 * m2 + h01 * n2), 2.0 * (h01 * m2 + h11 * n2)
-        d00, d02 = p0 * a0 + p1 * b0 + p2 * c0, p0 * a2 + p1 * b2 + p2 * c2  # dL/dJ
-        d11, d12 = q0 * a1 + q1 * b1 + q2 * c1, q0 * a2 + q1 * b2 + q2 * c2
-        dx, dy, dz = centre_slope(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
-        buf[i] = dx * a0 + dy * a1 + dz * a2
-        buf[i + _P1] = dx * b0 + dy * b1 + dz * b2
-        buf[i + _P2] = dx * c0 + dy * c1 + dz * c2
-        buf[i + _P3], buf[i + _P4], buf[i + _P5] = p0 * m0 + q0 * n0, p1 * m1 + q1 * n1, p2 * m2 + q2 * n2
-        buf[i + _P6] = 2.0 * (p0 * m1 + q0 * n1)
-        buf[i + _P7] = 2.0 * (p0 * m2 + q0 * n2)
-        buf[i + _P8] = 2.0 * (p1 * m2 + q1 * n2)
-
-
-@_lane_jit
-def _screen(buf: np.ndarray, total: int, conic: int, dilation: float, compensate: float) -> tuple[float, ...]:
-    """Return `screen_slope` of the lane whose sums and conic begin at ``total`` and ``conic``."""
-    return screen_slope(
-        buf[conic], buf[conic + _P1], buf[conic + _P2], buf[total], buf[total + _P1], buf[total + _P2],
-        buf[total + _P3], buf[total + _P4], buf[total + _P5], dilation, compensate,
-    )  # fmt: skip
+        t, c = i + U(TOTALS) * _P1, i + U(CONIC) * _P1
+        sums = buf[t], buf[t + _P1], buf[t + _P2], buf[t + _P3], buf[t + _P4], buf[t + _P5]
+        conic = buf[c], buf[c + _P1], buf[c + _P2]
+        slopes = slope_one(_lane_place(buf, i), sums, conic, pose, lens, dilation, compensate)
+        buf[i], buf[i + _P1], buf[i + _P2], buf[i + _P3], buf[i + _P4] = slopes[:5]
+        buf[i + _P5], buf[i + _P6], buf[i + _P7], buf[i + _P8] = slopes[5:]
 
 
 @_lane_jit

@@ -42,7 +42,7 @@ from vvgt_cli.splat.buffer import (
 
 
 @tile_jit
-def _pixel(
+def blend_pixel(
     t: float, dx: float, a: float, h: float, q: float, opacity: float, rule: tuple[float, ...]
 ) -> tuple[float, float]:
     """Return a pixel's weight T alpha and its transmittance afterwards; one that has ended keeps T with a minus.
@@ -80,7 +80,7 @@ def _blend_tile(
                 h, q = b * dy, c * dy * dy
                 for i in range(U(TILE)):
                     j = y * U(TILE) + i
-                    weight, buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
+                    weight, buf[j] = blend_pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
                     buf[j + PLANE_1] += weight * red
                     buf[j + PLANE_2] += weight * green
                     buf[j + PLANE_3] += weight * blue
@@ -137,7 +137,7 @@ def _gather_tile(
                 h, q = b * dy, c * dy * dy
                 for i in range(U(TILE)):
                     j = y * U(TILE) + i
-                    buf[j + PLANE_1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
+                    buf[j + PLANE_1], buf[j] = blend_pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
             s0 = s1 = s2 = s3 = s4 = ZERO
             for j in range(y0 * U(TILE), y1 * U(TILE)):
                 weight = buf[j + PLANE_1]

@@ -20,11 +20,11 @@ from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA, psnr
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.prepare import Prepared, prepare, unpack
 from vvgt_cli.network.runtime import views_of_round
+from vvgt_cli.network.training.by_gsplat import picture
 from vvgt_cli.network.training.config import LossConfig, TrainConfig
 from vvgt_cli.network.training.lpips import Lpips
 from vvgt_cli.network.training.scenes import TrainingScene, as_float
 from vvgt_cli.splat import project, render, render_backward
-from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 @dataclass
@@ -201,7 +201,7 @@ class Splat(torch.autograd.Function):
 def splat(rows: Tensor, camera: Camera) -> Tensor:
     """Return the picture (height, width, 4) float32 of Gaussians (K, 14), premultiplied; rows must be finite.
 
-    On a CUDA device gsplat (extra ``cuda``) draws it if installed, else the numba kernels on the host.
+    On a CUDA device gsplat draws it if installed, else the numba kernels on the host.
     """
     if rows.is_cuda and importlib.util.find_spec("gsplat"):
         return gsplat_picture(rows, camera)
@@ -210,8 +210,7 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
 
 
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
-    """`splat` by gsplat, differentiable; see `vvgt_cli.splat.by_gsplat.picture` for where pictures differ."""
+    """`splat` by gsplat, differentiable; see `picture` for where pictures differ."""
     means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
-    opacity = capped(logits[:, 0].sigmoid())
-    drawn = picture(means, opacity, colors.clamp(min=0), camera, quats=quaternions, scales=log_scales.exp())
+    drawn = picture(means, logits[:, 0].sigmoid(), colors.clamp(min=0), quaternions, log_scales.exp(), camera)
     return torch.cat(drawn, dim=-1)
