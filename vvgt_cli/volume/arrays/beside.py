@@ -151,7 +151,7 @@ def choose_grid(
         DataError: there are none, or places and vectors of particles in place of any.
         UsageError: several and none chosen (`SeveralArrays`), or none of that name.
     """
-    if wanted in arrays:
+    if wanted is not None and wanted in arrays:
         arrays = {wanted: arrays[wanted]}
     places = any(_of_particles(name, shape, dtype) for name, (shape, dtype) in arrays.items())
     particles = [name for name, (shape, dtype) in arrays.items() if _of_particles(name, shape, dtype, places)]
