@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import struct
 from pathlib import Path
 
@@ -157,6 +158,31 @@ def test_missing_views_are_empty_frames(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="setup 0 is missing at time point 1: all 0"):
         assert not read_volume(str(path), ReadOptions(component=0, time=1)).data.any()
     assert read_volume(str(path), ReadOptions(component=1, time=1)).data.all()
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "n5", "zarr"])
+def test_views_that_are_not_there_are_named(tmp_path: Path, kind: str) -> None:
+    path = write(tmp_path, kind)
+    if kind == "hdf5":
+        with h5py.File(tmp_path / "data.hdf5", "a") as file:
+            del file["t00001/s01"]
+    else:
+        shutil.rmtree(tmp_path / f"data.{kind}" / ("setup1/timepoint1" if kind == "n5" else "s1-t1.zarr"))
+    refused(
+        DataError,
+        rf"setup 1 at time point 1 is not in data\.{kind} .*, nor listed as missing",
+        read_volume,
+        path,
+        ReadOptions(component=1, time=1),
+    )
+
+
+def test_a_magnitude_needs_one_grid(tmp_path: Path) -> None:
+    path = Path(write(tmp_path, "hdf5"))
+    setup = '(timepoint="0" setup="1">.*?)<affine>1 0 0 0'
+    path.write_text(re.sub(setup, r"\1<affine>1 0 0 9", path.read_text()))
+    together = ReadOptions(component="magnitude", time=0)
+    refused(DataError, "expected the grid of data:DAPI.*choose one channel", read_volume, str(path), together)
 
 
 @pytest.mark.parametrize(

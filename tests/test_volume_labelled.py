@@ -179,7 +179,9 @@ def test_hdf5_choices(tmp_path: Path) -> None:
     path = tmp_path / "v.h5"
     with h5py.File(path, "w") as file:
         file["a/one"], file["b/two"] = VALUES, VALUES + 1
-    refused(UsageError, r"several datasets: /a/one \(3, 4, 5\) float64; /b/two .*choose one as", read_volume, str(path))
+    refused(
+        UsageError, r"several datasets: /a/one \(3 x 4 x 5 float64\); /b/two .*choose one as", read_volume, str(path)
+    )
     refused(UsageError, r"no dataset '/c'; it has /a/one", read_volume, f"{path}:/c")
     refused(UsageError, "choose both", read_volume, f"{path}:/a/one", ReadOptions(array="/a/one"))
     assert read_volume(f"{path}:/b").name == "v:b/two"
@@ -215,7 +217,7 @@ def test_zarr_with_coordinates(tmp_path: Path, version: int) -> None:
     array = group.create_array("deep/field", data=stored, chunks=(2, 2, 2), **names)
     told = {"scale_factor": 0.5, "_FillValue": -1} | ({"_ARRAY_DIMENSIONS": ["x", "z", "y"]} if version == 2 else {})
     array.attrs.update(told)
-    refused(UsageError, r"no array .*it has deep/field \[5, 3, 4\]", read_volume, f"{store}:/none")
+    refused(UsageError, r"no array .*it has deep/field \(5 x 3 x 4 (<i4|int32)", read_volume, f"{store}:/none")
     bare = read_volume(str(store))
     assert bare.name == "v:deep/field"
     assert bare.spacing == (1, 1, 1)  # the coordinates lie in another group
@@ -300,7 +302,7 @@ def test_npz(tmp_path: Path, save) -> None:
     assert volume.name == "v:field"
     np.testing.assert_array_equal(volume.data, VALUES)
     save(path, field=VALUES, other=VALUES + 1)
-    refused(UsageError, "several arrays: field; other; choose one with --array", read_volume, str(path))
+    refused(UsageError, r"several arrays: field \(.*; other \(.*; choose one with --array", read_volume, str(path))
     np.testing.assert_array_equal(read_volume(str(path), ReadOptions(array="other")).data, VALUES + 1)
 
 
@@ -361,4 +363,4 @@ def test_names_with_line_breaks_are_listed_in_one_line(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "v.h5", "w") as file:
         for name in ("a\nb", "c"):
             file[name] = np.zeros((2, 3, 4))
-    refused(UsageError, r"several datasets: /a\?b \(2, 3, 4\)", read_volume, str(tmp_path / "v.h5"))
+    refused(UsageError, r"several datasets: /a\?b \(2 x 3 x 4", read_volume, str(tmp_path / "v.h5"))

@@ -413,17 +413,11 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
     """Read an xarray.DataArray; one of Dask block by block, or as a whole for a magnitude or another grid."""
-    axes, stated = [], dict(data.coords)  # `data.coords.get` makes up numbers
-    for dim, size in zip(data.dims, data.shape, strict=True):
-        coordinate = stated.get(dim)
-        centres = None
-        if coordinate is not None and coordinate.dtype.kind in "iuf":
-            centres = np.asarray(coordinate.values, np.float64)
-        axes.append(axis(str(dim), size, centres, getattr(coordinate, "attrs", None)))
+    axes = [axis(str(dim), size) for dim, size in zip(data.dims, data.shape, strict=True)]
     label = str(data.name or name)
     beside = {
         str(key): Neighbour.of(one.shape, lambda one=one: (one.values, one.attrs), str(one.dims[0]))
-        for key, one in stated.items()
+        for key, one in data.coords.items()
         if one.ndim == 1
     }
     axes = with_neighbours(axes, beside, label, options.spacing is not None)

@@ -26,7 +26,7 @@ METRES = {  # length of a unit in metres, its short name, and others
     1e-3: ("mm", "millimeter", "millimetre"), 1e-6: ("um", "µm", "micron", "micrometer", "micrometre"),
     1e-9: ("nm", "nanometer", "nanometre"), 1e-10: ("angstrom", "Å"), 1e-12: ("pm", "picometer", "picometre"),
 }  # fmt: skip
-MILLIMETRE = 1e-3
+MILLIMETRE, MICROMETRE = 1e-3, 1e-6
 _LENGTHS = {name: metres for metres, names in METRES.items() for name in names}
 
 

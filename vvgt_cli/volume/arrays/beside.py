@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.components import choose, listed
 from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.labelled import Axis, axis, even
 from vvgt_cli.volume.space import metres
@@ -30,7 +31,7 @@ class Neighbour:
     """An array along one axis that lies beside another array.
 
     Attributes:
-        size: of its axis.
+        size: of its axis; 0 if it has several.
         read: returns its stored values (size,) and its attributes.
         along: name of its axis, where axes have names; "".
     """
@@ -41,27 +42,30 @@ class Neighbour:
 
     @classmethod
     def of(cls, shape: Sequence[int], read: Any, along: str = "") -> Neighbour:
-        """Make a neighbour of an array of any shape; one of more than one axis has no size."""
-        sizes = [n for n in shape or () if n > 1]
-        return cls(sizes[0] if len(sizes) == 1 else 0, read, along)
+        """Make a neighbour of an array of any shape."""
+        size = math.prod(shape or ())
+        return cls(size if size == max(shape or (1,)) else 0, read, along)
 
 
 def with_neighbours(
     axes: Sequence[Axis], beside: Mapping[str, Neighbour], source: str, spacing_given: bool
 ) -> list[Axis]:
-    """Return an array's axes with the coordinates beside it, where names and sizes assign them in one way.
+    """Return an array's axes with the coordinates beside it.
 
-    Otherwise one message names the neighbours whose sizes fit, and the axes stay as they are, as they do if any has
-    coordinates or a spacing is given. Names are letters (``x``, ``x_coords``, ``z_um``), words of CF (``lon``) or
-    numbers for all axes (``dim1``, ``dim2``, ``dim3`` of EMD, where two values stand for an even axis).
+    An axis with a name has those of that name. If none has any, and no spacing is given, names and sizes may assign
+    some in one way; otherwise one message names the neighbours whose sizes fit. Names are letters (``x``, ``x_coords``,
+    ``z_um``), words of CF (``lon``) or numbers for all axes (``dim1``, ``dim2``, ``dim3`` of EMD, where two values
+    stand for an even axis).
     """
+    same = {a.name: beside[a.name] for a in axes if a.name in beside and a.centres is None}
+    axes = [_read(a.name, same[a.name]) if a.name in same and same[a.name].size == a.size else a for a in axes]
     if spacing_given or any(a.centres is not None for a in axes):
-        return [*axes]
+        return axes
     if (numbered := _numbered(axes, beside)) is not None:
         return numbered
     fits = {name: one for name, one in beside.items() if any(_lies_along(one, a) for a in axes)}
     some = {name: _read(name, one) for name, one in itertools.islice(fits.items(), 50)}
-    read = {name: a for name, a in some.items() if a is not None}
+    read = {name: a for name, a in some.items() if a.centres is not None}
     named = {role: [name for name, a in read.items() if a.role == role and _ascends(a)] for role in "tzyx"}
     chosen = [names[0] for names in named.values() if len(names) == 1]
     if len(axes) < 4 and all(read[name].role == "t" for name in chosen):
@@ -80,7 +84,7 @@ def with_neighbours(
             f"{source}: states no spacing, which is taken as 1; beside it lie, as long as its axes, {steps}; --spacing "
             "X Y Z sets it", stacklevel=3,
         )  # fmt: skip
-    return [*axes]
+    return axes
 
 
 def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axis] | None:
@@ -99,17 +103,16 @@ def _numbered(axes: Sequence[Axis], beside: Mapping[str, Neighbour]) -> list[Axi
     return found if all(a.size == 1 or _ascends(a) for a in found) else None
 
 
-def _read(name: str, one: Neighbour) -> Axis | None:
-    """Read a neighbour as an axis, with the role and the unit that are in its name; None where it holds no numbers."""
+def _read(name: str, one: Neighbour) -> Axis:
+    """Read a neighbour as an axis, with the role and the unit that its attributes or its name state."""
     values, attributes = one.read()
-    if values.dtype.kind not in "iuf":
-        return None
-    leaf = name.rpartition("/")[2]
-    letter = _LETTER.fullmatch(leaf)
-    stated = dict(attributes)
+    leaf, centres = name.rpartition("/")[2], np.ravel(values) if values.dtype.kind in "iuf" else None
+    found = axis(leaf, one.size, centres, attributes)
+    letter = None if found.role else _LETTER.fullmatch(leaf)
     if letter and (_SUFFIXES.fullmatch(letter[2]) or metres(letter[2])):
-        stated = {"axis": letter[1], "units": letter[2] if metres(letter[2]) else ""} | stated
-    return axis(leaf, one.size, np.ravel(values), stated)
+        stated = {"axis": letter[1], "units": letter[2] if metres(letter[2]) else ""}
+        return axis(leaf, one.size, centres, stated | dict(attributes))
+    return found
 
 
 def _lies_along(one: Neighbour, a: Axis, read: Axis | None = None) -> bool:
@@ -130,22 +133,42 @@ def _step(a: Axis) -> str:
     return f"step {abs(a.centres[-1] - a.centres[0]) / (a.size - 1):.4g}"
 
 
-def on_grids(arrays: Mapping[str, tuple[Sequence[int], str]], source: str) -> list[str]:
-    """Return the names of the arrays, given with shape and type, that are no places or vectors of particles.
+def choose_grid(
+    arrays: Mapping[str, tuple[Sequence[int], str]], wanted: str | None, source: str, what: str = "array",
+    how: str = "choose one with --array NAME", rows: Mapping[str, str] | None = None,
+) -> str:  # fmt: skip
+    """Return the name of the array asked for, else of the only one with three axes (with two, if none has three).
+
+    Args:
+        arrays: shape and type of each, by name.
+        wanted: one of the names, or None.
+        source: for messages.
+        what: word for an array, in the singular, for messages.
+        how: how to choose one, for messages.
+        rows: description of each, for messages; by default shape and type.
 
     Raises:
-        DataError: there are particles, and nothing with three axes beside them.
+        DataError: there are none, or places and vectors of particles in place of any.
+        UsageError: several and none chosen (`SeveralArrays`), or none of that name.
     """
+    if wanted is not None and wanted in arrays:
+        arrays = {wanted: arrays[wanted]}
     places = any(_of_particles(name, shape, dtype) for name, (shape, dtype) in arrays.items())
     particles = [name for name, (shape, dtype) in arrays.items() if _of_particles(name, shape, dtype, places)]
-    rest = [name for name in arrays if name not in particles]
-    if particles and not any(sum(n > 1 for n in arrays[name][0]) >= 3 for name in rest):
+    rest = [name for name, (shape, _) in arrays.items() if name not in particles and (len(shape) >= 2 or wanted)]
+    deep = [name for name in rest if sum(n > 1 for n in arrays[name][0]) >= 3]
+    columns = [name for name, (shape, dtype) in arrays.items() if len(shape) == 1 and "f" in dtype]
+    if not rest and {"x", "y"} <= {re.split("[/_]", name.lower())[-1] for name in columns}:
+        particles = particles or [name for name in columns if name.lower().endswith("x")]
+    if particles and not deep:
         shape = " x ".join(map(str, arrays[particles[0]][0]))
         raise DataError(
             f"{source}: particles ({listed([particles[0]])}: {shape}), which lie on no grid; expected values on one: "
             "deposit them first (yt's arbitrary_grid, pynbody, swiftsimio) and save that as .npy or HDF5"
         )
-    return rest
+    names = deep or rest
+    texts = {name: f"{name} ({' x '.join(map(str, shape))} {dtype})" for name, (shape, dtype) in arrays.items()}
+    return names[choose(names, [(rows or texts)[name] for name in names], wanted, source, what, how)]
 
 
 def _of_particles(name: str, shape: Sequence[int], dtype: str, beside: bool = False) -> bool:

@@ -46,12 +46,10 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
     elif "axistags" in dataset.attrs:
         found = _vigra(json.loads(text_of(dataset.attrs["axistags"])).get("axes", []), dataset)
     elif np.size(sizes) == 3 and len(dataset.shape) >= 3:
-        steps = [*[None] * (len(dataset.shape) - 3), *np.asarray(sizes, np.float64).reshape(-1)]
-        names = ["", "", *"zyx"][-len(dataset.shape) :]
-        found = [
-            Axis(name, n, None if step is None else step * np.arange(n), "um" if name else "", name)
-            for name, n, step in zip(names, dataset.shape, steps, strict=True)
-        ]
+        *outer, nz, ny, nx = dataset.shape
+        found = [Axis("", n) for n in outer]
+        for name, n, step in zip("zyx", (nz, ny, nx), np.ravel(sizes).astype(np.float64), strict=True):
+            found.append(Axis(name, n, step * np.arange(n), "um", name))
     return (found, more) if found else None
 
 
@@ -69,17 +67,11 @@ def _openpmd(dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]]:
             "get_field(theta=None) gives a cartesian grid)"
         )
     labels = [text_of(label) for label in np.asarray(mesh["axisLabels"]).reshape(-1)]
-    spacing, offset, position, unit = (
-        np.broadcast_to(np.asarray(where.get(key, default), np.float64).reshape(-1), n)
-        if np.size(where.get(key, default)) in (1, n)
-        else np.empty(0)
-        for where, key, default in (
-            (mesh, "gridSpacing", 1.0), (mesh, "gridGlobalOffset", 0.0), (dataset.attrs, "position", 0.0),
-            (mesh, "gridUnitSI", 1.0),
-        )
-    )  # fmt: skip
-    if len(labels) != n or min(map(np.size, (spacing, offset, position, unit))) != n:
+    stated = [(mesh, "gridSpacing", 1.0), (mesh, "gridGlobalOffset", 0.0), (dataset.attrs, "position", 0.0)]
+    found = [np.ravel(where.get(key, default)) for where, key, default in (*stated, (mesh, "gridUnitSI", 1.0))]
+    if len(labels) != n or not {one.size for one in found} <= {1, n}:
         raise DataError(f"{source}: openPMD axes {', '.join(labels)} for {n} axes of values; expected as many")
+    spacing, offset, position, unit = (np.broadcast_to(one.astype(np.float64), n) for one in found)
     order = slice(None, None, -1 if text_of(mesh.get("dataOrder", "C")) == "F" else 1)
     step, start = (spacing * unit)[order], ((offset + position * spacing) * unit)[order]
     axes = [

@@ -15,10 +15,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, on_grids, with_neighbours
+from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
-from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
@@ -91,22 +90,15 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
         _check_links(h5py, file, wanted, path)
         found = file.get(wanted)
         if isinstance(found, h5py.Dataset):
-            on_grids({found.name: (found.shape or (), found.dtype.str)}, str(path))
-            return found
+            return file[choose_grid({found.name: (found.shape or (), found.dtype.name)}, found.name, str(path))]
         file, wanted = (found, None) if isinstance(found, h5py.Group) else (file, wanted)
-    known = {d.name: d for d in datasets(h5py, file)}
-    fits = [known[name] for name in on_grids({name: (d.shape, d.dtype.str) for name, d in known.items()}, str(path))]
-    rows = [f"{d.name} {d.shape} {d.dtype}" for d in fits]
-    first = printable(fits[0].name) if fits else "/path"
-    how = f"choose one as {path}:{first} (or with --array)"
-    return fits[choose([d.name for d in fits], rows, wanted, str(path), "dataset", how)]
+    known = {d.name: (d.shape, d.dtype.name) for d in datasets(h5py, file)}
+    how = f"choose one as {path}:{printable(next(iter(known), '/path'))} (or with --array)"
+    return file[choose_grid(known, wanted, str(path), "dataset", how)]
 
 
 def datasets(h5py: Any, group: Any) -> list[Any]:
-    """List the datasets of numbers with 2 to 5 axes; only those with three or more if there are any.
-
-    Datasets that describe others, such as bounds of cells, are skipped.
-    """
+    """List the datasets of numbers with 1 to 5 axes, but for those that describe others, such as bounds of cells."""
     found: list[Any] = []
     described: set[str] = set()
     seen = 0
@@ -117,13 +109,12 @@ def datasets(h5py: Any, group: Any) -> list[Any]:
         described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
         numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb"
         text = numbers and item.dtype == np.uint8 and name.endswith("Metadata")  # of Velox
-        if numbers and not text and 2 <= len(item.shape or ()) <= 5:
+        if numbers and not text and 1 <= len(item.shape or ()) <= 5:
             found.append(item)
         return True if seen >= MAX_VISITED else None
 
     group.visititems(visit)
-    data = [d for d in found if d.name.rpartition("/")[2] not in described] or found
-    return [d for d in data if sum(n > 1 for n in d.shape) >= 3] or data
+    return [d for d in found if d.name.rpartition("/")[2] not in described] or found
 
 
 def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
@@ -137,7 +128,8 @@ def _beside(h5py: Any, dataset: Any, path: Path) -> dict[str, Neighbour]:
     def visit(name: str, item: Any) -> bool | None:  # of no links, which may lead into other files
         group = item.parent
         coordinates = GROUPS.fullmatch(group.name.rpartition("/")[2]) and group.parent in (here, here.parent)
-        if isinstance(item, h5py.Dataset) and item != dataset and (group == here or coordinates):
+        near = isinstance(item, h5py.Dataset) and item != dataset and (group == here or coordinates)
+        if near and not _is_bare(item):
             found[item.name.removeprefix(here.name).strip("/")] = Neighbour.of(item.shape, partial(read, item))
         return True if len(found) >= MAX_BESIDE else None
 
@@ -197,6 +189,10 @@ def scaled_axes(dataset: Any) -> list[Axis]:
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
         scale = scales[0]
-        bare = text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")
-        axes.append(axis(scale.name.rpartition("/")[2], size, *((None, {}) if bare else coordinates_of(scale))))
+        axes.append(axis(scale.name.rpartition("/")[2], size, *(() if _is_bare(scale) else coordinates_of(scale))))
     return axes
+
+
+def _is_bare(scale: Any) -> bool:
+    """Tell whether a dataset stands for a dimension of NetCDF alone, without coordinates."""
+    return text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")

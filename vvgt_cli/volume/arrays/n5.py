@@ -22,8 +22,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
+from vvgt_cli.volume.arrays.beside import choose_grid
 from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
-from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy import bigdataviewer
@@ -180,14 +180,17 @@ def _levels(group: Path) -> list[Path]:
 def _choose(path: Path, options: ReadOptions) -> Path:
     """Return the folder of the array asked for, or of the only one; for a pyramid, that of the level."""
     here = inside(path, options.array)
-    if "dimensions" in _metadata(here):
+    if "dimensions" in (facts := _metadata(here)):
+        choose_grid({here.name: (facts["dimensions"][::-1], str(facts.get("dataType")))}, here.name, str(path))
         if options.level is not None:
             raise UsageError(f"{path}: an array without levels; leave out --level {options.level}")
         return here
     fits = _arrays(here) if here.is_dir() else []
     wanted, known = (None, fits) if fits else (options.array, _arrays(path))
-    names = [place.relative_to(path).as_posix() for place in known]
-    chosen = known[choose(names, names, wanted, str(path), how=f"choose one as {path}:/PATH (or with --array)")]
+    finest = {p.relative_to(path).as_posix(): _metadata((_levels(p) or [p])[0]) for p in known}
+    shapes = {name: (facts["dimensions"][::-1], str(facts.get("dataType"))) for name, facts in finest.items()}
+    how = f"choose one as {path}:/PATH (or with --array)"
+    chosen = path / choose_grid(shapes, wanted, str(path), how=how)
     levels = _levels(chosen)
     if (options.level or 0) >= max(len(levels), 1):
         raise UsageError(f"{path}: --level {options.level}: expected full, or 0 to {max(len(levels), 1) - 1}")

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.blocks import load_block
-from vvgt_cli.volume.components import choose
-from vvgt_cli.volume.labelled import DESCRIBES, Axis, axis, described_by, labelled_volume
+from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -48,7 +47,7 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         if "_FillValue" not in attributes and kind[1:] != "1" and kind in library.default_fillvals:
             attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
         source = f"{path}:{variable.name}"
-        axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
+        axes = [axis(name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
         _warn_of_curvilinear(variable, attributes, source)
         beside = _beside(variable)
         _refuse_mesh(beside, source)
@@ -74,10 +73,14 @@ def _warn_of_curvilinear(variable: Any, attributes: dict[str, Any], source: str)
 
 
 def _beside(variable: Any) -> dict[str, Neighbour]:
-    """List the variables along one of a variable's dimensions in its group."""
+    """List the variables along one of a variable's dimensions, in its group and those above."""
+    groups = [variable.group()]
+    while groups[0].parent is not None:
+        groups.insert(0, groups[0].parent)
     return {
         name: Neighbour.of(one.shape, lambda one=one: (one[:], one.__dict__), *one.dimensions)
-        for name, one in variable.group().variables.items()
+        for group in groups
+        for name, one in group.variables.items()
         if len(one.dimensions) == 1 and one.dimensions[0] in variable.dimensions
     }
 
@@ -125,30 +128,15 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
     fits = {
         name: variable
         for name, variable in found.items()
-        if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf" and len(variable.shape) >= 2
+        if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf"
         and name.rpartition("/")[2] not in described
     }  # fmt: skip
-    if wanted is not None and wanted.strip("/") in found:
-        fits = {wanted.strip("/"): found[wanted.strip("/")]}
-    grids = on_grids({name: (v.shape, np.dtype(v.dtype).str) for name, v in fits.items()}, str(path))
-    fits = {name: fits[name] for name in grids}
-    if wanted is not None and wanted.strip("/") in fits:
-        return fits[wanted.strip("/")]
-    deep = {name: variable for name, variable in fits.items() if sum(n > 1 for n in variable.shape) >= 3} or fits
-    rows = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
-    return list(deep.values())[choose(list(deep), rows, wanted, str(path), "variable")]
-
-
-def _axis(variable: Any, name: str, size: int) -> Axis:
-    """Return an axis with its coordinate variable: that of its own name, in the variable's group or one above."""
-    group = variable.group()
-    while group is not None:
-        found = group.variables.get(name)
-        if found is not None and found.shape == (size,) and np.dtype(found.dtype).kind in "iuf":
-            stated = {key: found.getncattr(key) for key in found.ncattrs()}
-            return axis(name, size, np.asarray(found[:]), stated)
-        group = group.parent
-    return axis(name, size)
+    wanted = wanted and wanted.strip("/")
+    if wanted in found:
+        fits = {wanted: found[wanted]}
+    rows = {name: f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in fits.items()}
+    grids = {name: (v.shape, np.dtype(v.dtype).name) for name, v in fits.items()}
+    return fits[choose_grid(grids, wanted, str(path), "variable", rows=rows)]
 
 
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12

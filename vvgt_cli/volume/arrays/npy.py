@@ -18,7 +18,7 @@ from typing import IO
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
@@ -52,7 +52,7 @@ def _volume(
 ) -> Volume:  # fmt: skip
     """Make a volume of values in file order; axes are z, y, x, and at most one of components at either end."""
     array = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
-    on_grids({name.rpartition(":")[2]: (shape, values.dtype.str)}, source)
+    choose_grid({(own := name.rpartition(":")[2]): (shape, values.dtype.name)}, own, source)
     axes = with_neighbours([Axis("", n) for n in shape], beside or {}, source, options.spacing is not None)
     return labelled_volume(array, array.dtype, axes, {}, options, source, name)
 
@@ -97,12 +97,10 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
             head = io.BytesIO(stream.read(_HEADER))
         try:
             shape, _, dtype = _header(head, f"{path}:{name}")
-            shapes[name] = shape, dtype.str
+            shapes[name] = shape, dtype.name
         except (DataError, ValueError):
             continue
-    known = on_grids(shapes, str(path)) or list(members)
-    deep = [name for name in known if sum(n > 1 for n in shapes.get(name, ((), ""))[0]) >= 3] or known
-    return deep[choose(deep, deep, None, str(path))]
+    return choose_grid(shapes or dict.fromkeys(members, ((1, 1), "")), None, str(path))
 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> tuple[np.ndarray, tuple[int, ...], bool]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -19,8 +20,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.beside import Neighbour, on_grids, with_neighbours
-from vvgt_cli.volume.components import choose
+from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import hex_color
@@ -47,11 +47,14 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
     zarr = need("zarr", "zarr", str(path), "Zarr")
     with library_errors(str(path), "Zarr"):
         place, facts = _choose(path, options.array, options.level)
-        _check_codecs(place, facts)
         array = _array(zarr, place)
         attributes = _marked(array)
-        axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
-        axes = with_neighbours(axes, _beside(zarr, path, place), str(place), options.spacing is not None)
+        names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * array.ndim
+        axes = _ome_axes(place, array.shape) or [
+            axis(str(name or ""), size) for name, size in zip(names, array.shape, strict=True)
+        ]
+        beside = _beside(zarr, path, place, [a.name for a in axes if a.centres is None])
+        axes = with_neighbours(axes, beside, str(place), options.spacing is not None)
         volume = labelled_volume(
             lambda index: np.asarray(array[index]), array.dtype, axes, attributes, options, str(place),
             name_in(path, place), array.chunks,
@@ -76,7 +79,8 @@ def _segments(labels: dict[str, Any]) -> list[Segment]:
 
 
 def _array(zarr: Any, place: Path) -> Any:
-    """Open an array and check its codecs again, as a server may have sent zarr other metadata."""
+    """Open an array and check its codecs before and after, as a server may have sent zarr other metadata."""
+    _check_codecs(place, _metadata(place))
     server: Any = None if isinstance(place, Path) else place  # `remote.Remote`
     array = zarr.open_array(**(server.store() if server else {"store": place}), mode="r")
     _check_codecs(place, array.metadata.to_dict())
@@ -155,7 +159,7 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
     here = inside(path, wanted)
     facts = _metadata(here)
     if facts.get("node_type") == "array":
-        on_grids({here.name: (facts["shape"], _type(facts))}, str(path))
+        choose_grid({here.name: (facts["shape"], _type(facts))}, here.name, str(path))
         return here, facts
     level = _multiscale(here)
     if number is not None and not level:
@@ -166,13 +170,10 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
         place = here / str(level["datasets"][number or 0]["path"])
         if place.resolve().is_relative_to(path.resolve()):
             return place, _metadata(place)
-    fits = _arrays(here if facts else path)
-    shown = {p.relative_to(path).as_posix(): (p, f) for p, f in fits}
-    names = on_grids({name: (f["shape"], _type(f)) for name, (_, f) in shown.items()}, str(path))
-    fits = [shown[name] for name in names]
-    rows = [f"{name} {facts['shape']}" for name, (_, facts) in zip(names, fits, strict=True)]
+    fits = {folder.relative_to(path).as_posix(): (folder, f) for folder, f in _arrays(here if facts else path)}
+    shapes = {name: (f["shape"], _type(f)) for name, (_, f) in fits.items()}
     how = f"choose one as {path}:/PATH (or with --array)"
-    return fits[choose(names, rows, None if facts else wanted, str(path), how=how)]
+    return fits[choose_grid(shapes, None if facts else wanted, str(path), how=how)]
 
 
 def _type(facts: dict[str, Any]) -> str:
@@ -181,18 +182,17 @@ def _type(facts: dict[str, Any]) -> str:
 
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """List the arrays below a group with three axes or more (with two where none has three)."""
+    """List the arrays below a group."""
     found: list[tuple[Path, dict[str, Any]]] = []
     groups = [root]
     while groups:
         for folder in sorted(p for p in groups.pop(0).iterdir() if p.is_dir() and not p.is_symlink()):
             facts = _metadata(folder)
-            if facts.get("node_type") == "array" and len(facts.get("shape", ())) >= 2:
+            if facts.get("node_type") == "array" and facts.get("shape"):
                 found.append((folder, facts))
             elif facts.get("node_type") == "group":
                 groups.append(folder)
-    deep = [(p, f) for p, f in found if sum(n > 1 for n in f["shape"]) >= 3]
-    return deep or found
+    return found
 
 
 def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
@@ -224,38 +224,22 @@ def _attributes(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _axes(
-    zarr: Any, place: Path, facts: dict[str, Any], attributes: dict[str, Any], shape: tuple[int, ...]
-) -> list[Axis]:
-    names = facts.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS") or [""] * len(shape)
-    axes = []
-    for label, size in zip(names, shape, strict=True):
-        name = str(label or "")
-        beside = place.parent / name
-        coordinate = _metadata(beside) if name and "/" not in name and name not in (".", "..") else {}
-        if coordinate.get("node_type") != "array" or list(coordinate.get("shape", [])) != [size] or beside == place:
-            axes.append(axis(name, size))
-            continue
-        _check_codecs(beside, coordinate)
-        stored = _array(zarr, beside)
-        centres = np.asarray(stored[:size]) if stored.dtype.kind in "iuf" else None
-        axes.append(axis(name, size, centres, _marked(stored)))
-    return axes
-
-
-def _beside(zarr: Any, path: Path, place: Path) -> dict[str, Neighbour]:
-    """List the arrays along one axis in the group of another; none where a server does not list folders."""
+def _beside(zarr: Any, path: Path, place: Path, names: Sequence[str]) -> dict[str, Neighbour]:
+    """List the arrays along one axis beside another: those of some names alone where a server lists no folders."""
 
     def line(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
         array = _array(zarr, folder)
         return np.asarray(array[:]), _marked(array)
 
-    found = {}
+    group = place.parent
+    folders = [group / name for name in names if name and "/" not in name and name not in (".", "..")]
     with suppress(OSError, NotImplementedError):
-        for folder in place.parent.iterdir() if place != path else ():
-            facts = _metadata(folder) if folder.is_dir() and not folder.is_symlink() and folder != place else {}
-            if facts.get("node_type") == "array":
-                found[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
+        folders += [f for f in group.iterdir() if f.is_dir() and not f.is_symlink()] if place != path else []
+    found = {}
+    for folder in folders:
+        facts = _metadata(folder) if folder != place else {}
+        if facts.get("node_type") == "array":
+            found[folder.name] = Neighbour.of(facts.get("shape", ()), partial(line, folder))
     return found
 
 

@@ -9,6 +9,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -79,17 +80,21 @@ class _Dataset:
         read, array = READ[self.kind]
         group = self.groups.get(view)
         array = f"{group}/{level}" if group else array.format(t=view[0], s=view[1], l=level)
-        volume: Volume = read(self.data, ReadOptions(array=array, stored=True))
+        try:
+            volume: Volume = read(self.data, ReadOptions(array=array, stored=True))
+        except UsageError as error:
+            raise DataError(
+                f"{self.source}: setup {view[1]} at time point {view[0]} is not in {self.data.name} (no {array}), nor "
+                "listed as missing; expected its values: export it again, or choose another --time or --channel"
+            ) from error
         return volume
 
     def levels(self, view: tuple[int, int]) -> list[tuple[int, ...]]:
         """List the shapes (z, y, x) of the levels of a view."""
         shapes: list[tuple[int, ...]] = []
-        try:
+        with suppress(VvgtError):
             while len(shapes) < MAX_LEVELS:
                 shapes.append(self.read(view, len(shapes)).data.shape)
-        except VvgtError:
-            pass
         return shapes
 
 
@@ -173,6 +178,8 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
         volume = _view(bdv, time, setups[channel], options)
         return volume if options.stored else loaded(volume)
     parts = [loaded(_view(bdv, time, one, options)) for one in setups]
+    for part in parts[1:]:
+        part.check_grid(part.name, parts[0], parts[0].name, "choose one channel (--channel), not their magnitude")
     return replace(parts[0], data=magnitude(np.stack([part.data for part in parts], axis=-1)))
 
 

@@ -68,7 +68,10 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
     """
     if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
-    channel = _channel(picture, options.component, source)
+    channel = choose_channel(
+        picture.channels, picture.names, picture.dtype, options.component, source, picture.colors, picture.rgb,
+        not picture.rgb,
+    )  # fmt: skip
     time = options.step(picture.times, source)
     box = tuple(slice(0, n) for n in picture.shape)
     size = math.prod(picture.shape)
@@ -92,12 +95,6 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
     across = x or y or z or 1.0  # of an axis without a size, as in `Facts.voxel` of TIFF
     spacing = options.spacing_or((x or across, y or across, z or across))
     return Volume(field, spacing, picture.origin, name=name, unit=unit)
-
-
-def _channel(picture: Micrograph, wanted: int | str | None, source: str) -> int | None:
-    """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
-    colors, separate = picture.colors, not picture.rgb
-    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, separate)
 
 
 def choose_channel(

@@ -17,11 +17,10 @@ from vvgt_cli.volume.libraries import read_part
 from vvgt_cli.volume.microscopy.image import Color, Micrograph, picture_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.space import MICROMETRE, metres
 from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
-MICROMETRE = 1e-6
 MAX_COUNT = 1_000_000  # time steps or channels
 
 

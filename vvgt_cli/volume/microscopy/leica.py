@@ -6,8 +6,6 @@ Channels have the colours of their look-up tables.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,10 @@ from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume, safe_xml
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.space import MICROMETRE, metres
 from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
-MICROMETRE = 1e-6  # metres
 LUTS: dict[str, Color] = {
     "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "cyan": (0, 1, 1), "magenta": (1, 0, 1),
     "yellow": (1, 1, 0), "gray": (1, 1, 1), "grey": (1, 1, 1),
@@ -34,26 +31,14 @@ def read_lif(path: Path, options: ReadOptions) -> Volume:
     """Read one image of a LIF file; spacing in micrometres."""
     liffile = need("liffile", EXTRA, str(path), "LIF")
     _check_header(path)
-    with library_errors(str(path), "LIF"), _opened(liffile, path) as file:
+    with library_errors(str(path), "LIF"), Bounded(path) as stream, liffile.LifFile(stream, squeeze=False) as file:
         images = list(file.images)
-        number = choose_image(
-            [i.path for i in images],
-            [_facts(i) for i in images],
-            options.array,
-            "images",
-            str(path),
-            [_deep(i) for i in images],
-        )
-        image = images[number]
+        facts = [_facts(i) for i in images]
+        deep = [" Z" in text for text in facts]
+        image = images[choose_image([i.path for i in images], facts, options.array, "images", str(path), deep)]
         inner = image.path if len(images) > 1 else ""
         name = volume_name(path) + (f":{inner}" if inner else "")
         return picture_volume(_picture(image, path), options, f"{path}:{inner}" if inner else str(path), name)
-
-
-@contextmanager
-def _opened(liffile: Any, path: Path) -> Iterator[Any]:
-    with Bounded(path) as stream, liffile.LifFile(stream, squeeze=False) as file:
-        yield file
 
 
 def _check_header(path: Path) -> None:
@@ -73,14 +58,6 @@ def _facts(image: Any) -> str:
         return " x ".join(f"{n} {a}" for a, n in image.sizes.items() if n > 1) + f" {image.dtype}"
     except (ValueError, KeyError, AssertionError, OverflowError):
         return "not a volume"
-
-
-def _deep(image: Any) -> bool:
-    """Tell whether an image has several slices."""
-    try:
-        return bool(image.sizes.get("Z", 1) > 1)
-    except (ValueError, KeyError, AssertionError, OverflowError):
-        return False
 
 
 def _picture(image: Any, path: Path) -> Micrograph:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -32,7 +30,7 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
     """Read one position of an ND2 file; spacing in micrometres."""
     nd2 = need("nd2", EXTRA, str(path), "ND2")
     there = _frames(path)
-    with library_errors(str(path), "ND2"), _opened(nd2, path) as file:
+    with library_errors(str(path), "ND2"), Bounded(path) as stream, nd2.ND2File(stream) as file:
         sizes = {str(a): int(n) for a, n in file.sizes.items()}
         odd = [a for a, n in sizes.items() if a not in "TPZCYXS" and n > 1]
         if odd or min(sizes.values(), default=0) < 1 or not {"Y", "X"} <= set(sizes):
@@ -61,12 +59,6 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         )  # fmt: skip
         name = volume_name(path) + (f":{place}" if sizes.get("P", 1) > 1 else "")
         return picture_volume(picture, options, str(path), name)
-
-
-@contextmanager
-def _opened(nd2: Any, path: Path) -> Iterator[Any]:
-    with Bounded(path) as stream, nd2.ND2File(stream) as file:
-        yield file
 
 
 def _frames(path: Path) -> dict[int, int]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,6 +36,7 @@ from vvgt_cli.volume.microscopy.image import (
 )
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import MICROMETRE
 from vvgt_cli.volume.stored import Slices
 from vvgt_cli.volume.types import Volume
 
@@ -188,7 +190,6 @@ def _jpeg_xr(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, path: Pa
     return np.asarray(imagecodecs.jpegxr_decode(data)).reshape(shape).astype(dtype, copy=False)
 
 
-MICROMETRE = 1e-6
 TILE = 512  # pixels along the edge of what is read together, at least
 
 
@@ -197,9 +198,8 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
     with library_errors(str(path), "CZI"):
         every, xml = tiles_of(path)
         scene, tiles = _scene(every, options, path)
-        ends = {
-            a: (min(t.at.get(a, 0) for t in tiles), max(t.at.get(a, 0) for t in tiles)) for t in tiles for a in t.at
-        }
+        at = {a: [t.at.get(a, 0) for t in tiles] for a in {a for t in tiles for a in t.at}}
+        ends = {a: (min(some), max(some)) for a, some in at.items()}
         odd = [a for a, (lo, hi) in ends.items() if a not in "TCZMS" and hi > lo]
         kinds = {tile.pixel for tile in tiles}
         if odd or len(kinds) != 1 or not kinds <= set(PIXELS):
@@ -208,8 +208,7 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
                 f"pixels of types {sorted(kinds)}; expected several of T, C and Z at most, and one of {sorted(PIXELS)}"
             )
         dtype, samples = PIXELS[kinds.pop()]
-        x, y = min(t.x for t in tiles), min(t.y for t in tiles)
-        width, height = max(t.x + t.width for t in tiles) - x, max(t.y + t.height for t in tiles) - y
+        x, y, width, height = _bounds(tiles)
         times, channels, slices = (ends[a][1] - ends[a][0] + 1 if a in ends else 1 for a in "TCZ")
         filled = sum(t.width * t.height for t in tiles)
         if times * channels * slices * width * height > SPARSE * filled:
@@ -232,13 +231,15 @@ def _scene(tiles: list[CziTile], options: ReadOptions, path: Path) -> tuple[int 
     for tile in tiles:
         found.setdefault(tile.at.get("S", 0), []).append(tile)
     keys = sorted(found)
-    facts = [
-        f"{max(t.x + t.width for t in found[k]) - min(t.x for t in found[k])} x "
-        f"{max(t.y + t.height for t in found[k]) - min(t.y for t in found[k])} pixels"
-        for k in keys
-    ]
+    facts = ["{2} x {3} pixels".format(*_bounds(found[k])) for k in keys]
     number = choose_image([f"scene {k}" for k in keys], facts, options.array, "scenes", str(path))
     return keys[number] if len(keys) > 1 else None, found[keys[number]]
+
+
+def _bounds(tiles: Sequence[CziTile]) -> tuple[int, int, int, int]:
+    """Return the left and upper edge of the tiles, and the width and height of all of them together."""
+    x, y = min(t.x for t in tiles), min(t.y for t in tiles)
+    return x, y, max(t.x + t.width for t in tiles) - x, max(t.y + t.height for t in tiles) - y
 
 
 Planes = dict[tuple[int, ...], list[CziTile]]
@@ -254,15 +255,9 @@ def _by_plane(tiles: list[CziTile], first: dict[str, int]) -> Planes:
 
 
 def _read(
-    path: Path,
-    planes: Planes,
-    corner: tuple[int, int],
-    samples: int,
-    dtype: np.dtype,
-    time: int,
-    channel: int,
+    path: Path, planes: Planes, corner: tuple[int, int], samples: int, dtype: np.dtype, time: int, channel: int,
     box: Slices,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Read a box, 0 where no tile is. Samples of colours are blue first in the file."""
     z, y, x = box
     number, sample = divmod(channel, samples)
@@ -286,13 +281,10 @@ def _metadata(xml: str, channels: int, path: Path) -> tuple[Any, list[str], list
         return (None, None, None), [], []
     spacing = {d.get("Id"): _micrometres(d.findtext("Value")) for d in root.findall(".//Scaling/Items/Distance")}
     found = root.findall(".//Information/Image/Dimensions/Channels/Channel")[:channels]
-    shown = root.findall(".//DisplaySetting/Channels/Channel")
-    display = {c.get("Id"): c.findtext("Color") for c in shown}
-    names = [c.get("Name") or "" for c in found]
+    found = found if len(found) == channels else []
+    display = {c.get("Id"): c.findtext("Color") for c in root.findall(".//DisplaySetting/Channels/Channel")}
     colors = [hex_color(display.get(c.get("Id")) or c.findtext("Color")) for c in found]
-    if len(found) != channels:
-        names, colors = [], []
-    return tuple(spacing.get(a) for a in "XYZ"), names, colors
+    return tuple(spacing.get(a) for a in "XYZ"), [c.get("Name") or "" for c in found], colors
 
 
 def _micrometres(text: str | None) -> float | None:
