@@ -174,9 +174,9 @@ class FrameSeries(Batch):
             if not wanted(stem):
                 continue
             if self._dark[k]:
-                console.message(f"skipped: {step.name} (nothing of it is visible)")
+                console.progress(f"skipped: {step.name} (nothing of it is visible)")
                 continue
-            console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
+            console.progress(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
         console.message(f"{done} frames converted, {mine - done} were complete before")
