@@ -30,6 +30,7 @@ from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.medical.masks import hold_volumes, mask_files
+from vvgt_cli.volume.readers import is_glob
 from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
@@ -206,11 +207,6 @@ class FrameSeries(Batch):
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [os.path.relpath(p, folder) for p in (request.output, request.report, request.preview) if p],
         }
-
-
-def is_glob(path: str) -> bool:
-    """Return whether a path is a glob, and not the name of a file."""
-    return bool(set(path) & set("*?[")) and not os.path.exists(path)
 
 
 def is_glob_of_volumes(source: SourceRequest) -> bool:

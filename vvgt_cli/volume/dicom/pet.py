@@ -13,8 +13,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.errors import DataError
 
 SUV = "SUVbw"
 PHILIPS = (0x7053, 0x1000)  # SUV per value, and who says so
@@ -31,12 +30,10 @@ def in_suv(slices: list[Any], headers: list[Any], wanted: str | None, path: Path
     """Return slices whose ``scaling`` gives SUV by body weight, and the unit of their values.
 
     ``headers`` are of the whole series. Values stay as stored if ``wanted`` is ``none``, and, with a message, if a
-    header lacks something; raise DataError for that if it is ``bw``, and UsageError for either without PET.
+    header lacks something; raise DataError for that if it is ``bw``.
     """
     first = slices[0].header
     if first.get("Modality") != "PT":
-        if wanted is not None:
-            raise UsageError(f"{path}: no PET, but {printable(str(first.get('Modality')))}; leave out --suv {wanted}")
         return slices, ""
     unit = _UNITS.get(first.get("Units"), "")
     if wanted == "none" or (wanted is None and first.get("Units") and not unit):
