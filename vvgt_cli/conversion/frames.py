@@ -326,19 +326,17 @@ def list_steps(source: SourceRequest, timed: bool = False) -> list[Step]:
             f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
             "a file with several time steps"
         )
-    if len(files) > 1:
-        named = frame_facts(list(map(str, files)))
-        times = [_stated_time(str(file), source.read) if timed else None for file in files]
-        return [Step(f.name, str(f), source.read, t, n) for f, t, n in zip(files, times, named, strict=True)]
-    volume = str(files[0]) if files else source.path
-    name = Path(volume).name
-    times, facts = _times(volume, source.read), frame_facts([volume])[0]
-    if len(times) == 1:
-        time = _stated_time(volume, source.read) if timed else None
-        return [Step(name, volume, source.read, time, facts)]
+    names = list(map(str, files)) or [source.path]
+    times = _times(names[0], source.read) if len(names) == 1 else []
+    if len(times) > 1:
+        one, (facts,) = names[0], frame_facts(names)
+        return [
+            Step(f"{Path(one).name} time {k}", one, replace(source.read, time=k), time, {**facts, "step": str(k)})
+            for k, time in enumerate(times)
+        ]
     return [
-        Step(f"{name} time {k}", volume, replace(source.read, time=k), time, {**facts, "step": str(k)})
-        for k, time in enumerate(times)
+        Step(Path(one).name, one, source.read, _stated_time(one, source.read) if timed else None, facts)
+        for one, facts in zip(names, frame_facts(names), strict=True)
     ]
 
 

@@ -304,7 +304,7 @@ def load_all(
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
-            shown = from_histogram(whole, volume.hounsfield, volume.density, volume.preset)
+            shown = from_histogram(whole, volume.hounsfield, volume.preset)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
                 f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
