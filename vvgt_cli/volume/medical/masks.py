@@ -53,12 +53,14 @@ def mask_files(source: str | Path) -> list[Path]:
     numbered = not folder and len({re.sub(r"\d+", "", path.name) for path in files}) == 1
     if len(files) < 2 or numbered or not hold_volumes(files):
         return []
-    ends = [next((kind for path in some if (kind := _kind(path))), 0) for some in (files, files[::-1])]
+    dated = [(path, path.stat().st_mtime_ns) for path in files]
+    ends = [next((kind for one in some if (kind := _kind(*one))), 0) for some in (dated, dated[::-1])]
     return files if max(ends) >= 0 else []
 
 
-def _kind(path: Path) -> int:
-    """Return 1 if a file holds a mask, 0 if an empty one, and -1 if anything else."""
+@lru_cache(maxsize=1024)
+def _kind(path: Path, date: int) -> int:
+    """Return 1 if a file of this date holds a mask, 0 if an empty one, and -1 if anything else."""
     try:
         return int(_inside(path, ReadOptions())[1].any())
     except (VvgtError, OSError, ValueError):  # reported when it is read
