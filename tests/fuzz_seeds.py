@@ -113,8 +113,8 @@ def inviwo() -> list[Seed]:
 def vgi() -> list[Seed]:
     text = (
         b"{volume1}\n[representation]\nsize = 5 4 3\n[file1]\nSkipHeader = 2\nFileFormat = raw\nSize = 5 4 3\n"
-        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n{volumeprimitive1}\n[geometry]\n"
-        b"resolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
+        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n"
+        b"{volumeprimitive1}\n[geometry]\nresolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
     )
     return [Seed("a.vgi", text, READ, {"v.raw": b"xx" + VALUES.tobytes()})]
 

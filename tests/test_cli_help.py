@@ -42,7 +42,7 @@ def every_command() -> dict[str, click.Command]:
 
 @pytest.mark.parametrize("command", every_command())
 def test_an_option_of_one_value_is_given_once(command, vvgt):
-    """Also by its short and its long name; options that are repeatable and flags without an opposite may be repeated."""
+    """Also by its short and its long name; repeatable ones, and flags without an opposite, may be repeated."""
     given = [option for option in every_command()[command].params if isinstance(option, click.Option)]
     for option in given:
         words = [[name, *([] if option.is_flag else [value] * option.nargs)] for name, value in

@@ -77,7 +77,9 @@ def test_every_label_is_told_of(vvgt, tmp_path: Path) -> None:
     values[values == 3] += np.arange(16, dtype=np.uint8)[np.nonzero(values == 3)[0]] // 8
     np.save(tmp_path / "v.npy", values)
     few = ("--max-gaussians", 60, "--size", 24, "--steps", 0)
-    told = vvgt.ok("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", *few, "-o", tmp_path / "{}.ply").err
+    told = vvgt.ok(
+        "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", *few, "-o", tmp_path / "{}.ply"
+    ).err
     assert told.count("converting what others hide of it") == 2, told
 
 

@@ -47,8 +47,8 @@ from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
-from vvgt_cli.volume.readers import is_glob
 from vvgt_cli.volume import Statistics
+from vvgt_cli.volume.readers import is_glob
 from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"
