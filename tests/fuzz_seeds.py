@@ -112,13 +112,11 @@ def inviwo() -> list[Seed]:
 
 def vgi() -> list[Seed]:
     text = (
-        b"{volume1}\n[representation]\nsize = 5 4 3\n[file1]\nSkipHeader = 2\nFileFormat = raw\nSize = 5 4 2\n"
-        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n[file2]\nSize = 5 4 1\n"
-        b"Name = w.raw\nDatatype = signed integer\nBitsPerElement = 16\n{volumeprimitive1}\n[geometry]\n"
-        b"resolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
+        b"{volume1}\n[representation]\nsize = 5 4 3\n[file1]\nSkipHeader = 2\nFileFormat = raw\nSize = 5 4 3\n"
+        b"Mirror = 0 0 1\nName = v.raw\nDatatype = signed integer\nBitsPerElement = 16\n"
+        b"{volumeprimitive1}\n[geometry]\nresolution = 1 2 3\nunit = mm\n[volume]\nvolume = volume1\n"
     )
-    beside = {"v.raw": b"xx" + VALUES[:2].tobytes(), "w.raw": VALUES[2:].tobytes()}
-    return [Seed("a.vgi", text, READ, beside)]
+    return [Seed("a.vgi", text, READ, {"v.raw": b"xx" + VALUES.tobytes()})]
 
 
 def slc() -> list[Seed]:

@@ -10,7 +10,7 @@ import xarray
 
 from tests.test_pages import clouds
 from vvgt_cli.conversion.frames import list_steps
-from vvgt_cli.conversion.index import index_path
+from vvgt_cli.conversion.index import function_name, index_path
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import read_ply
 
@@ -127,3 +127,11 @@ def test_where_an_index_lies():
     assert index_path("a/{}.compressed.ply") == "a/index.json"
     assert index_path("a/{}/v1.0.ply") == "a/index.json"
     assert index_path("a.b_{}.v2.ply") == "a.b_index.v2.json"
+
+
+def test_what_a_function_is_called(at):
+    Path("a:b").mkdir()
+    Path("a:b/soft.json").write_text("{}")
+    named = {"a:b/soft.json": "soft", "a:b/soft.json#x: y": "x: y", "p.json#Cool to Warm": "Cool to Warm"}
+    named |= {text: text for text in ("gray:0.2,1", "iso:3,#88aaff:5")}
+    assert {text: function_name(text) for text in named} == named

@@ -343,7 +343,13 @@ def test_info_tells_functions_from_volumes(vvgt, file) -> None:
         (ITF.format(lo=0, hi=1, type=0), "c.itf"),
     ):
         assert b"transfer function" in vvgt("info", file(content, name)).out
-    for content, name in (('{"a": 1}', "a.json"), ("<a/>", "a.xml"), ("{ text }", "a"), ("[1]", "b"), ("[", "b.json")):
+    for content, name in (
+        ('{"a": 1.5}', "a.json"),
+        ("<a/>", "a.xml"),
+        ("{ text }", "a"),
+        ("[1]", "b"),
+        ("[", "b.json"),
+    ):
         assert "of no known format; expected NIfTI" in vvgt.fails(1, "info", file(content, name))
     for content, name in (('{"points": 3}', "a.json"), ('{"RGBPoints": [1,', "b.json"), ("<ColorMap", "a.xml")):
         assert "of no known format" not in vvgt.fails(1, "info", file(content, name))

@@ -117,9 +117,9 @@ def test_moments_of_extreme_values_are_finite() -> None:
 @pytest.mark.parametrize(("sign", "name"), [(1, "density-contour"), (-1, "density-difference")])
 def test_densities_are_contoured_when_no_function_is_given(tmp_path: Path, sign: float, name: str) -> None:
     values = blob(sign)
-    volume = Volume(values, density=True)
+    volume = Volume(values, preset="density")
     numbers = statistics(volume)
-    shown = from_histogram(numbers, density=volume.density)
+    shown = from_histogram(numbers, preset=volume.preset)
     assert shown.name == f"automatic ({name})"
     high, low = values.max(), values.min()
     assert shown.opacity(np.array([0.1])) == 0
@@ -132,7 +132,7 @@ def test_densities_are_contoured_when_no_function_is_given(tmp_path: Path, sign:
 def test_a_density_without_anything_above_its_noise_is_shown_by_its_histogram() -> None:
     values = np.full((4, 4, 4), 1.0)
     values[:2] = 0
-    assert from_histogram(statistics(Volume(values)), density=True).name == "automatic (histogram)"
+    assert from_histogram(statistics(Volume(values)), preset="density").name == "automatic (histogram)"
 
 
 def test_info_names_a_function_that_fits(tmp_path: Path, vvgt) -> None:

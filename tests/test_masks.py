@@ -4,6 +4,7 @@ import gzip
 import json
 import struct
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,8 @@ def test_layers_have_colours_of_their_own(tmp_path: Path) -> None:
     stats = load(SourceRequest(many, labels="auto")).statistics
     frame = SourceRequest(one[0], labels="auto", layers=(look[1],), statistics=(stats,))
     first, second = (layer.tf.structures[0] for layer in load(frame).layers)
+    far = replace(frame, statistics=(replace(stats, hi=2e9),))  # Allen's atlas has such numbers
+    assert [layer.tf.structures[0].name for layer in load(far).layers] == ["label 1", "spleen"]
     assert first.color == shown[0].color
     assert second.color not in {label.color for label in shown[:3]}
 
@@ -156,6 +159,9 @@ CARET = (
     "</CaretExtension>"
 )
 VALUES = np.resize(np.array([0, 1, 3, 5], np.uint8), (3, 4, 5))
+
+
+SHORT = '<LabelTable><Label Key="1" Red="1" Green="0" Blue="0" Alpha="1">skin</Label></LabelTable>'
 
 
 def nifti(path: Path, text: str = CARET) -> str:
@@ -215,6 +221,12 @@ def test_a_header_names_labels(tmp_path: Path, make: Any, opacity: float, option
     assert [(e.number, e.name) for e in found.structures] == [(1, "skin"), (3, "core"), (5, "label 5")]
     np.testing.assert_allclose([e.color for e in found.structures[:2]], [(1, 0.2, 0), (0, 0, 1)])
     assert [e.opacity for e in found.structures] == [pytest.approx(opacity, abs=0.01), 1, 1]
+
+
+def test_a_short_table_is_read(tmp_path: Path) -> None:
+    named = read_volume(nifti(tmp_path, SHORT)).segments
+    assert named is not None
+    assert [(one.number, one.name, one.color) for one in named] == [(1, "skin", (1, 0, 0))]
 
 
 @pytest.mark.parametrize(

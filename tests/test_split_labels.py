@@ -71,6 +71,18 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
     assert scores["gaussians"] == len(core)
 
 
+def test_every_label_is_told_of(vvgt, tmp_path: Path) -> None:
+    """Also where a line says of several labels the same."""
+    values = nested(16)
+    values[values == 3] += np.arange(16, dtype=np.uint8)[np.nonzero(values == 3)[0]] // 8
+    np.save(tmp_path / "v.npy", values)
+    few = ("--max-gaussians", 60, "--size", 24, "--steps", 0)
+    told = vvgt.ok(
+        "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", *few, "-o", tmp_path / "{}.ply"
+    ).err
+    assert told.count("converting what others hide of it") == 2, told
+
+
 def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:
     counts, cost = [], ViewingConditions.cost
     monkeypatch.setattr(

@@ -323,13 +323,8 @@ def test_vgi(tmp_path: Path, newline: str) -> None:
     np.testing.assert_array_equal(volume.data, VALUES)
     assert isinstance(volume.data, np.memmap)
     assert (volume.spacing, volume.unit, volume.name) == ((0.05, 0.1, 0.2), "mm", "v")
-    parts = VGI.replace("Size = 5 4 3", "Size = 5 4 2").replace("[file1]", "[file2]\nSize = 5 4 1\nName = w.vol\n"
-                        "Datatype = signed integer\nBitsPerElement = 16\n[file1]").encode()  # fmt: skip
-    (tmp_path / "v.vol").write_bytes(b"xx" + VALUES[:2].tobytes())
-    (tmp_path / "w.vol").write_bytes(VALUES[2:].tobytes())
-    np.testing.assert_array_equal(read_volume(write(tmp_path / "v.vgi", parts)).data, VALUES)
     second = b"{volume2}\n[file1]\nSize = 5 4 1\nName = w.vol\nDatatype = float\nBitsPerElement = 16\n"
-    two = write(tmp_path / "v.vgi", parts.replace(b"{volumeprimitive1}", second + b"{volumeprimitive1}"))
+    two = write(tmp_path / "v.vgi", VGI.encode().replace(b"{volumeprimitive1}", second + b"{volumeprimitive1}"))
     refused(UsageError, "volume1; volume2; choose one with --array", read_volume, two)
     np.testing.assert_array_equal(read_volume(two, ReadOptions(array="volume1")).data, VALUES)
     refused(DataError, "'float' of 16 bits; expected raw", read_volume, two, ReadOptions(array="volume2"))
@@ -338,7 +333,8 @@ def test_vgi(tmp_path: Path, newline: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("size = 5 4 3", "size = 5 4 2", "files of .*expected all of it"),
+        ("size = 5 4 3", "size = 5 4 2", "first file of .*expected all of it"),
+        ("{volumeprimitive1}", "[file2]\nName = w.vol\n{volumeprimitive1}", "expected all of it in one file"),
         ("BitsPerElement = 16", "BitsPerElement = 32", "has 122 bytes; expected 242"),
         ("Datatype = signed integer", "Datatype = colour", "'colour' of 16 bits; expected raw"),
         ("FileFormat = raw", "FileFormat = tiff", "FileFormat tiff"),

@@ -45,7 +45,7 @@ def test_mrc_modes_and_byte_orders(tmp_path: Path, code: str, mode: int, order: 
     assert isinstance(volume.data, np.memmap)
     assert volume.data.dtype == np.dtype(order + code)
     assert volume.spacing == (1.5, 2.0, 2.5)
-    assert (volume.density, volume.space) == (True, None)
+    assert (volume.preset, volume.space) == ("density", None)
 
 
 def test_mrc_bytes_of_imod_are_unsigned_where_it_says_so(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_cube(tmp_path: Path, sign: int, unit: float) -> None:
         assert volume.data[i, j, k] == pytest.approx(GRID[i, j, k, 0], rel=1e-6)
         expected = unit * np.array([-2 + 0.5 * i, 1 + 0.25 * j + 0.1 * k, 0.5 + k])
         np.testing.assert_allclose(place(volume, i, j, k), expected, atol=1e-6)
-    assert volume.density
+    assert volume.preset == "density"
 
 
 def test_text_takes_the_memory_of_its_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,7 +211,7 @@ def test_dx(tmp_path: Path, form: str) -> None:
     volume = read_volume(str(tmp_path / "v.dx"))
     np.testing.assert_allclose(volume.data, values, rtol=1e-6)
     np.testing.assert_allclose(place(volume, 2, 1, 3), [-1, 1.55, 3.5], atol=1e-6)
-    assert volume.density
+    assert volume.preset == "density"
 
 
 def test_dx_as_another_library_writes_it(tmp_path: Path) -> None:

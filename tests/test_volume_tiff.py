@@ -299,8 +299,8 @@ def test_images_of_the_xml_without_pages_leave_the_others_their_sizes(tmp_path: 
         ('PlaneCount="24"', 'PlaneCount="99999999999"', "TiffData of"),
         ('DimensionOrder="XYZCT"', 'DimensionOrder="XXZCT"', "DimensionOrder 'XXZCT'"),
         ('PhysicalSizeX="0.2"', 'PhysicalSizeX="1" PhysicalSizeXUnit="pixel"', "pixel, µm, nm; expected one unit"),
-        ("</Pixels>", "</Pixel>", "damaged OME-XML"),
-        ("<Pixels", "<!DOCTYPE a [<!ENTITY b 'c'>]><Pixels", "declares entities"),
+        ("</Pixels>", "</Pixel>", "damaged XML metadata"),
+        ("<Pixels", "<!DOCTYPE a [<!ENTITY b 'c'>]><Pixels", "with entities"),
         ("<TiffData", '<x><AlongZ Start="0" End="1e9" Step="1e-9"/></x><TiffData', "AlongZ from 0"),
         (
             "<Pixels",

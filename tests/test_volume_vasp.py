@@ -40,7 +40,7 @@ def test_densities_lie_on_a_periodic_cell(tmp_path, scale, factor, elements, mor
     cell = CELL * factor
     np.testing.assert_allclose(volume.affine[:3, :3].T * np.array([[2], [3], [4]]), cell)
     assert volume.origin == (0, 0, 0)
-    assert (volume.density, volume.unit) == (True, "angstrom")
+    assert (volume.preset, volume.unit) == ("density", "angstrom")
     np.testing.assert_allclose(volume.slope * volume.data, VALUES / np.linalg.det(cell), rtol=1e-6)
 
 

@@ -84,18 +84,18 @@ class Console:
     once: Once | None = None
 
     def message(self, line: str) -> None:
-        """Print one line, unless it was said of another item of a batch."""
+        """Print one line, once of all items of a batch; lines that tell of the work done are `progress`."""
         if self.once is None or self.once.first(line):
-            self._print(line)
+            self.progress(line)
 
-    def _print(self, line: str) -> None:
-        """Print one line; line breaks within it, such as those of a file name, become blanks."""
+    def progress(self, line: str) -> None:
+        """Print one line, as often as it comes; line breaks within it, as in a file's name, become blanks."""
         if not self.quiet:
             print(" ".join(line.splitlines()), file=self.stream, flush=True)
 
     def stage(self, name: str, seconds: float, detail: str = "") -> None:
         """Print the line of a stage: name, wall seconds and details."""
-        self._print(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
+        self.progress(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
 
     def bar(self, label: str) -> ProgressCallback | None:
         """Return a callback ``(done, total)`` that draws a bar, or without a terminal prints a line at times."""
@@ -110,7 +110,7 @@ class Console:
             if not terminal:
                 if done < total and now - last >= _LINES:
                     last = now
-                    self._print(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
+                    self.progress(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
                 return
             if done >= total:
                 self.stream.write("\r\x1b[K")  # the line of the stage follows

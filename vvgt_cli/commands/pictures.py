@@ -18,7 +18,7 @@ from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.view_sets import draw_in_blocks
-from vvgt_cli.conversion.frames import FrameSeries, is_glob, is_glob_of_volumes
+from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, frame_facts, is_pattern, put_name
@@ -48,6 +48,7 @@ from vvgt_cli.look.tables import Optics, exposed_distance
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import Run
 from vvgt_cli.volume import Statistics
+from vvgt_cli.volume.readers import is_glob
 from vvgt_cli.volume.space import shear_text
 
 VIEWS_FILE, PICTURE = "transforms.json", ".png"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import re
 import shlex
+from collections import Counter
 from collections.abc import Collection, Sequence
 
 import click
@@ -158,20 +158,13 @@ class SectionedCommand(click.Command):
             ) from None
 
     def _check_repeated(self, ctx: click.Context, args: list[str]) -> None:
-        """Raise click.UsageError for an option with several values, of which click would take the last."""
-        parser = self.make_parser(ctx)
-        options = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.multiple]
-        for option in options:
-            collecting = copy.copy(option)
-            collecting.multiple = True
-            collecting.add_to_parser(parser, ctx)
-        collected = parser.parse_args(args)[0]
-        for option in options:
-            values = collected.get(option.name, [])
-            if len(values) > 1 and not (option.is_flag and len(set(values)) == 1):
+        """Raise click.UsageError for an option that is given several times, of which click would take the last."""
+        for option, times in Counter(self.make_parser(ctx).parse_args(args)[2]).items():
+            if not isinstance(option, click.Option) or option.multiple:
+                continue
+            if times > 1 and (not option.is_flag or option.secondary_opts):
                 names = "/".join([*option.opts, *option.secondary_opts])
-                words = " and ".join(_word(option, value) for value in values)
-                raise click.UsageError(f"{names}: given {len(values)} times, {words}; expected one", ctx)
+                raise click.UsageError(f"{names}: given {times} times; expected once", ctx)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options under their headings."""
@@ -184,10 +177,3 @@ class SectionedCommand(click.Command):
             if listed:
                 with formatter.section(title):
                     formatter.write_dl(listed)
-
-
-def _word(option: click.Option, value: object) -> str:
-    """Return a value of an option as it was typed; of a flag its name, and the default of a value that is omitted."""
-    if isinstance(value, bool):
-        return (option.opts if value else option.secondary_opts)[0]
-    return " ".join(value) if isinstance(value, tuple) else str(value if isinstance(value, str) else option.flag_value)

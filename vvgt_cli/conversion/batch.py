@@ -189,7 +189,7 @@ class Functions(Batch):
         """Yield an item for each function."""
         for number, ((name, request, fact), stem) in enumerate(zip(self._requests, self.stems, strict=True), 1):
             if wanted(stem):
-                run.console.message(f"{fact}: function {number} of {len(self._requests)}")
+                run.console.progress(f"{fact}: function {number} of {len(self._requests)}")
                 yield Item(name, stem, request, {"function": fact})
 
 

@@ -320,7 +320,7 @@ def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     for warning in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.message(warning)
     plain = request.source.tf is None and not source.gridded and source.volume.data.nbytes < MIN_BLOCKED
-    if plain and (name := fitting(source.overall, source.volume)):
+    if plain and (name := fitting(source.overall, source.volume)) and name not in source.layers[0].tf.name:
         run.console.message(f"{source.volume.name}: no look is given; --tf {name} is made for such data, try it")
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)

@@ -30,6 +30,7 @@ from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.medical.masks import hold_volumes, mask_files
+from vvgt_cli.volume.readers import is_glob
 from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
@@ -174,9 +175,9 @@ class FrameSeries(Batch):
             if not wanted(stem):
                 continue
             if self._dark[k]:
-                console.message(f"skipped: {step.name} (nothing of it is visible)")
+                console.progress(f"skipped: {step.name} (nothing of it is visible)")
                 continue
-            console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
+            console.progress(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
         console.message(f"{done} frames converted, {mine - done} were complete before")
@@ -206,11 +207,6 @@ class FrameSeries(Batch):
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [os.path.relpath(p, folder) for p in (request.output, request.report, request.preview) if p],
         }
-
-
-def is_glob(path: str) -> bool:
-    """Return whether a path is a glob, and not the name of a file."""
-    return bool(set(path) & set("*?[")) and not os.path.exists(path)
 
 
 def is_glob_of_volumes(source: SourceRequest) -> bool:
@@ -330,19 +326,17 @@ def list_steps(source: SourceRequest, timed: bool = False) -> list[Step]:
             f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
             "a file with several time steps"
         )
-    if len(files) > 1:
-        named = frame_facts(list(map(str, files)))
-        times = [_stated_time(str(file), source.read) if timed else None for file in files]
-        return [Step(f.name, str(f), source.read, t, n) for f, t, n in zip(files, times, named, strict=True)]
-    volume = str(files[0]) if files else source.path
-    name = Path(volume).name
-    times, facts = _times(volume, source.read), frame_facts([volume])[0]
-    if len(times) == 1:
-        time = _stated_time(volume, source.read) if timed else None
-        return [Step(name, volume, source.read, time, facts)]
+    names = list(map(str, files)) or [source.path]
+    times = _times(names[0], source.read) if len(names) == 1 else []
+    if len(times) > 1:
+        one, (facts,) = names[0], frame_facts(names)
+        return [
+            Step(f"{Path(one).name} time {k}", one, replace(source.read, time=k), time, {**facts, "step": str(k)})
+            for k, time in enumerate(times)
+        ]
     return [
-        Step(f"{name} time {k}", volume, replace(source.read, time=k), time, {**facts, "step": str(k)})
-        for k, time in enumerate(times)
+        Step(Path(one).name, one, source.read, _stated_time(one, source.read) if timed else None, facts)
+        for one, facts in zip(names, frame_facts(names), strict=True)
     ]
 
 

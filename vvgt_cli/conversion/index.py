@@ -36,9 +36,10 @@ def is_pattern(output: str) -> bool:
 
 def function_name(tf: str) -> str:
     """Return the name of a function: that of its file without folder and endings, or NAME of FILE#NAME."""
-    if ":" in tf:  # a colour map or levels, with numbers
+    file, _, pick = tf.rpartition("#")
+    if ":" in tf and not os.path.exists(file or tf):  # a colour map or levels, with numbers
         return tf
-    return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]
+    return pick if file else Path(tf).name.partition(".")[0]
 
 
 def put_name(

@@ -111,9 +111,9 @@ class Labels(Batch):
         for request, parts in self._layers:
             for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
                 if gaussians is None:
-                    run.console.message(f"skipped: {part.text()} (nothing of it is visible)")
+                    run.console.progress(f"skipped: {part.text()} (nothing of it is visible)")
                     continue
-                run.console.message(f"{part.text()}: {len(gaussians)} Gaussians")
+                run.console.progress(f"{part.text()}: {len(gaussians)} Gaussians")
                 name = part.name if names.count(part.name) == 1 else part.stem
                 used.append(unused(name, used))
                 yield Item(used[-1], part.stem, part.request, part.facts, gaussians)
@@ -216,7 +216,7 @@ def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) ->
         off = not label.label.opacity
         if not off and not hides.meet_label(label.volume, label.label.number):
             continue
-        console.message(f"{label.text()}: converting {'it alone: off' if off else 'what others hide of it'}")
+        console.progress(f"{label.text()}: converting {'it alone: off' if off else 'what others hide of it'}")
         alone = _alone(label, console)
         if alone is not None:
             hidden[-1].append(alone if off else alone.take(hides.contain(alone)))

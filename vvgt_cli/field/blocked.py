@@ -271,16 +271,20 @@ class Blocked:
         grid = self.grid or self._grid(np.zeros(3, np.int64))
         at = (points + self.frame.half) / self.frame.step - 0.5
         store, kind = self.run_pass.store, f"points-{digest(at)[:16]}"
-        path = store.folder / f"{kind}.npy"
-        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-            np.save(stream, at)
-        task = PointBlocks(self.reader, grid, store, str(path), kind)
+        task = PointBlocks(self.reader, grid, store, self._saved(at, kind), kind)
         self.run_pass(task, "normals")
         out = np.zeros((len(at), 4))
         for number in range(len(task)):
             part = store.load(kind, number)
             out[part["which"]] = part["found"]
         return out
+
+    def _saved(self, rows: np.ndarray, kind: str) -> str:
+        """Return the path of a new file of the store with an array."""
+        path = self.run_pass.store.folder / f"{kind}.npy"
+        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+            np.save(stream, rows)
+        return str(path)
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Implement `Field.sample`."""
@@ -292,10 +296,7 @@ class Blocked:
         centres, arms = in_voxels(gaussians, *self.frame)
         rows = np.concatenate([centres, arms.reshape(-1, 9)], axis=1)
         kind = f"values-{digest(rows)[:16]}"
-        path = store.folder / f"{kind}.npy"
-        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
-            np.save(stream, rows)
-        task = ValueBlocks(self.reader, grid, store, str(path), kind)
+        task = ValueBlocks(self.reader, grid, store, self._saved(rows, kind), kind)
         self.run_pass(task, "values")
         samples = np.full(len(gaussians) * POINTS, np.nan, np.float32)
         sums = np.zeros((len(gaussians), NORMAL_SUMS))

@@ -21,7 +21,7 @@ from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 from vvgt_cli.volume.blocks import Packed
-from vvgt_cli.volume.label_maps import MAX_LABELS
+from vvgt_cli.volume.label_maps import MAX_LABELS, whole_numbers
 from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.stored import read_block
 
@@ -197,16 +197,7 @@ class BlockAccess:
                 task = replace(task, kind=task.kind.replace(COUNTS, LABELS), labels=True)
                 self._run(task)
             stored = task.unique()
-        if len(stored) > MAX_LABELS:
-            raise Unsuitable(f"{volume.name}: more than {MAX_LABELS} distinct values; expected a label map")
-        values = np.unique(volume.slope * stored + volume.intercept)
-        if (values != np.round(values)).any():
-            odd = values[values != np.round(values)][0]
-            raise Unsuitable(
-                f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected integers, as in a label map: "
-                "omit --labels for scalars"
-            )
-        return [int(value) for value in values]
+        return list(map(int, whole_numbers(stored, volume)))
 
 
 PARTS = 4  # of a block, counted at once

@@ -277,7 +277,7 @@ def functions_of(
     if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
-            return [from_histogram(stats[0], one.hounsfield, one.density, one.preset)]
+            return [from_histogram(stats[0], one.hounsfield, one.preset)]
         return [resolve(tf, stats[0], tf_range, one.hounsfield)]
     if opened.components_message:
         _warn_all_channels(opened, tf)

@@ -15,7 +15,7 @@ from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_pl
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels, palette_color
+from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, check_labels, palette
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
@@ -304,7 +304,7 @@ def load_all(
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)
         else:
-            shown = from_histogram(whole, volume.hounsfield, volume.density, volume.preset)
+            shown = from_histogram(whole, volume.hounsfield, volume.preset)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
                 f"{volume.name}: every voxel is {whole.lo:g}, so only the box is visible; check --dtype, --component "
@@ -337,7 +337,7 @@ def _layered(
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     if request.layers:  # a frame's labels keep their looks: colours of its whole series are in use
         frames = bool(request.statistics) and isinstance(layers[0].tf, LabelTable)
-        used = {palette_color(n + 1) for n in range(int(request.statistics[0].hi) if frames else 0)}
+        used = set(palette()[: max(int(request.statistics[0].hi), 0)] if frames else ())
         layers = [*layers[:frames], *told_apart(layers[frames:], used)]
     lighting = request.light.lighting(layers[0].tf.lighting, content.volumes[0].space)
     stats = access.statistics(layers[0].volume)

@@ -13,6 +13,7 @@ from vvgt_cli.look.readers.names import named_function
 from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
 from vvgt_cli.look.resolve import resolve
 from vvgt_cli.volume.stats import Statistics
+from vvgt_cli.volume.types import DENSITY
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"
@@ -48,9 +49,7 @@ TISSUES = (
 )
 
 
-def from_histogram(
-    statistics: Statistics, hounsfield: bool = False, density: bool = False, preset: str = ""
-) -> TransferFunction:
+def from_histogram(statistics: Statistics, hounsfield: bool = False, preset: str = "") -> TransferFunction:
     """Return a transfer function chosen from the histogram; deterministic.
 
     Densities get `contours`, smoke and fire the functions of these names. Hounsfield units (stated, or air near -1000
@@ -62,8 +61,7 @@ def from_histogram(
     Args:
         statistics: range and histogram of the data.
         hounsfield: whether the file states that data values are Hounsfield units.
-        density: whether it is a map of densities.
-        preset: name of the function for such data, "" if unknown.
+        preset: see `Volume.preset`.
 
     Returns:
         The function on data values, opacity per `UNIT_SHARE`, named `NAME`, `HOUNSFIELD` or `CONTOUR`.
@@ -78,8 +76,8 @@ def from_histogram(
         raise DataError("the data have no finite voxel; expected some to choose a transfer function from")
     if lo == hi:  # a box, seen through
         return _function(NAME, np.array([lo]), np.array([FAINT]), ColorMap(np.array([lo]), COLORS[3:4], space="Lab"))
-    if density or preset:
-        name = preset or contours(counts, edges)
+    if preset:
+        name = contours(counts, edges) if preset == DENSITY else preset
         shown = resolve(named_function(name), statistics)
         shown = replace(shown, name=CONTOUR.format(name), opacity_unit_label="automatic")
         if shown.support(lo, hi):

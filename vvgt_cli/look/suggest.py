@@ -21,7 +21,7 @@ from vvgt_cli.look.recognise import AIR, air_and_tissue, background_bins, foregr
 from vvgt_cli.volume.bodies import largest
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.stored import planes
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import DENSITY, Volume
 
 BY_VALUE = 0.5  # bands are equal half by the voxels in them, half by their width
 WIDE = 0.25  # share of the value range; air and padding are narrow, a turbulent field's peak is the field
@@ -169,8 +169,8 @@ def fitting(statistics: Statistics, volume: Volume) -> str | None:
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if not counts.any() or statistics.lo == statistics.hi:
         return None
-    if volume.density or volume.preset:
-        return volume.preset or contours(counts, edges)
+    if volume.preset:
+        return contours(counts, edges) if volume.preset == DENSITY else volume.preset
     if volume.hounsfield or (volume.modality in ("", "CT") and in_hounsfield(counts, edges)):
         body, bone = (_share(counts, edges, *span) / counts.sum() for span in (BODY, BONE))
         lung = _lungs(volume)

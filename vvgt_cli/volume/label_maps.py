@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, Unsuitable
 from vvgt_cli.volume.space import MILLIMETRE, metres
 from vvgt_cli.volume.stats import count_integers, slabs
 from vvgt_cli.volume.stored import planes
@@ -23,7 +23,7 @@ SORTED = 1 << 16  # span of a plane's values above which they are sorted, not co
 
 
 def labels_in(volume: Volume) -> list[int]:
-    """List a volume's labels, ascending, without NaN; raise DataError for fractions, or more than `MAX_LABELS`."""
+    """List a volume's labels, ascending, without NaN; errors are those of `whole_numbers`."""
     kind = volume.data.dtype
     if kind.kind in "iu" and kind.itemsize <= 2 and (volume.slope, volume.intercept) == (1, 0):
         counts, first = count_integers(volume)
@@ -31,17 +31,26 @@ def labels_in(volume: Volume) -> list[int]:
     found = np.empty(0)
     for _, slab in slabs(volume):
         values = np.unique(slab)
-        values = volume.slope * values[np.isfinite(values)].astype(np.float64) + volume.intercept
-        if (values != np.round(values)).any():
-            odd = values[values != np.round(values)][0]
-            raise DataError(
-                f"{volume.name}: {slab.dtype} values such as {odd:g}; expected a label map, of whole numbers: of "
-                "scalars leave out --labels"
-            )
-        found = np.union1d(found, values)
-        if len(found) > MAX_LABELS:
-            raise DataError(f"{volume.name}: more than {MAX_LABELS} different values; expected a label map")
-    return [int(value) for value in found]
+        found = np.union1d(found, values[np.isfinite(values)].astype(np.float64))
+        values = whole_numbers(found, volume)
+    return list(map(int, values))
+
+
+def whole_numbers(stored: np.ndarray, volume: Volume) -> np.ndarray:
+    """Return the labels (m,), ascending, that ``stored`` values (n,) of a volume stand for.
+
+    Raises:
+        Unsuitable: fractions, or more than `MAX_LABELS`.
+    """
+    values = np.unique(volume.slope * stored + volume.intercept)
+    if len(values) > MAX_LABELS:
+        raise Unsuitable(f"{volume.name}: more than {MAX_LABELS} different values; expected a label map")
+    if (odd := values[values != np.round(values)]).size:
+        raise Unsuitable(
+            f"{volume.name}: {volume.data.dtype} values such as {odd[0]:g}; expected a label map, of whole numbers: of "
+            "scalars leave out --labels"
+        )
+    return values
 
 
 def named_so(volume: Volume) -> bool:

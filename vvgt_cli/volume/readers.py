@@ -6,6 +6,7 @@ recognised; the module that reads them is imported when such a file comes. `regi
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class Reader:
             that do not suit.
         sniff: tells whether a file with these first `HEAD_BYTES`, decompressed, has the format; None where files begin
             in no certain way, so that the name decides.
-        takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order``, ``header_bytes``
-            and ``suv`` it takes; all readers take the others.
+        takes: which of the options ``array``, ``time``, ``dims``, ``dtype``, ``byte_order`` and ``header_bytes`` it
+            takes; all readers take the others.
         by_name: also tried on files that `sniff` does not recognise.
         holds: tells whether a folder holds the format.
         whole: a folder that holds it is one volume, whatever other files lie in it.
@@ -110,6 +111,11 @@ def register_scheme(name: str, open_scheme: Scheme, times: bool = False) -> None
 def known_suffixes() -> list[str]:
     """List the file name endings of all readers."""
     return [suffix for reader in READERS for suffix in reader.suffixes]
+
+
+def is_glob(source: str) -> bool:
+    """Return whether a source is a glob, and not the name of a file."""
+    return bool(set(source) & set("*?[")) and "\0" not in source and not os.path.exists(source)
 
 
 def volume_name(path: Path) -> str:

@@ -21,7 +21,7 @@ from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
-from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, is_glob
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.tiff import SLICES
 from vvgt_cli.volume.types import Volume
@@ -47,14 +47,15 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    scheme = "-" if source == "-" else source.partition(":")[0]
-    if options.time is not None and scheme in {"-", *SCHEMES} - STEPPED:
+    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
-    if options.suv is not None and scheme in {"-", *SCHEMES}:
-        raise UsageError(f"{source}: no DICOM PET; leave out --suv {options.suv}")
     if (options.crop, options.mask, options.keep_largest) != (None, None, None):
         options = replace(options, packed=False)
-    return cut(in_space(_read(source, options), options.space), options)
+    volume = _read(source, options)
+    if options.suv is not None and volume.modality != "PT":
+        what = f"no PET, but {volume.modality}" if volume.modality else "no DICOM PET"
+        raise UsageError(f"{source}: {what}; leave out --suv {options.suv}")
+    return cut(in_space(volume, options.space), options)
 
 
 def cut(volume: Volume, options: ReadOptions) -> Volume:
@@ -155,7 +156,7 @@ def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
 
 def _slices(source: str, options: ReadOptions) -> Volume | None:
     """Read a glob of slices or masks; None where the source is none."""
-    if not set(source) & set("*?[") or "\0" in source or os.path.exists(source):
+    if not is_glob(source):
         return None
     if MASKS.holds is not None and MASKS.holds(Path(source)):
         return MASKS.read(Path(source), options)
@@ -278,8 +279,6 @@ def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
             f"{source}: a {reader.name} file, which has no known time steps; leave out --time {options.time} (along a "
             "fourth axis of any kind --component N chooses)"
         )
-    if options.suv is not None and "suv" not in reader.takes:
-        raise UsageError(f"{source}: a {reader.name} file, no DICOM PET; leave out --suv {options.suv}")
     if options.array is not None and "array" not in reader.takes:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"

@@ -12,6 +12,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.segments import Segment
 
+DENSITY = "density"  # `Volume.preset`
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 FLAT = 1e-3  # volume of the parallelepiped of three unit axes, below which they lie in a plane
 ALIKE = 1e-3  # of a voxel, by which places on one grid may differ
@@ -69,9 +70,9 @@ class Volume:
         hounsfield: whether the file says that data values are Hounsfield units.
         modality: as DICOM abbreviates it, "CT" or "MR"; "" unknown.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
-        density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
         quantity: what the values are, as the file calls them ("temperature"); "" unknown.
-        preset: name of the function that shows such values (smoke, fire); "" unknown.
+        preset: name of the function that shows such values (smoke, fire), or `DENSITY` of a map (MRC, CCP4, cube,
+            OpenDX), which is shown by standard deviations; "" unknown.
         value_unit: unit of the values; "" unknown.
         time: time that the values are of, and its unit, which may be ""; None unknown.
         unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
@@ -91,7 +92,6 @@ class Volume:
     space: str | None = None
     hounsfield: bool = False
     reference: str | None = None
-    density: bool = False
     unit: str = ""
     modality: str = ""
     quantity: str = ""

@@ -8,7 +8,7 @@ from vvgt_cli.volume.readers import Reader, lazy
 
 _EXPLICIT = re.compile(rb"(?:[\2\x08]\0[\0-\x18]\0|\0[\2\x08]\0[\0-\x18])(?:UL|OB|UI|CS|SH|DA|TM|LO)")
 _IMPLICIT = re.compile(rb"\x08\0[\0-\x18]\0([\0-\x7f])\0\0\0")
-_TAKES = ("array", "time", "dims", "suv")
+_TAKES = ("array", "time", "dims")
 
 
 def is_dicom(head: bytes) -> bool:

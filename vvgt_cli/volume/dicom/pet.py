@@ -13,14 +13,13 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.errors import DataError
 
 SUV = "SUVbw"
-TAGS = [  # of headers; the private ones are Philips' (SUV, activity) and GE's (start of the scan)
+PHILIPS = (0x7053, 0x1000)  # SUV per value, and who says so
+TAGS = [
     *("Units", "SUVType", "CorrectedImage", "DecayCorrection", "PatientWeight", "SeriesDate", "SeriesTime"),
-    *("RadiopharmaceuticalInformationSequence", "AcquisitionDate", "ActualFrameDuration"),
-    *((0x7053, 0x0010), (0x7053, 0x1000), (0x7053, 0x1009), (0x0009, 0x0010), (0x0009, 0x100D)),
+    *("RadiopharmaceuticalInformationSequence", "AcquisitionDate", "ActualFrameDuration", (0x7053, 0x0010), PHILIPS),
 ]
 _UNITS = {"BQML": "Bq/ml", "GML": "g/ml", "CNTS": "counts"}
 _LEAST = 1e5  # Bq: less is a dose in another unit
@@ -31,12 +30,10 @@ def in_suv(slices: list[Any], headers: list[Any], wanted: str | None, path: Path
     """Return slices whose ``scaling`` gives SUV by body weight, and the unit of their values.
 
     ``headers`` are of the whole series. Values stay as stored if ``wanted`` is ``none``, and, with a message, if a
-    header lacks something; raise DataError for that if it is ``bw``, and UsageError for either without PET.
+    header lacks something; raise DataError for that if it is ``bw``.
     """
     first = slices[0].header
     if first.get("Modality") != "PT":
-        if wanted is not None:
-            raise UsageError(f"{path}: no PET, but {printable(str(first.get('Modality')))}; leave out --suv {wanted}")
         return slices, ""
     unit = _UNITS.get(first.get("Units"), "")
     if wanted == "none" or (wanted is None and first.get("Units") and not unit):
@@ -55,37 +52,34 @@ def in_suv(slices: list[Any], headers: list[Any], wanted: str | None, path: Path
 
 def _factor(header: Any, earliest: Any) -> float:
     """Return SUV per value; raise ValueError that names what a header, or the ``earliest`` of its series, lacks."""
-    units, scale = header.get("Units"), 1.0
+    units = header.get("Units")
     if units == "GML" and header.get("SUVType") in (None, "", "BW"):
         return 1.0
-    if units == "CNTS" and (factor := _number(header.get((0x7053, 0x1000)))):
+    if units == "CNTS" and (factor := _number(header.get(PHILIPS))):
         return factor
-    if units == "CNTS" and not (scale := _number(header.get((0x7053, 0x1009)))):
-        raise ValueError("Philips' factor (7053,1000)")
     injected = (header.get("RadiopharmaceuticalInformationSequence") or [{}])[0]
     weight = _number(header.get("PatientWeight"))
     dose, half = (_number(injected.get(f"Radionuclide{key}")) for key in ("TotalDose", "HalfLife"))
     start, corrected = header.get("DecayCorrection"), header.get("CorrectedImage")
     stated = {
-        "Units BQML, CNTS or GML by body weight": units in ("BQML", "CNTS"), "PatientWeight": weight > 0,
-        "RadionuclideTotalDose in Bq": dose >= _LEAST, "DecayCorrection START or ADMIN": start in ("START", "ADMIN"),
+        "Units BQML, GML by body weight or CNTS with Philips' factor (7053,1000)": units == "BQML",
+        "PatientWeight": weight > 0, "RadionuclideTotalDose in Bq": dose >= _LEAST,
+        "DecayCorrection START or ADMIN": start in ("START", "ADMIN"),
         "RadionuclideHalfLife": half > 0 or start == "ADMIN",
         "ATTN and DECY in CorrectedImage": not corrected or {"ATTN", "DECY"} <= {*corrected},
     }  # fmt: skip
     if lacking := [key for key, there in stated.items() if not there]:
         raise ValueError(", ".join(lacking))
     decayed = 0.0 if start == "ADMIN" else _decay(injected, half, earliest) / half
-    return float(scale * 1000 * weight / (dose * 2.0**-decayed))
+    return float(1000 * weight / (dose * 2.0**-decayed))
 
 
 def _decay(injected: Any, half: float, first: Any) -> float:
     """Return the seconds from injection to the start of the scan, to which images are corrected; raise ValueError."""
     acquired, scan = _acquired(first), _time(first.get("SeriesDate"), first.get("SeriesTime"))
     if scan is None or (acquired is not None and scan > acquired):  # of a series that was made later
-        private = first.get((0x0009, 0x100D))
-        scan = _time(getattr(private, "value", private) or "", "")
-        at, frame = (_number(first.get(key)) / 1000 for key in ("FrameReferenceTime", "ActualFrameDuration"))
-        if scan is None and acquired is not None and at > 0 and frame > 0:
+        scan, at, frame = None, *(_number(first.get(f)) / 1000 for f in ("FrameReferenceTime", "ActualFrameDuration"))
+        if acquired is not None and at > 0 and frame > 0:
             share = frame * math.log(2) / half
             scan = acquired + timedelta(seconds=half / math.log(2) * math.log(share / -math.expm1(-share)) - at)
     given = _time(injected.get("RadiopharmaceuticalStartDateTime"), "")

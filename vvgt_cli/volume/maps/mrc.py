@@ -23,7 +23,7 @@ from vvgt_cli.volume.medical.pairs import read_pair
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import FLAT, Volume
+from vvgt_cli.volume.types import DENSITY, FLAT, Volume
 
 _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 _OTHERS = {3: "complex integers", 4: "complex numbers", 101: "4-bit integers"}
@@ -147,4 +147,4 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
     if options.component is not None:
         block = select_component(block[..., None], options.component, str(path), label="a map")[0]
     steps = [header.steps[a] for a in header.axes]
-    return placed(block, steps, header.origin, options, volume_name(path), density=True, unit="angstrom")
+    return placed(block, steps, header.origin, options, volume_name(path), preset=DENSITY, unit="angstrom")

@@ -23,7 +23,7 @@ from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import DENSITY, Volume
 
 BOHR = 0.529177210903  # angstroms (CODATA 2018)
 LINE, LINES = 4096, 100_000  # bytes of a line of a header, and lines
@@ -89,7 +89,7 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
     field, _ = select_component(block, options.component, str(path), label=label)
     unit = 1.0 if min(sizes) < 0 else BOHR
     return placed(
-        field, unit * np.array(steps[::-1]), unit * np.array(origin), options, volume_name(path), density=True
+        field, unit * np.array(steps[::-1]), unit * np.array(origin), options, volume_name(path), preset=DENSITY
     )
 
 
@@ -134,7 +134,7 @@ def read_dx(path: Path, options: ReadOptions) -> Volume:
         )
     block = _dx_values(keys, counts, path, start)
     field, _ = select_component(block, options.component, str(path))
-    return placed(field, steps[::-1], origin, options, volume_name(path), density=True)
+    return placed(field, steps[::-1], origin, options, volume_name(path), preset=DENSITY)
 
 
 def _dx_values(keys: list[str], counts: list[int], path: Path, start: int) -> np.ndarray:
@@ -191,7 +191,7 @@ def read_vasp(path: Path, options: ReadOptions) -> Volume:
         slope = 1.0
     elif not any(word in name for word in ("CHG", "AECCAR")):
         warnings.warn(f"{path}: taken as a density times the cell's volume, as CHGCAR, not as LOCPOT", stacklevel=2)
-    steps, facts = cell / np.reshape(sizes, (3, 1)), {"density": True, "unit": "angstrom", "slope": slope}
+    steps, facts = cell / np.reshape(sizes, (3, 1)), {"preset": DENSITY, "unit": "angstrom", "slope": slope}
     return placed(field, steps, np.zeros(3), options, volume_name(path), **facts)
 
 

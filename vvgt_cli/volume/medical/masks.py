@@ -5,13 +5,11 @@ Files of a glob that differ in numbers alone (frame_1, frame_2) are the frames o
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import READERS, volume_name
+from vvgt_cli.volume.readers import READERS, is_glob, volume_name
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.segments import Segment
 from vvgt_cli.volume.stored import planes
@@ -29,7 +27,6 @@ from vvgt_cli.volume.tiff.pages import check_pages
 from vvgt_cli.volume.tiff.slices import by_number, matching
 from vvgt_cli.volume.types import Volume
 
-MOST = 65535  # files, as numbers of uint16
 VALUES = (".img", ".img.gz", ".brik", ".brik.gz")  # of a header that is beside them
 
 
@@ -45,22 +42,25 @@ def hold_volumes(files: Sequence[Path]) -> bool:
 
 def mask_files(source: str | Path) -> list[Path]:
     """Return the files of a folder or a glob that is a set of masks, sorted by name; an empty list for any other."""
-    source, folder = str(source), os.path.isdir(source)
-    if not folder and (not set(source) & set("*?[") or os.path.exists(source)):
+    folder = Path(source).is_dir()
+    if not folder and not is_glob(str(source)):
         return []
     kinds = [reader for reader in READERS if reader.holds is None and not (reader.nameable or reader.resamples)]
     suffixes = tuple(suffix for reader in kinds for suffix in reader.suffixes if suffix not in (*PICTURES, *VALUES))
-    there = [p for p in islice(Path(source).iterdir(), MOST) if p.is_file()] if folder else matching(source)
-    files = sorted((p for p in there if p.name.lower().endswith(suffixes) and p.name[0] != "."), key=by_number)
+    there = Path(source).iterdir() if folder else matching(str(source))
+    named = (p for p in there if p.name.lower().endswith(suffixes) and p.name[0] != "." and p.is_file())
+    files = sorted(named, key=by_number)
     numbered = not folder and len({re.sub(r"\d+", "", path.name) for path in files}) == 1
     if len(files) < 2 or numbered or not hold_volumes(files):
         return []
-    ends = [next((kind for path in some if (kind := _kind(path))), 0) for some in (files, files[::-1])]
+    dated = [(path, path.stat().st_mtime_ns) for path in files]
+    ends = [next((kind for one in some if (kind := _kind(*one))), 0) for some in (dated, dated[::-1])]
     return files if max(ends) >= 0 else []
 
 
-def _kind(path: Path) -> int:
-    """Return 1 if a file holds a mask, 0 if an empty one, and -1 if anything else."""
+@lru_cache(maxsize=1024)
+def _kind(path: Path, date: int) -> int:
+    """Return 1 if a file of this date holds a mask, 0 if an empty one, and -1 if anything else."""
     try:
         return int(_inside(path, ReadOptions())[1].any())
     except (VvgtError, OSError, ValueError):  # reported when it is read
@@ -92,7 +92,7 @@ def read_masks(source: Path, options: ReadOptions) -> Volume:
         DataError: a file that is damaged, no mask, or on another grid than the first; all are empty.
         UsageError: options that a file does not take.
     """
-    files = mask_files(source)[:MOST]
+    files = mask_files(source)
     dates = tuple(path.stat().st_mtime_ns for path in files)
     return _formed(source, tuple(files), dates, replace(options, crop=None, mask=None, keep_largest=None))
 

@@ -173,7 +173,7 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     head, encoding = read_head(path, HEADER)
     header = parse_header(head, str(path))
     volume = _volume(header, path, encoding, options)
-    if header.offset <= HEADER + 4 or not header.single:
+    if not header.single:
         return volume
     text = read_head(path, min(header.offset, MAX_HEADER))[0]
     if not (table := re.search(rb"<LabelTable\b.*?</LabelTable>", text, re.DOTALL)):

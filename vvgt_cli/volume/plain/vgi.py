@@ -1,20 +1,19 @@
-"""VGStudio's ``.vgi`` beside the raw files that it describes, which are memory-mapped.
+"""VGStudio's ``.vgi`` beside the raw file that it describes, which is memory-mapped.
 
-A block ``{volume1}`` has its files in sections ``[file1]``, ``[file2]``, ...; a section ``[geometry]`` of another block
-says how large voxels are. Fields as open_iA and DREAM3D read them; the place in VGStudio's scene is not read.
+A block ``{volume1}`` has its file in a section ``[file1]``; a section ``[geometry]`` of another block says how large
+voxels are. Fields as open_iA and DREAM3D read them; the place in VGStudio's scene is not read.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from itertools import count, takewhile
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, data_file, load_block
+from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.headers import HeaderFields, fields_of_sections
 from vvgt_cli.volume.options import ReadOptions
@@ -27,25 +26,20 @@ _BYTES = {"f": (4, 8), "u": (1, 2, 4, 8), "i": (1, 2, 4, 8)}
 
 
 def read_vgi(path: Path, options: ReadOptions) -> Volume:
-    """Read a volume that a VGStudio header describes; several files lie one above the other along z.
+    """Read a volume that a VGStudio header describes.
 
     Raises:
-        DataError: fields that are missing, or do not fit each other or the files.
+        DataError: fields that are missing, or do not fit each other or the file; a volume of several files.
         UsageError: several volumes and no ``array`` chosen (`SeveralArrays`), or none such.
     """
     fields = fields_of_sections(path)
     names = [key.partition("/")[0] for key in fields if key.endswith("/file1/name")]
     name = names[choose(names, names, options.array, str(path), "volume")]
-    starts = [f"{name}/file{k}/" for k in takewhile(lambda k: f"{name}/file{k}/name" in fields, count(1))]
-    parts = [_mapped(path, fields, start) for start in starts]
-    shapes = [part.shape for part in parts]
-    stated = fields.sizes("size", fields.get(f"{name}/representation/size", fields[f"{starts[0]}size"]))
-    whole = [*shapes[0][:0:-1], sum(shape[0] for shape in shapes)]
-    if whole != stated or len({(part.shape[1:], part.dtype) for part in parts}) > 1:
-        raise DataError(f"{path}: {name} of {stated} voxels, files of {[s[::-1] for s in shapes]}; expected all of it")
-    if len(parts) > 1:
-        check_memory(sum(part.nbytes for part in parts), str(path))
-    values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    values = _mapped(path, fields, f"{name}/file1/")
+    there = [*values.shape[::-1]]
+    stated = fields.sizes("size", fields.get(f"{name}/representation/size", fields[f"{name}/file1/size"]))
+    if there != stated or f"{name}/file2/name" in fields:
+        raise DataError(f"{path}: {name} of {stated} voxels, its first file of {there}; expected all of it in one file")
     places = [key.removesuffix("geometry/resolution") for key in fields if key.endswith("/geometry/resolution")]
     place = next((p for p in places if fields.get(f"{p}volume/volume") == name), *places[:1] or [""]) + "geometry/"
     _, unit = one_unit([fields.get(f"{place}unit", "")], str(path), options.spacing is not None)

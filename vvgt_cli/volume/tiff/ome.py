@@ -18,10 +18,11 @@ from xml.etree import ElementTree
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.components import listed
+from vvgt_cli.volume.microscopy.image import MAX_XML, safe_xml
 from vvgt_cli.volume.tiff import TIFF
 from vvgt_cli.volume.tiff.pages import MAX_PAGES, check_pages
 
-_MOST_FILES, _MOST_BYTES = 10_000, 64 << 20
+_MOST_FILES = 10_000
 _UUID = re.compile(r"""<(?:\w+:)?OME\b[^>]*?\bUUID=["']([^"']+)""")
 
 
@@ -53,12 +54,7 @@ def open_tiff(path: Path) -> Any:
 
 def _parsed(xml: str, path: Path) -> ElementTree.Element:
     """Parse OME-XML and check its elements."""
-    if "<!DOCTYPE" in xml or "<!ENTITY" in xml:
-        raise DataError(f"{path}: OME-XML that declares entities; expected plain OME-XML")
-    try:
-        root = ElementTree.fromstring(xml)
-    except ElementTree.ParseError as error:
-        raise DataError(f"{path}: damaged OME-XML ({error}); check that the file is whole") from error
+    root = safe_xml(xml, str(path))
     for element in root.iter():
         _check_element(element, path)
     return root
@@ -76,7 +72,7 @@ def _description(path: Path) -> str:
     import tifffile
 
     if not path.name.lower().endswith(TIFF):
-        return path.read_bytes()[:_MOST_BYTES].decode("utf-8-sig", "replace")
+        return path.read_bytes()[:MAX_XML].decode("utf-8-sig", "replace")
     check_pages(path)
     with tifffile.TiffFile(path) as file:
         return str(file.ome_metadata or "")
