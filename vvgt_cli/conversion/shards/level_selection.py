@@ -140,7 +140,7 @@ class ErrorRegions:
 
     def __call__(self, number: int) -> None:
         """Save the errors of the nodes of region ``number``."""
-        thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
+        thresholds = np.broadcast_to(self.values, (len(self.cut.pyramid), CUTS))
         nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
         found = errors_of([node.levels for node in nodes], self.cut.plan.ply.rule or INRIA)
         faint = sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)
@@ -161,7 +161,7 @@ def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]
     Raises:
         DataError: a block is damaged.
     """
-    tree, store = cut.tiled_tree, cut.store
+    tree, store = cut.pyramid, cut.store
     finest = tree.threshold(budget)
     second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
