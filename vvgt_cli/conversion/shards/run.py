@@ -20,9 +20,9 @@ from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import most_steps, steps_in_time
-from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
+from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest, Limits
 from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes
-from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
+from vvgt_cli.conversion.shards.regions import Refiner, StoredGaussians, make_regions
 from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
@@ -44,7 +44,7 @@ from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
-from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
+from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import DRAW, INIT, OPTIMIZE, RENDER, for_blocks, for_degree
 from vvgt_cli.progress import Console
@@ -153,8 +153,7 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     if not steps:
         return None
     run.compile(for_degree(OPTIMIZE, degree))
-    descent = PartDescent(steps, fit.size, rule_of(fit.rule), fit.seed, limits.target_psnr)
-    return Refiner(field.reader, field.light, descent)
+    return Refiner(field.reader, field.light, replace(fit, steps=steps), Limits(limits.target_psnr))
 
 
 def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:

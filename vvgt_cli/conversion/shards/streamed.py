@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.conversion.shards.level_selection import measure_cuts
-from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions
+from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions, measure_cuts
 from vvgt_cli.conversion.stages.closed_form import TOO_FAINT, thin
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
