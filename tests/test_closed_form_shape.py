@@ -9,9 +9,9 @@ import pytest
 from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.closed_form.cell_kernels import principal_axes
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.moments import base_cells
-from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.shape import ROUND, make_gaussians, quaternions, widened
 from vvgt_cli.closed_form.surface_offset import flattened, opaque_field, surface_offset
 from vvgt_cli.closed_form.wavelet import box_surrogate

@@ -92,7 +92,7 @@ def cache(tmp_path, monkeypatch):
 
 def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache):
     """Two kernels of loops over threads and one without are compiled by the first run."""
-    names = ("splat.kernel.count_pairs", "splat.kernel.sum_pairs", "closed_form.pyramid.take_base")
+    names = ("splat.kernel.count_pairs", "splat.kernel.sum_pairs", "closed_form.cell_kernels.take_base")
     some = tuple(f"vvgt_cli.{name}-" for name in names)
     for name in kernels(cache):
         if name.startswith(some):

@@ -11,7 +11,8 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.shards.regions import PartDescent, RegionNodes, VolumePart
+from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.shards.regions import Refiner, RegionNodes, VolumePart, refine_part
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
@@ -20,7 +21,6 @@ from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import read_splats
-from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
@@ -131,12 +131,12 @@ def test_descent_on_a_part_weighs_both_kinds_of_views(volume: Path, monkeypatch:
     monkeypatch.setattr(VolumePart, "weights", lambda self, camera, width: np.full((camera.height,) * 2, 0.25, "f4"))
     seen = dict[str, object]()
 
-    def spied(*args: object, check: tuple, weights: list) -> tuple:
+    def spied(*args: object, check: tuple, weights: list, **_: object) -> tuple:
         seen.update(train=weights, check=check[3])
-        return args[0], OptimizeRecord()
+        return args[0], OptimizeRecord(psnr_before=1.0)
 
-    monkeypatch.setattr("vvgt_cli.refine.optimize", spied)
-    PartDescent(4, 150, RULES["inria"])(part, part.moved_out(ball()))
+    monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.optimize", spied)
+    refine_part(part, part.moved_out(ball()), Refiner(None, None, FitOptions(size=150, steps=4), Limits()))
     assert all((weight == 0.25).all() for weight in seen[way])
 
 
@@ -224,9 +224,10 @@ def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, 
     call, seen = RegionNodes.__call__, list[int]()
 
     def stopped(task: RegionNodes, number: int) -> None:
-        seen.append(number)
-        if len(seen) == 2:
-            raise KeyboardInterrupt
+        if task.refiner is not None:
+            seen.append(number)
+            if len(seen) == 2:
+                raise KeyboardInterrupt
         call(task, number)
 
     monkeypatch.setattr(RegionNodes, "__call__", stopped)

@@ -70,6 +70,14 @@ def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, raw, tmp_path, *fit))
 
 
+def test_surfaces_of_labels_lie_where_they_do_in_memory(vvgt, tmp_path):
+    z, y, x = np.indices((44, 36, 40))
+    r = np.sqrt((x - 19.5) ** 2 + (y - 17.5) ** 2 + (z - 21.5) ** 2)
+    np.save(tmp_path / "v.npy", ((r < 14) + (r < 8)).astype(np.uint8))
+    fit = ("--labels", "auto", "--light", "none", "--max-gaussians", "2000", "--size", "200", "-q")
+    assert same_gaussians(*in_memory_and_in_blocks(vvgt, tmp_path / "v.npy", tmp_path, *fit))
+
+
 def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
     both = []

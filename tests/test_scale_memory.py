@@ -186,19 +186,19 @@ def test_of_a_mapped_file_no_more_than_a_little_is_held(tmp_path, monkeypatch, t
 
 
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):
-    from vvgt_cli.field import tiled_tree
+    from vvgt_cli.closed_form import pyramid
 
     values, made = np.round(bodies((128, 90, 120)) * 255).astype(np.uint8), []
     path = tmp_path / "v_128x90x120_uint8.raw"
     path.write_bytes(values.tobytes())
 
-    def watched(*args, build=tiled_tree.build_tree):
+    def watched(*args, build=pyramid.build_tree):
         assert sum(one() is not None for one in made) <= 1  # the one before
         tree = build(*args)
         made.append(weakref.ref(tree.moments))
         return tree
 
-    monkeypatch.setattr(tiled_tree, "build_tree", watched)
+    monkeypatch.setattr(pyramid, "build_tree", watched)
     vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
     assert len(made) > 6
 

@@ -223,7 +223,9 @@ def test_levels_are_not_refined_on_a_gpu(volume: Path, tmp_path: Path) -> None:
 def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
     monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 2500)
-    monkeypatch.setattr("vvgt_cli.conversion.shards.run.most_cells", lambda budget: 256 * budget)  # for many nodes
+    monkeypatch.setattr(
+        "vvgt_cli.closed_form.closed_form.most_cells", lambda budget, **_: 256 * budget
+    )  # for many nodes
     whole, out = tmp_path / "whole", tmp_path / "out"
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
     vvgt.ok(*line, whole / "lod-meta.json")

@@ -76,14 +76,13 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, tmp_path: Path) -> None:
     assert files[0] == files[1]
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == before
     run_pass = Pass(InProcess(), BlockStore(tmp_path / "parts"), lambda _: None)
-    tiled_tree = cut_of(Run(Console(quiet=True), ConversionReport("merge")), run_pass).tiled_tree
-    top, root = tiled_tree.top, tiled_tree.leaves_over_tiles(np.finfo(float).max)
-    assert top is not None
+    pyramid = cut_of(Run(Console(quiet=True), ConversionReport("merge")), run_pass).pyramid
+    top, root = pyramid.top, pyramid.leaves_over_tiles(np.finfo(float).max)
     assert root is not None
     first, last = base_rows(top, np.array([len(top) - 1]))
-    count = len(tiled_tree.tiles)
+    count = len(pyramid)
     assert (first[0], last[0]) == (0, count)
-    tiles = [cuts[0].moments[0] for cuts in tiled_tree.cuts(0, count, np.full((count, 1), np.finfo(float).max))]
+    tiles = [cuts[0].moments[0] for cuts in pyramid.cuts(0, count, np.full((count, 1), np.finfo(float).max))]
     seen = np.array([row[SEEN] for row in tiles])
     np.testing.assert_allclose(root.moments[0, : MASS + 1], np.sum([row[: MASS + 1] for row in tiles], axis=0))
     np.testing.assert_allclose(

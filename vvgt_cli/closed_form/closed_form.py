@@ -10,26 +10,24 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
-from vvgt_cli.closed_form.lit import Shading, centroids
+from vvgt_cli.closed_form.lit import Shading
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
+from vvgt_cli.closed_form.pyramid import Pyramid, Tile
 from vvgt_cli.closed_form.samples import visible_voxels
-from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
-from vvgt_cli.closed_form.sharpen import sharpened
-from vvgt_cli.closed_form.surface_offset import Opaque, opaque_field
+from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle
+from vvgt_cli.closed_form.surface_offset import opaque_field
 from vvgt_cli.closed_form.tree import (
     Leaves,
+    Scores,
     Tree,
-    build_tree,
     leaves_of,
     select,
-    shown,
     split,
     split_score,
     value_score,
 )
-from vvgt_cli.closed_form.visibility import Visibility, visibility
+from vvgt_cli.closed_form.visibility import visibility
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
@@ -38,6 +36,7 @@ from vvgt_cli.splat import render
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
 CELLS_A_GAUSSIAN, FEW_CELLS = 40, 500_000  # at most: more gain less than steps do in their time
+LEAST_CELLS = 8  # a Gaussian, of cells on disk
 OF_VALUES = 20  # cells a Gaussian that stands for any function, which is seldom small (5: -1 dB)
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
@@ -54,59 +53,51 @@ TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when co
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True)
-class ClosedForm:
-    """A volume's pyramid, ready to be cut for any budget.
+@dataclass(frozen=True, kw_only=True)
+class ClosedForm(Pyramid):
+    """A pyramid of one tile in memory, ready to be cut for any budget.
 
     Attributes:
-        seen: what the cameras see of it.
-        tree: moments of every cell that some view sees.
-        opaque: where bodies are opaque.
-        half, step: (3,) half extents and voxel edges, unit frame.
-        pixel: a pixel's width at the centre, unit frame.
+        whole: the tile.
         budget: most Gaussians.
-        labels: it is one of labels alone.
-        shading: of its light, None where nothing is lit; ``normals`` (n, 3) at the centroids of the tree's base cells.
-        degree: of the harmonics that colours have under a light that depends on the view.
         scene: what base cells are split from; None: they are not split, as only blocks of the volume are in memory.
     """
 
-    seen: Visibility
-    tree: Tree
-    opaque: Opaque
-    half: np.ndarray
-    step: np.ndarray
-    pixel: float
+    whole: Tile
     budget: int
-    labels: bool = False
-    shading: Shading | None = None
-    normals: np.ndarray | None = None
-    degree: int = 0
     scene: Scene | None = None
+
+    @property
+    def tree(self) -> Tree:
+        """Moments of every cell that some view sees."""
+        return self.whole.tree
+
+    def roots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Implement `Pyramid.roots`."""
+        place = np.zeros((min(len(self.tree), 1), 3), np.int32)
+        return place, self.tree.edges[-1], self.tree.moments[-1:], self.tree.largest[-1:]
+
+    def tile(self, row: int) -> Tile:
+        """Implement `Pyramid.tile`."""
+        return self.whole
+
+    def scores_of(self, row: int) -> Scores:
+        """Implement `Pyramid.scores_of`."""
+        return Scores.of(self.tree, split_score(self.tree))
 
     def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
         """Return Gaussians of the cells that the moments alone choose."""
-        return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget)), style)
+        cuts = self.cuts(0, len(self), np.array([[self.threshold(self.budget)]]), least=False)
+        nothing = self.shaded(leaves_of(self.tree, np.empty(0, np.int64)), self.whole)
+        return super().gaussians_of(next(cuts, [nothing])[0], style)
 
     def cells_of_values(self) -> Leaves:
         """Return cells for any function: those of `tree.value_score`."""
         return leaves_of(self.tree, select(self.tree, self.budget, value_score(self.tree, self.labels)))
 
     def gaussians_of(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
-        """Return the Gaussians of cells."""
-        return self._sharpened(leaves, self._cells(leaves, style))
-
-    def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
-        found = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
-        if self.shading is None or self.normals is None:
-            return found
-        return self.shading.lit(found, self.tree, leaves, self.degree, self.normals)
-
-    def _sharpened(self, leaves: Leaves, found: Gaussians) -> Gaussians:
-        """Apply `sharpened`, but not to labels: each is of one colour, and may be written to a file of its own."""
-        if self.labels:
-            return found
-        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.half)
+        """Return the Gaussians of cells, one each."""
+        return super().gaussians_of(self.shaded(leaves, self.whole), style)
 
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """Return `gaussians` of cells chosen by the errors of ``drawn`` that views (n, h, w, 4) show, by ``rule``.
@@ -121,10 +112,10 @@ class ClosedForm:
         if seen > 1 - FEW:
             return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
         wanted = round(self.budget * min(seen**-SMALLER, 2.0))
-        leaves = leaves_of(self.tree, select(self.tree, wanted, score))
-        found = self._cells(leaves, ROUND)
+        leaves = self.shaded(leaves_of(self.tree, select(self.tree, wanted, score)), self.whole)
+        found = self.blurred(leaves)
         shown = np.flatnonzero(~unseen(blending_weights(found, cameras, rule), self.budget))
-        return self._sharpened(leaves.take(shown), found.take(shown))
+        return self.sharpened(leaves.take(shown), found.take(shown))
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Return Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
@@ -201,15 +192,11 @@ def form_of(
         seen = seen.at_least(INSIDE)
     opaque = opaque_field(cells, step, half, labels)
     report(0.6)
-    normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]
-    tree = build_tree(cells, seen, step)
-    if shading is not None and normals is None:
-        base = int((tree.children == 0).sum())
-        normals = shading.normals(centroids(tree.moments[:base]))
+    whole = Tile.of(cells, seen, step, shading=shading)
     report(1)
     return ClosedForm(
-        seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
-    )  # fmt: skip
+        seen, opaque, half, step, pixel_width(size), labels, shading, degree, whole=whole, budget=budget, scene=scene
+    )
 
 
 def base_level(scene: Scene, size: int, budget: int, values: bool = False) -> int:
@@ -219,9 +206,10 @@ def base_level(scene: Scene, size: int, budget: int, values: bool = False) -> in
     )
 
 
-def most_cells(budget: int, values: bool = False) -> int:
-    """Return how many base cells a budget needs and memory holds; ``values``: as of `closed_form`."""
-    return min(MAX_BASE_CELLS, max((OF_VALUES if values else CELLS_A_GAUSSIAN) * budget, FEW_CELLS))
+def most_cells(budget: int, values: bool = False, on_disk: bool = False) -> int:
+    """Return how many base cells a budget needs and memory, or a disk, holds; ``values``: as of `closed_form`."""
+    wanted = min(MAX_BASE_CELLS, max((OF_VALUES if values else CELLS_A_GAUSSIAN) * budget, FEW_CELLS))
+    return max(wanted, LEAST_CELLS * budget) if on_disk else wanted
 
 
 def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> int:

@@ -111,13 +111,14 @@ class Shading:
     Attributes:
         light: as kernels take it.
         half, step: (3,) of the volume, as `Scene` has them.
-        normals: unit normals (n, 3) at points (n, 3) of the box frame, zeros where there is no gradient.
+        normals: unit normals (n, 3) at points (n, 3) of the box frame, zeros where there is no gradient; by default
+            there are only those of base cells.
     """
 
     light: Light
     half: np.ndarray
     step: np.ndarray
-    normals: Callable[[np.ndarray], np.ndarray]
+    normals: Callable[[np.ndarray], np.ndarray] = np.zeros_like
 
     @classmethod
     def of(cls, scene: Scene) -> Shading | None:
@@ -126,18 +127,18 @@ class Shading:
             return None
         return cls(scene.light, scene.half, scene.step, lambda points: at_points(scene, points)[:, :3])
 
-    def lit(self, gaussians: Gaussians, tree: Tree, leaves: Leaves, degree: int, base: np.ndarray) -> Gaussians:
-        """Return Gaussians of ``leaves`` with the colours of their cells, harmonics up to ``degree``.
+    def lit(self, tree: Tree, leaves: Leaves, base: np.ndarray) -> np.ndarray:
+        """Return the means (k, 16 + lights) of `sums` over the base cells of ``leaves``.
 
         ``base`` (n, 3): normals at the centroids of the tree's base cells.
         """
         inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
-        sums = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
-        sums[inside] = self.sums(tree.moments, base, *base_rows(tree, leaves.node[inside]))
+        means = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
+        means[inside] = self.sums(tree.moments, base, *base_rows(tree, leaves.node[inside]))
         below = leaves.moments[~inside]
         if len(below):
-            sums[~inside] = self.sums(below, self.normals(centroids(below)))
-        return colored(gaussians, self.light, sums, degree)
+            means[~inside] = self.sums(below, self.normals(centroids(below)))
+        return means
 
     def alone(self, gaussians: Gaussians, degree: int) -> Gaussians:
         """Return Gaussians with their own colours under the light, as it is at their centres."""
@@ -151,18 +152,11 @@ class Shading:
         """Return `_shade` of each row, or of rows ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
         if first is None or last is None:
             first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
-        return shaded(self.light, self.half, self.step, rows, normals, first, last)
-
-
-def shaded(
-    light: Light, half: np.ndarray, step: np.ndarray, rows: np.ndarray, normals: np.ndarray, first: np.ndarray,
-    last: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Return `_shade` from rows ``first`` (k,) to ``last``, over the weight: means (k, 16 + lights)."""
-    out = np.empty((len(first), ARRIVING + len(light.directions)))
-    _shade(light, np.ascontiguousarray(normals), np.ascontiguousarray(rows), first, last, half, step, out)
-    out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
-    return out
+        out = np.empty((len(first), ARRIVING + len(self.light.directions)))
+        normals, rows = np.ascontiguousarray(normals), np.ascontiguousarray(rows)
+        _shade(self.light, normals, rows, first, last, self.half, self.step, out)
+        out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
+        return out
 
 
 def centroids(moments: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vvgt_cli.closed_form.cell_kernels import morton_codes
 from vvgt_cli.closed_form.columns import MASS, MOMENTS
-from vvgt_cli.closed_form.pyramid import morton_codes
 from vvgt_cli.closed_form.quadrature import block_moments, compact
 from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
@@ -139,7 +139,12 @@ def region_cells(
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    return in_order(np.concatenate(index), [moments])
+    whole = np.concatenate(index)
+    codes = morton(whole)
+    if (codes[1:] > codes[:-1]).all():
+        return whole, moments
+    along = np.argsort(codes, kind="stable")
+    return whole[along], moments[along]
 
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
@@ -174,25 +179,6 @@ def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if cells.max() <= MAX_CELLS:
         cells[:] = cells.max()
     return np.round(cells * cell).astype(np.int64), cells
-
-
-def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices (n, 3) and the rows of ``parts`` in Morton order; parts are freed as they are copied."""
-    codes = morton(index)
-    order = None if (codes[1:] > codes[:-1]).all() else np.argsort(codes, kind="stable")
-    if order is None and len(parts) == 1:
-        return index, parts[0]
-    moments, done = np.empty((len(index), MOMENTS)), 0
-    place = np.empty_like(order) if order is not None else None
-    if order is not None and place is not None:
-        place[order] = np.arange(len(order))
-    parts.reverse()
-    while parts:
-        part = parts.pop()
-        here = slice(done, done + len(part))
-        moments[here if place is None else place[here]] = part
-        done += len(part)
-    return index if order is None else index[order], moments
 
 
 # offsets (x, y, z) of a cell's children, x fastest

@@ -1,157 +1,168 @@
-"""The kernels under `tree` and `shape`: order, look-up, sums of children, principal axes."""
+"""The pyramid: cells of every scale, tile by tile, the choice of cells for a budget, and their Gaussians.
+
+The cells of each tile form a tree that ends in the tile's own cell; these roots are the base of a top tree. A volume
+whose cells are in memory is one tile.
+"""
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, SQUARE, XX, YY, ZZ, X, Y, Z
-from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.threads import ThreadSlice, iterations
-
-SWEEPS = 8  # of Jacobi rotations: each squares the error, three are enough for most
-TINY = 1e-300  # of what is divided by
-CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
-
-
-@inlined()
-def _spread_bits(number: int) -> np.uint64:
-    """Return the 21 lowest bits of ``number`` with two zeros between them."""
-    v = np.uint64(number)
-    v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
-    v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
-    v = (v | (v << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
-    v = (v | (v << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
-    v = (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
-    return v  # noqa: RET504 - one expression would be of another type
-
-
-@parallel_kernel("i4:2 u8:1")
-def morton_codes(thread: ThreadSlice, index: np.ndarray, out: np.ndarray) -> None:
-    """Write Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
-    for n in iterations(thread, len(index)):
-        x, y, z = _spread_bits(index[n, 0]), _spread_bits(index[n, 1]), _spread_bits(index[n, 2])
-        out[n] = x | (y << np.uint64(1)) | (z << np.uint64(2))
+from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
+from vvgt_cli.closed_form.lit import Shading, centroids, colored
+from vvgt_cli.closed_form.moments import Cells
+from vvgt_cli.closed_form.shape import ROUND, SurfaceStyle, cell_gaussians
+from vvgt_cli.closed_form.sharpen import sharpened
+from vvgt_cli.closed_form.surface_offset import Opaque
+from vvgt_cli.closed_form.tree import (
+    Leaves,
+    Scores,
+    Tree,
+    build_tree,
+    leaves_of,
+    shown,
+    split_score,
+    threshold_for,
+    tree_over,
+)
+from vvgt_cli.closed_form.visibility import Visibility
+from vvgt_cli.gaussians import Gaussians
 
 
-@parallel_kernel("i4:2 f8:1 f4:3 f4:3 f4:2")
-def look_up(
-    thread: ThreadSlice, index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray
-) -> None:
-    """Write ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid, into ``out`` (n, 2).
+class Tile(NamedTuple):
+    """The tree of a tile, and the normals (n, 3) at the centroids of its base cells; None without light."""
 
-    ``index`` (n, 3) int32 cell indices; ``ratio`` (3,) a cell's edges in those of the grid's cells.
+    tree: Tree
+    normals: np.ndarray | None
+
+    @classmethod
+    def of(
+        cls, cells: Cells, seen: Visibility, step: np.ndarray, levels: int | None = None, shading: Shading | None = None
+    ) -> Tile:
+        """Build a tile of base cells; arguments as of `build_tree`. Cells without normals get those of ``shading``."""
+        normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]
+        tree = build_tree(cells, seen, step, levels)
+        if shading is not None and normals is None:
+            normals = shading.normals(centroids(tree.moments[: int((tree.children == 0).sum())]))
+        return cls(tree, normals)
+
+
+@dataclass(frozen=True)
+class Pyramid(ABC):
+    """The cells of a volume, with what their Gaussians need of all of it; subclasses keep the tiles.
+
+    Attributes:
+        seen: visibility of cells from the training views.
+        opaque: regions where bodies are opaque.
+        half, step: (3,) half extents and voxel edges, unit frame.
+        pixel: width of a pixel at the centre, unit frame.
+        labels: whether all layers are label maps.
+        shading: the light, None for none.
+        degree: degree of the harmonics of colours under a light that depends on the view.
     """
-    nz, ny, nx = mean.shape
-    for n in iterations(thread, len(index)):
-        i = min(max(math.floor((index[n, 0] + 0.5) * ratio[0]), 0), nx - 1)
-        j = min(max(math.floor((index[n, 1] + 0.5) * ratio[1]), 0), ny - 1)
-        k = min(max(math.floor((index[n, 2] + 0.5) * ratio[2]), 0), nz - 1)
-        out[n, 0], out[n, 1] = mean[k, j, i], largest[k, j, i]
 
+    seen: Visibility
+    opaque: Opaque
+    half: np.ndarray
+    step: np.ndarray
+    pixel: float
+    labels: bool = False
+    shading: Shading | None = None
+    degree: int = 0
 
-@parallel_kernel("f8:2 i8:1 f4:2 f8:2 f8:1")
-def take_base(
-    thread: ThreadSlice, moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray
-) -> None:
-    """Copy rows ``keep`` (n,) of ``moments`` (m, 13) into a pyramid's base ``out`` (n, 18), ``top`` (n,).
+    @abstractmethod
+    def roots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return own cells of the tiles that some view sees: places (n, 3), edge (3,), moments, largest of `Tree`."""
 
-    ``seen`` (m, 2): mean and largest transmittance.
-    """
-    for n in iterations(thread, len(keep)):
-        row, mean = moments[keep[n]], np.float64(seen[keep[n], 0])
-        top[n] = seen[keep[n], 1]
-        for column in range(MOMENTS):
-            out[n, column] = row[column]
-        out[n, SEEN] = row[MASS] * mean
-        square = 0.0
-        for band in range(3):
-            out[n, SEEN + 1 + band] = row[RED + band] * mean
-            square += row[RED + band] ** 2
-        out[n, SQUARE] = square * mean / max(row[MASS], TINY)
+    @abstractmethod
+    def tile(self, row: int) -> Tile:
+        """Return a tile."""
 
+    @abstractmethod
+    def scores_of(self, row: int) -> Scores:
+        """Return the scores of a tile's cells, as if it were alone."""
 
-@parallel_kernel("f8:2 f8:1 i8:1 f8:2 f8:1")
-def sum_children(
-    thread: ThreadSlice, rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray
-) -> None:
-    """Sum rows (n, 18) from one ``start`` (m,) to the next into ``out`` (m, 18), with the largest of ``top`` (n,)."""
-    for m in iterations(thread, len(start)):
-        stop = start[m + 1] if m + 1 < len(start) else len(rows)
-        for column in range(COLUMNS):
-            out[m, column] = rows[start[m], column]
-        out_top[m] = top[start[m]]
-        for n in range(start[m] + 1, stop):
-            for column in range(COLUMNS):
-                out[m, column] += rows[n, column]
-            out_top[m] = max(out_top[m], top[n])
+    @cached_property
+    def top(self) -> Tree:
+        """The tree over the tiles' own cells."""
+        places, edge, own, seen = self.roots()
 
+        def fill(moments: np.ndarray, largest: np.ndarray) -> None:
+            moments[:], largest[:] = own, seen
 
-@parallel_kernel("f8:2 f8:1 f8:1 f8 f8:1", error_model="numpy")
-def score_splits(
-    thread: ThreadSlice, moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray
-) -> None:
-    """Write `tree.split_score` of rows of ``moments`` (n, 18), ``top`` (n,), edges ``edge`` (3,), into ``out`` (n,).
+        return tree_over(places, edge, fill)
 
-    ``plain``: variance added to that of the colours; infinite: colours do not count.
-    """
-    area = (edge[0] * edge[1] * edge[2]) ** (2.0 / 3.0)
-    for n in iterations(thread, len(out)):
-        row, mass = moments[n], moments[n, MASS]
-        x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
-        variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
-        seen, share = row[SEEN], 1.0
-        if plain < math.inf:
-            shade = row[SQUARE]
-            for band in range(1, 4):
-                shade -= row[SEEN + band] ** 2 / max(seen, TINY)
-            share = max(shade, 0.0) / max(seen, TINY) + plain
-        out[n] = -math.expm1(-mass / area) * area * math.sqrt(top[n] * seen / mass) * variance * share
+    @cached_property
+    def _top_scores(self) -> Scores:
+        return Scores.of(self.top, split_score(self.top))
 
+    def __len__(self) -> int:
+        """Return the number of tiles."""
+        return int((self.top.children == 0).sum())
 
-@inlined(error_model="numpy")
-def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
-    """Apply one Jacobi rotation to symmetric ``a`` (3, 3) that makes a[p, q] zero; ``v`` (3, 3) gathers them."""
-    if a[p, q] == 0.0:
-        return
-    theta = (a[q, q] - a[p, p]) / (2 * a[p, q])
-    t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1))
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    for k in range(3):
-        a[k, p], a[k, q] = c * a[k, p] - s * a[k, q], s * a[k, p] + c * a[k, q]
-    for k in range(3):
-        a[p, k], a[q, k] = c * a[p, k] - s * a[q, k], s * a[p, k] + c * a[q, k]
-    for k in range(3):
-        v[k, p], v[k, q] = c * v[k, p] - s * v[k, q], s * v[k, p] + c * v[k, q]
+    def _scores(self, row: int) -> Scores:
+        """Return the scores of a tile's cells, at most those of the cells above."""
+        (above, capped, inner), top = self.scores_of(row), self._top_scores
+        above, capped = np.minimum(above, top.capped[row]), np.minimum(capped, top.capped[row])
+        above[-1] = top.above[row]
+        return Scores(above, capped, inner)
 
+    def scores_over_tiles(self) -> Scores:
+        """Return the scores of the cells that hold several tiles."""
+        return Scores(*(column[len(self) :] for column in self._top_scores))
 
-@parallel_kernel("f8:3 f8:2 f8:3", error_model="numpy")
-def principal_axes(thread: ThreadSlice, cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
-    """Compute eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` by Jacobi."""
-    for n in iterations(thread, len(cov)):
-        a, v = np.empty((3, 3)), np.zeros((3, 3))
-        for row in range(3):
-            v[row, row] = 1.0
-            for column in range(3):
-                a[row, column] = cov[n, row, column]
-        scale = abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
-        for _ in range(SWEEPS):
-            off = a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2] + a[1, 2] * a[1, 2]
-            if off <= CONVERGED * scale * scale:
-                break
-            _rotate(a, v, 0, 1)
-            _rotate(a, v, 0, 2)
-            _rotate(a, v, 1, 2)
-        least, middle, most = 0, 1, 2  # `np.argsort` takes 1 s to compile
-        if a[least, least] > a[middle, middle]:
-            least, middle = middle, least
-        if a[middle, middle] > a[most, most]:
-            middle, most = most, middle
-        if a[least, least] > a[middle, middle]:
-            least, middle = middle, least
-        for column, order in enumerate((least, middle, most)):
-            values[n, column] = a[order, order]
-            for row in range(3):
-                vectors[n, row, column] = v[row, order]
+    def scores(self) -> Iterator[Scores]:
+        """Yield the scores of each tile in turn, then those of `scores_over_tiles`."""
+        yield from map(self._scores, range(len(self)))
+        yield self.scores_over_tiles()
+
+    def threshold(self, budget: int) -> float:
+        """Return the threshold of scores for at most ``budget`` cells."""
+        return threshold_for(self.scores, budget)
+
+    def counts(self, threshold: float) -> np.ndarray:
+        """Return the number of leaves for a threshold in each tile, and last that over several tiles."""
+        return np.array([int(scores.leaves(threshold).sum()) for scores in self.scores()])
+
+    def cuts(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> Iterator[list[Leaves]]:
+        """Yield, for each of the tiles from ``begin`` to ``end``, the leaves for each of its ``thresholds`` (tiles, n).
+
+        Under light the means of `Shading.lit` follow their moments. With ``least`` there is always at least the tile's
+        own cell.
+        """
+        for row in range(begin, end):
+            tile, scores = self.tile(row), self._scores(row)
+            if least:
+                scores.above[-1] = np.inf
+            chosen = [np.flatnonzero(scores.leaves(threshold)) for threshold in thresholds[row]]
+            yield [self.shaded(leaves_of(tile.tree, nodes), tile) for nodes in chosen]
+
+    def shaded(self, leaves: Leaves, tile: Tile) -> Leaves:
+        """Return leaves of a tile with the means of light, if any, after their moments."""
+        if self.shading is None or tile.normals is None:
+            return leaves
+        means = self.shading.lit(tile.tree, leaves, tile.normals)
+        return replace(leaves, moments=np.concatenate([leaves.moments, means], axis=1))
+
+    def gaussians_of(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Return the Gaussians of shaded leaves, one each."""
+        return self.sharpened(leaves, self.blurred(leaves, style))
+
+    def blurred(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Return the Gaussians of shaded leaves with the colours of their cells."""
+        found = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
+        if self.shading is None:
+            return found
+        return colored(found, self.shading.light, leaves.moments[:, COLUMNS:], self.degree)
+
+    def sharpened(self, leaves: Leaves, gaussians: Gaussians) -> Gaussians:
+        """Apply `sharpened`, but not to labels: each is of one colour, and may be written to a file of its own."""
+        if self.labels:
+            return gaussians
+        return sharpened(gaussians, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.half)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vvgt_cli.closed_form.cell_kernels import principal_axes
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
-from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.surface_offset import Opaque, flattened, surface_offset
 from vvgt_cli.closed_form.tree import Leaves, central
 from vvgt_cli.gaussians import Gaussians

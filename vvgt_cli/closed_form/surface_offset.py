@@ -54,12 +54,10 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool 
     depth = opaque_depth(cells.moments[:, MASS], cells.edge, step)
     if not len(depth) or depth.max() < SURFACE:
         return nowhere(cells.edge, half)
-    if labels:
-        depth *= OPAQUE_DEPTH / LABEL_DEPTH
     wider = field_coarsening(cells.edge, half, MAX_FIELD)
     edge = cells.edge * 2.0**wider
     shape = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
-    field = summed(cells.index, np.minimum(depth, 1) / 8.0**wider, wider, shape).astype(np.float32)
+    field = summed(cells.index, covered(depth, labels) / 8.0**wider, wider, shape).astype(np.float32)
     return smoothed(field, edge, half)
 
 
@@ -73,6 +71,11 @@ def opaque_depth(mass: np.ndarray, edge: np.ndarray, step: np.ndarray) -> np.nda
     """Return (n,) opacity of cells of ``mass`` (n,), 1 and more where opaque; edges of cell and voxel (3,)."""
     result: np.ndarray = mass / edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
     return result
+
+
+def covered(depth: np.ndarray, labels: bool) -> np.ndarray:
+    """Return (n,) the saturated opacity of cells of `opaque_depth`, all of ``labels`` or not."""
+    return np.minimum(depth * (OPAQUE_DEPTH / LABEL_DEPTH if labels else 1.0), 1)
 
 
 def field_coarsening(edge: np.ndarray, half: np.ndarray, most: int) -> int:

@@ -1,21 +1,25 @@
-"""The dyadic pyramid of optical moments (Haar scaling coefficients) and the choice of its cells for a budget."""
+"""The tree of optical moments of cells (Haar scaling coefficients) and the choice of its cells for a budget."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
+from vvgt_cli.closed_form.cell_kernels import score_splits, sum_children, take_base
 from vvgt_cli.closed_form.columns import BLUE, COLOR, COLUMNS, FIRST, GREEN, MASS, RED, SECOND
 from vvgt_cli.closed_form.moments import CHILDREN, Cells, cell_moments, morton
-from vvgt_cli.closed_form.pyramid import score_splits, sum_children, take_base
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.scene import Scene
 
 LEAST_SPREAD = 0.01  # of the range of values, added to that in a cell: noise and places tell little apart
 PLAIN = 0.005  # beside the variance of colours: outlines, and what light makes of one colour, show too
 EMPTY = 0.5  # how far what is empty is from any label, of the range of their codes
+FRACTION_BITS = 9  # mantissa bits of a score that select its bin in the histogram
+BINS = 1 << 16
+LOWEST = (1023 - 110) << FRACTION_BITS  # exponent 2^-110: smaller scores share the lowest bin
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
 
 
@@ -61,7 +65,7 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | N
     """
     through = seen.at(cells.index, cells.edge / step)
     keep = np.flatnonzero(through[:, 1] > HIDDEN)
-    return pyramid(
+    return tree_over(
         cells.index[keep],
         cells.edge,
         lambda moments, top: take_base(cells.moments, keep, through, moments, top),
@@ -74,7 +78,7 @@ def shown(cells: Cells, seen: Visibility, step: np.ndarray) -> np.ndarray:
     return np.flatnonzero(seen.at(cells.index, cells.edge / step)[:, 1] > HIDDEN)
 
 
-def pyramid(
+def tree_over(
     base: np.ndarray, base_edge: np.ndarray, fill: Callable[[np.ndarray, np.ndarray], None], levels: int | None = None
 ) -> Tree:
     """Build the tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
@@ -154,49 +158,72 @@ def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
     return result
 
 
-def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
-    """Choose at most ``budget`` cells that cover the scene: split while the score is above a bisected threshold.
+class Scores(NamedTuple):
+    """Scores of cells: that which splits the parent, the cell's own, and whether it has children."""
 
-    Returns ids into the tree, ascending. A cell is split only where all above it are.
+    above: np.ndarray
+    capped: np.ndarray
+    inner: np.ndarray
+
+    @classmethod
+    def of(cls, tree: Tree, score: np.ndarray) -> Scores:
+        """Return scores (n,) of a tree's cells, so that a cell is split only where all above it are."""
+        capped = cap_by_ancestors(tree, score)
+        above = capped[tree.parent]
+        above[-1:] = np.inf  # the root appears at any threshold
+        return cls(above, capped, tree.children > 0)
+
+    def leaves(self, threshold: float) -> np.ndarray:
+        """Return which cells (n,) are leaves where all with a score above the threshold are split."""
+        found: np.ndarray = (self.above > threshold) & ((self.capped <= threshold) | ~self.inner)
+        return found
+
+
+def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
+    """Choose at most ``budget`` cells that cover the scene, by `split_score` or another ``score`` (n,).
+
+    Returns ids into the tree, ascending.
     """
     if not len(tree) or budget < 1:
         return np.empty(0, np.int64)
-    capped = cap_by_ancestors(tree, split_score(tree) if score is None else score)
-    above = capped[tree.parent]
-    above[-1] = np.inf  # the root is there at any threshold
-    inner = tree.children > 0
-    # cells at threshold t: those whose parent is split, minus those split themselves; only large scores can matter
-    split_scores = capped[inner]
-    kept = min(len(split_scores), budget)  # every split adds a cell, or replaces one by an only child
-    while True:
-        floor = np.partition(split_scores, len(split_scores) - kept)[len(split_scores) - kept] if kept else np.inf
-        exits, entries = np.sort(split_scores[split_scores >= floor]), np.sort(above[above >= floor])
-        if kept == len(split_scores) or _cells_above(entries, exits, floor) > budget:
-            break
-        kept = min(2 * kept, len(split_scores))
-    thresholds = np.unique(exits)
-    low, high = -1, len(thresholds) - 1  # at thresholds[high] nothing but the root is left
-    while high - low > 1:
-        middle = (low + high) // 2
-        fits = _cells_above(entries, exits, thresholds[middle]) <= budget
-        low, high = (low, middle) if fits else (middle, high)
-    threshold = thresholds[high] if len(thresholds) else -np.inf  # the root alone
-    if high == 0 and len(thresholds) and len(tree) - inner.sum() <= budget:
-        threshold = -np.inf  # even all base cells fit
-    return np.flatnonzero((above > threshold) & ((capped <= threshold) | ~inner))
+    scores = Scores.of(tree, split_score(tree) if score is None else score)
+    return np.flatnonzero(scores.leaves(threshold_for(lambda: [scores], budget)))
 
 
-def _cells_above(entries: np.ndarray, exits: np.ndarray, threshold: float) -> int:
-    """Return the number of cells when all with a score above ``threshold`` are split (both arrays ascending)."""
-    exist = len(entries) - np.searchsorted(entries, threshold, "right")
-    return int(exist - (len(exits) - np.searchsorted(exits, threshold, "right")))
+def threshold_for(scores: Callable[[], Iterable[Scores]], budget: int) -> float:
+    """Return the least threshold that leaves at most ``budget`` cells; ``scores`` yields parts of a tree, twice."""
+    counts = np.zeros(BINS + 1, np.int64)  # cells that appear, less those that are split
+    for part in scores():
+        counts += np.bincount(_bins(part.above), minlength=BINS + 1)
+        counts -= np.bincount(_bins(part.capped[part.inner]), minlength=BINS + 1)
+    left = np.cumsum(counts[::-1])[::-1]  # leaves if all cells from a bin on are split
+    first = int(np.argmax(left <= budget))
+    if first == 0:
+        return -np.inf  # even all base cells fit
+    appear, split_up = [], []
+    for part in scores():
+        own = part.capped[part.inner]
+        appear.append(part.above[_bins(part.above) == first - 1])
+        split_up.append(own[_bins(own) == first - 1])
+    entries, exits = np.sort(np.concatenate(appear)), np.sort(np.concatenate(split_up))
+    values = np.unique(exits)
+    more = len(entries) - np.searchsorted(entries, values, "right")
+    less = len(exits) - np.searchsorted(exits, values, "right")
+    fits = np.append(left[first] + more - less <= budget, True)
+    return float(np.append(values, np.inf)[np.argmax(fits)])
+
+
+def _bins(scores: np.ndarray) -> np.ndarray:
+    """Return the histogram bin of each score; bins ascend with scores."""
+    bits = np.ascontiguousarray(scores).view(np.int64) >> (52 - FRACTION_BITS)
+    result: np.ndarray = np.clip(bits - LOWEST, 0, BINS - 1)
+    return result
 
 
 def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
     """Lower each cell's score to the smallest above it."""
     capped = score.copy()
-    end = len(tree) - 1
-    level = np.array([end])
+    level = np.arange(len(tree))[-1:]
     while len(level):
         inner = level[tree.children[level] > 0]
         if not len(inner):
@@ -230,6 +257,11 @@ class Leaves:
     def take(self, which: np.ndarray) -> Leaves:
         """Return the rows ``which`` (indices or bool)."""
         return Leaves(self.moments[which], self.index[which], self.edge[which], self.node[which])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Leaves]) -> Leaves:
+        """Concatenate leaves."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
 def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
@@ -275,8 +307,7 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
     kept = np.ones(len(leaves), bool)
     kept[order[splits]] = False
     parts.insert(0, leaves.take(np.flatnonzero(kept)))
-    fields = ("moments", "index", "edge", "node")
-    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
+    return Leaves.joined(parts)
 
 
 def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
@@ -297,7 +328,5 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
         )
     parent = np.concatenate(parents)
-    fields = ("moments", "index", "edge", "node")
-    together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
     order = np.argsort(parent, kind="stable")
-    return parent[order], together.take(order)
+    return parent[order], Leaves.joined(found).take(order)

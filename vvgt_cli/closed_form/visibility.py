@@ -10,9 +10,9 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.closed_form.cell_kernels import look_up
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.closed_form.moments import Cells
-from vvgt_cli.closed_form.pyramid import look_up
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel

@@ -282,11 +282,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
     """
     if request.fit.device != "cpu":
         load_ahead()
-    options, most = request.blocks or automatic(request.source, run.console), None
-    if options is not None and by_regions(request):
-        from vvgt_cli.conversion.shards.cut import most_cells
-
-        most = most_cells(request.budget())
+    options = request.blocks or automatic(request.source, run.console)
     if options is None:
         with run.stage("read") as stage:
             source = load(request.source)
@@ -298,7 +294,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
         yield field
         return
     values = request.live or request.editor
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, most, values=values)
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, by_regions(request), values)
     with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
         _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())

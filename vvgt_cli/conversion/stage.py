@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
@@ -16,6 +17,9 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from vvgt_cli.cameras import Camera
     from vvgt_cli.closed_form import Start
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
@@ -44,6 +48,8 @@ class Work:
         check, train: views to judge by, and to fit to, once rendered.
         train_rule, train_settings: drawing rule of the training views, and settings of their references.
         judged: the Gaussians and check views last compared, and their PSNR (dB).
+        weigh: returns factors (h, w) of errors in a camera's picture, where the field is a part of the volume whose
+            Gaussians keep their number and order.
     """
 
     run: Run
@@ -60,11 +66,18 @@ class Work:
     train_rule: Rule | None = None
     train_settings: RenderSettings | None = None
     judged: tuple[Gaussians, Views, float] | None = None
+    weigh: Callable[[Camera], np.ndarray] | None = None
 
     @property
     def rule(self) -> Rule:
         """Return the drawing rule that the file is made for."""
         return rule_of(self.fit.rule)
+
+    @property
+    def check_rule(self) -> Rule:
+        """Return the drawing rule of the check views, which may have fewer pixels than the screen."""
+        assert self.check is not None
+        return self.rule.at(self.check.cameras[0].width / self.fit.size)
 
     def current(self) -> Gaussians:
         """Return the Gaussians of the latest stage."""
@@ -75,7 +88,7 @@ class Work:
         """Return the PSNR (dB) on the check views; the last one is cached."""
         assert self.check is not None, "a stage that judges stands before the check views"
         if self.judged is None or self.judged[0] is not gaussians or self.judged[1] is not self.check:
-            self.judged = gaussians, self.check, self.check.psnr(gaussians, self.rule)
+            self.judged = gaussians, self.check, self.check.psnr(gaussians, self.check_rule)
         return self.judged[2]
 
     def reset(self) -> None:

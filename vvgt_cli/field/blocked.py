@@ -12,10 +12,11 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.block_store import CELLS, BlockStore
-from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
+from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
@@ -157,22 +158,22 @@ class Blocked:
         )  # fmt: skip
         return for_budget(workload, gaussians)
 
-    def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
-        """Return the task for base cells for ``size`` px images, ``most`` at most, by default as many as fit."""
-        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells
+    def cells(self, size: int, most: int) -> CellBlocks:
+        """Return the task for base cells for ``size`` px images, ``most`` at most."""
+        from vvgt_cli.closed_form.closed_form import finest_level, level_within
         from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS
 
         step = self.frame.step
         finest = finest_level(step, pixel_width(size))
-        level = level_within(step, self.visible, most or most_cells(budget), finest)
+        level = level_within(step, self.visible, most, finest)
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
             level += 1  # voxels so thin that a block has too many cells
         grid, todo = self._grid(exponents(step, level)), self._pending()
         rays = self._file([(one, one.first_pass()) for one in todo], grid) if todo else None
         if rays is not None:
             self.run_pass.store.prepare(rays.kind)
-        return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light)
+        return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light, self.source.labels_alone)
 
     def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
         """Implement `Field.pyramid`."""
@@ -180,8 +181,7 @@ class Blocked:
         from vvgt_cli.closed_form.closed_form import form_of, most_cells
         from vvgt_cli.closed_form.lit import Shading
 
-        most = most_cells(options.max_gaussians, options.values)
-        task = self.cells(options.size, options.max_gaussians, most)
+        task = self.cells(options.size, most_cells(options.max_gaussians, options.values))
         self.run_pass(task, "integrate")
         self.grid, half, step = task.grid, *self.frame
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
@@ -328,25 +328,18 @@ class Blocked:
 
 def _gathered(task: CellBlocks) -> Cells:
     """Return all cells, with normals under light."""
-    from vvgt_cli.closed_form.moments import Cells, in_order, morton
+    from vvgt_cli.closed_form.moments import Cells
+    from vvgt_cli.field.tiles import places_of, read_cells
 
-    index, moments, normals = [np.empty((0, 3), np.int32)], [], []
-    for number in range(len(task)):
-        part = task.store.load(CELLS, number, names=("tiles", "counts"))
-        offset = 0
-        for tile, count in zip(part["tiles"], part["counts"].tolist(), strict=True):
-            rows, local = read_rows(task.store, number, offset, count)
-            index.append(local + (tile * task.grid.tile_cells).astype(np.int32))
-            moments.append(rows)
-            offset += count
-        if task.light is not None:
-            normals.append(np.load(task.store.path(CELLS, number, NORMALS)))
-    whole = np.concatenate(index)
-    lit = None
-    if task.light is not None:
-        lit = np.concatenate(normals)[np.argsort(morton(whole), kind="stable")]
-    grid = task.grid
-    return Cells(*in_order(whole, moments), grid.cell_edge, np.array(grid.exponent, np.int64), lit)
+    grid, lit, places = task.grid, task.light is not None, places_of(task.store, task.grid)
+    count, done = sum(place.cells for place in places), 0
+    index, moments, normals = np.empty((count, 3), np.int32), np.empty((count, MOMENTS)), np.empty((count * lit, 3))
+    for place in places:
+        part, here = read_cells(task.store, grid, place, lit), slice(done, done + place.cells)
+        index[here], moments[here], done = part.index, part.moments, here.stop
+        if part.normals is not None:
+            normals[here] = part.normals
+    return Cells(index, moments, grid.cell_edge, np.array(grid.exponent, np.int64), normals if lit else None)
 
 
 @dataclass

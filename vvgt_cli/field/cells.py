@@ -8,8 +8,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.errors import DataError
-from vvgt_cli.field.block_store import CELLS, ROW, BlockStore
+from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
@@ -50,10 +49,12 @@ class CellBlocks(Blockwise):
     Attributes:
         rays: rays to cast while a block is in memory, None for none.
         light: lighting; with it cells get normals.
+        labels: whether all layers are label maps.
     """
 
     rays: RayFile | None = None
     light: Light | None = None
+    labels: bool = False
     kind: str = CELLS
 
     def __call__(self, number: int) -> None:
@@ -122,13 +123,13 @@ class CellBlocks(Blockwise):
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Return a tile's mass in cells of the visibility march, its opacity field, and its largest opacity."""
-        from vvgt_cli.closed_form.surface_offset import opaque_depth
+        from vvgt_cli.closed_form.surface_offset import covered, opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
         grid = self.grid
         depth = opaque_depth(mass, grid.cell_edge, np.array(grid.step))
         march, wide = np.full(3, grid.tile_cells >> grid.march), np.full(3, grid.tile_cells >> grid.field)
-        field = summed(local, np.minimum(depth, 1) / 8.0**grid.field, grid.field, wide)
+        field = summed(local, covered(depth, self.labels) / 8.0**grid.field, grid.field, wide)
         return summed(local, mass, grid.march, march), field.astype(np.float32), float(depth.max())
 
 
@@ -253,25 +254,3 @@ class ExtinctionBlocks(Blockwise):
             part = self.store.load(self.kind, number)["extinction"]
             out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
         return out
-
-
-def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read moments (count, 13) and indices within the tile (count, 3) int32 of a tile's cells.
-
-    ``offset`` is the number of cells of the block before these.
-
-    Raises:
-        DataError: the file is truncated.
-    """
-    path = store.path(CELLS, number, ".rows")
-    try:
-        with open(path, "rb") as stream:
-            stream.seek(offset * ROW)
-            read = stream.readinto(content := bytearray(count * ROW))  # writable, as kernels are compiled for
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if read < count * ROW:
-        raise DataError(f"{path}: truncated; remove {path.with_suffix('.npz')} and run the same command again")
-    split = count * MOMENTS * 8
-    moments = np.frombuffer(content, np.float64, count * MOMENTS).reshape(count, MOMENTS)
-    return moments, np.frombuffer(content, np.uint8, offset=split).reshape(count, 3).astype(np.int32)

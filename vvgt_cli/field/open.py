@@ -69,14 +69,14 @@ class FieldNeeds:
         gaussians: budget of Gaussians.
         size: edge of the screen in pixels.
         degree: degree of spherical harmonics that was requested.
-        most: largest number of base cells, None for as many as fit in memory.
+        on_disk: base cells stay on disk, so that there may be more than fit in memory.
         values: Gaussians will carry values for any function, which needs the histogram as well.
     """
 
     gaussians: int
     size: int
     degree: int | None = None
-    most: int | None = None
+    on_disk: bool = False
     values: bool = False
 
 
@@ -348,7 +348,7 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
         "series": digest(*request.statistics),
-        "gaussians": [needs.gaussians, needs.degree, needs.most, needs.values],
+        "gaussians": [needs.gaussians, needs.degree, needs.on_disk, needs.values],
         "size": needs.size,
     }
 

@@ -9,7 +9,7 @@ SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell
 MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
 VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
-MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
+MORTON, MIX = "vvgt_cli.closed_form.cell_kernels:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
 AXES_STEPS = "vvgt_cli.refine.steps:own_axes"
 REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
@@ -36,12 +36,12 @@ CELLS = (
     ADD_CELLS,
     BLOCK_MOMENTS,
     COMPACT,
-    "vvgt_cli.closed_form.pyramid:look_up",
+    "vvgt_cli.closed_form.cell_kernels:look_up",
     MORTON,
-    "vvgt_cli.closed_form.pyramid:take_base",
-    "vvgt_cli.closed_form.pyramid:sum_children",
-    "vvgt_cli.closed_form.pyramid:score_splits",
-    "vvgt_cli.closed_form.pyramid:principal_axes",
+    "vvgt_cli.closed_form.cell_kernels:take_base",
+    "vvgt_cli.closed_form.cell_kernels:sum_children",
+    "vvgt_cli.closed_form.cell_kernels:score_splits",
+    "vvgt_cli.closed_form.cell_kernels:principal_axes",
     MIX,
 )
 CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")))
@@ -73,7 +73,7 @@ SEGMENTS = {
 }
 CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
 LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points", "vvgt_cli.closed_form.gaussian_samples:add_normals")
-OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
+OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.cell_kernels:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
 ALL = (

@@ -255,7 +255,7 @@ class OwnAxes(OnHost):
 
     def gaussians(self) -> Gaussians:
         """Return Gaussians as a file has them: principal axes of ``M M^T``."""
-        from vvgt_cli.closed_form.pyramid import principal_axes
+        from vvgt_cli.closed_form.cell_kernels import principal_axes
         from vvgt_cli.closed_form.shape import quaternions
 
         means, factors, logits, *colors = self.arrays

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -135,6 +135,13 @@ class Views:
         blocks = None if self.blocks is None else [self.blocks[i] for i in index]
         weights = None if self.weights is None else [self.weights[i] for i in index]
         return Views([self.cameras[i] for i in index], self.images[list(index)], blocks, weights)
+
+    def weighed(self, weigh: Callable[[Camera], np.ndarray]) -> Views:
+        """Return the views with ``weigh(camera)`` (h, w) as weights, in their blocks."""
+        weights = [weigh(camera) for camera in self.cameras]
+        if self.blocks is not None:
+            weights = [b.pick(w[..., None])[..., 0] for b, w in zip(self.blocks, weights, strict=True)]
+        return replace(self, weights=weights)
 
     def pictures(self, gaussians: Gaussians, rule: Rule = INRIA) -> Iterator[np.ndarray]:
         """Draw Gaussians in each view, whole or in its blocks."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import COLUMNS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.dvr.layout import Light
@@ -26,10 +25,9 @@ from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import plain
 
 if TYPE_CHECKING:
-    from vvgt_cli.closed_form.surface_offset import Opaque
     from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.field.blocked import Pass
-    from vvgt_cli.field.tiled_tree import TiledTree, TileTrees
+    from vvgt_cli.field.tiles import TiledPyramid
     from vvgt_cli.gaussians import Gaussians
     from vvgt_cli.score.record import Run
 
@@ -73,28 +71,19 @@ class Cut:
     """A pyramid with what Gaussians need of the whole volume. A pickled one is a reference to its folder.
 
     Attributes:
-        trees: trees of the tiles.
-        opaque: regions where bodies are opaque.
+        pyramid: the pyramid; the scores of its cells must have been saved (`TreeBlocks`).
         plan: plan of the file.
         key: digest of the plan and of what the blocks depend on.
     """
 
-    trees: TileTrees
-    opaque: Opaque
+    pyramid: TiledPyramid
     plan: ShardPlan
     key: str
 
     @property
     def store(self) -> BlockStore:
         """Return the store of the blocks."""
-        return self.trees.store
-
-    @cached_property
-    def tiled_tree(self) -> TiledTree:
-        """The pyramid over all tiles; their trees must have been saved (`TreeBlocks`)."""
-        from vvgt_cli.field.tiled_tree import TiledTree
-
-        return TiledTree(self.trees)
+        return self.pyramid.store
 
     def __reduce__(self) -> Any:
         """Return what opens the same cut in another process, once for all tasks there."""
@@ -103,8 +92,8 @@ class Cut:
     def regions(self, threshold: float) -> Regions:
         """Divide the tiles into cubes of enough Gaussians for a threshold, with voxels that fit in memory."""
         grid, width = self.plan.grid, 1
-        places = np.array([tile.place for tile in self.tiled_tree.tiles])
-        total = int(self.tiled_tree.counts(threshold).sum())
+        places = self.pyramid.top.index[: len(self.pyramid)]
+        total = int(self.pyramid.counts(threshold).sum())
         while True:
             numbers = np.unique(places // width, axis=0)
             wider = float((2 * width * grid.tile).prod()) * self.plan.voxel_bytes
@@ -118,8 +107,7 @@ class Cut:
     def box(self, regions: Regions, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the first voxel of a region, and the end of its range, (3,) each."""
         grid, edge = self.plan.grid, regions.width * self.plan.grid.tile
-        place = self.tiled_tree.tiles[regions.ends[number] - 1].place
-        lo: np.ndarray = np.array(place) // regions.width * edge
+        lo: np.ndarray = np.array(self.pyramid.top.index[regions.ends[number] - 1]) // regions.width * edge
         return lo, np.minimum(lo + edge, grid.dims)
 
     def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[CutNode]:
@@ -133,48 +121,30 @@ class Cut:
             thresholds: (tiles, n) thresholds of all tiles.
             least: whether a level of a tile has at least the tile's own cell.
         """
-        from vvgt_cli.closed_form.tree import spread_of
-        from vvgt_cli.field.tiled_tree import joined
+        from vvgt_cli.closed_form.tree import Leaves, spread_of
 
-        cuts = list(self.tiled_tree.cuts(begin, end, thresholds, least))
+        cuts = list(self.pyramid.cuts(begin, end, thresholds, least))
         sizes = np.array([[len(leaves) for leaves in node] for node in cuts])
-        whole = [self.make(joined([node[k] for node in cuts])) for k in range(sizes.shape[1])]
+        whole = [self._gaussians(Leaves.joined([node[k] for node in cuts])) for k in range(sizes.shape[1])]
         made = []
         for node, size, last in zip(cuts, sizes, np.cumsum(sizes, axis=0), strict=True):
             gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, last, strict=True)]
             made.append(CutNode(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
         return made
 
-    def make(self, leaves: Leaves) -> Gaussians:
-        """Make the Gaussians of cells, one each, in their order."""
-        from vvgt_cli.closed_form.columns import MASS, SEEN
-        from vvgt_cli.closed_form.lit import colored
-        from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
-        from vvgt_cli.closed_form.sharpen import sharpened
-
-        lit, light = self._lit(leaves), self.trees.light
-        made = cell_gaussians(leaves, min(self.plan.grid.step), pixel_width(self.plan.size), self.opaque, ROUND)
-        if lit is not None and light is not None:
-            made = colored(made, light, lit, self.plan.degree)
-        if not self.plan.labels:
-            made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
-        return as_stored(made)
-
     def over_tiles(self, threshold: float) -> tuple[Gaussians, np.ndarray | None] | None:
         """Return the Gaussians, and normals, of cells that stand for several tiles each; None if there are none."""
-        leaves = self.tiled_tree.leaves_over_tiles(threshold)
-        return None if leaves is None else (self.make(leaves), self._normals(leaves))
+        leaves = self.pyramid.leaves_over_tiles(threshold)
+        return None if leaves is None else (self._gaussians(leaves), self._normals(leaves))
+
+    def _gaussians(self, leaves: Leaves) -> Gaussians:
+        return as_stored(self.pyramid.gaussians_of(leaves))
 
     def _normals(self, leaves: Leaves) -> np.ndarray | None:
         """Return the normals (n, 3) of cells; None without a light."""
         from vvgt_cli.closed_form.lit import MEAN, directions
 
-        lit = self._lit(leaves)
-        return None if lit is None else directions(lit[:, MEAN])
-
-    def _lit(self, leaves: Leaves) -> np.ndarray | None:
-        """Return the columns of light that the pyramid appends to moments; None without a light."""
-        return None if self.trees.light is None else leaves.moments[:, COLUMNS:]
+        return None if self.pyramid.shading is None else directions(leaves.moments[:, COLUMNS:][:, MEAN])
 
 
 @dataclass(frozen=True)
@@ -190,7 +160,7 @@ class TreeBlocks:
 
     def __call__(self, number: int) -> None:
         """Save the trees of block ``number``."""
-        self.cut.trees.save(number)
+        self.cut.pyramid.save(number)
 
 
 @lru_cache(maxsize=1)  # a worker opens it once for all of its tasks
@@ -204,14 +174,11 @@ def open_cut(store: BlockStore, key: str) -> Cut:
     Raises:
         DataError: a file is missing or damaged.
     """
-    from vvgt_cli.closed_form.surface_offset import SURFACE, nowhere, smoothed
-    from vvgt_cli.field.tiled_tree import Coarse, TileTrees
+    from vvgt_cli.field.tiles import TiledPyramid
 
-    plan, coarse = ShardPlan.load(store), Coarse.load(store)
-    grid, half = plan.grid, np.array(plan.grid.half)
-    edge = grid.cell_edge * 2.0**grid.field
-    opaque = nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
-    return Cut(TileTrees(store, grid, coarse, load_light(store, plan)), opaque, plan, key)
+    plan = ShardPlan.load(store)
+    light = load_light(store, plan)
+    return Cut(TiledPyramid.load(store, plan.grid, plan.size, plan.labels, light, plan.degree), plan, key)
 
 
 def cut_of(run: Run, run_pass: Pass) -> Cut:
@@ -225,7 +192,7 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
         NothingVisible: nothing is visible from any view.
         DataError: blocks are missing or damaged.
     """
-    from vvgt_cli.field.tiled_tree import Coarse
+    from vvgt_cli.field.tiles import gather
 
     store = run_pass.store
     plan = ShardPlan.load(store)
@@ -234,14 +201,13 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
     with run.stage("pyramid") as stage:
         store.prepare(COARSE)
         if store.missing(COARSE, [0]):
-            Coarse.gathered(store, plan.grid)
+            gather(store, plan.grid)
         open_cut.cache_clear()  # an earlier run's
         cut = open_cut(store, digest(*((store.folder / name).read_text("utf-8") for name in (PLAN, RUN)))[:16])
         open_cut.cache_clear()  # this process holds the cut itself
-        run_pass(TreeBlocks(cut), "pyramid", sorted({tile.block for tile in cut.trees.coarse.tiles}))
-        tree = cut.tiled_tree
-        stage.note = f"{tree.base} cells in {len(tree.tiles)} tiles"
-    if not tree.tiles:
+        run_pass(TreeBlocks(cut), "pyramid", cut.pyramid.blocks)
+        stage.note = f"{cut.pyramid.base} cells in {len(cut.pyramid)} tiles"
+    if not len(cut.pyramid):
         raise NothingVisible(plan.volume["name"], plan.function["name"])
     return cut
 
@@ -249,7 +215,6 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
 PLAN, LIGHT = "plan.json", "light.npz"
 A_SCORE, A_RAY = 20, 20  # bytes of the scores of a base cell and its ancestors, and of a ray within a block
 A_NORMAL = 24  # bytes of the normal of a base cell under a light
-A_GAUSSIAN = 8  # base cells per Gaussian, for large budgets
 KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels, in the store and in the output
 
 
@@ -330,13 +295,6 @@ def load_light(store: BlockStore, plan: ShardPlan) -> Light | None:
 
 def _tupled(value: Any) -> Any:
     return tuple(map(_tupled, value)) if isinstance(value, list) else value
-
-
-def most_cells(budget: int) -> int:
-    """Return the maximal number of base cells on disk: that in memory, or more for large budgets."""
-    from vvgt_cli.closed_form.closed_form import most_cells as in_memory
-
-    return max(in_memory(budget), A_GAUSSIAN * budget)
 
 
 def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool, degree: int) -> int:

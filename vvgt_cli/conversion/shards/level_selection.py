@@ -9,13 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT
-from vvgt_cli.field.digests import digest
 from vvgt_cli.gaussians.rules import INRIA, Rule
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.cut import Cut, Regions
-    from vvgt_cli.field.blocked import Pass
     from vvgt_cli.gaussians import Gaussians
 
 
@@ -113,63 +109,6 @@ def errors_of(nodes: Sequence[Sequence[Gaussians]], rule: str | Rule) -> dict[st
     squares, energies, pixels = zip(*(level_errors(cuts, rule) for cuts in nodes), strict=True)
     counts = [[len(gaussians) for gaussians in cuts] for cuts in nodes]
     return dict(zip(FIELDS, map(np.array, (counts, squares, energies, pixels)), strict=True))
-
-
-@dataclass(frozen=True)
-class ErrorRegions:
-    """The task of drawing the cuts of every node of a region.
-
-    Attributes:
-        cut: pyramid to cut.
-        regions: division of its tiles.
-        values: thresholds of the cuts, the finest first.
-    """
-
-    cut: Cut
-    regions: Regions
-    values: np.ndarray
-
-    @property
-    def kind(self) -> str:
-        """Kind of the results."""
-        return f"errors-{digest(self.cut.key, self.values)[:16]}"
-
-    def __len__(self) -> int:
-        """Return the number of regions."""
-        return len(self.regions.ends)
-
-    def __call__(self, number: int) -> None:
-        """Save the errors of the nodes of region ``number``."""
-        thresholds = np.broadcast_to(self.values, (len(self.cut.tiled_tree.tiles), CUTS))
-        nodes = self.cut.nodes(*self.regions.rows(number), thresholds)
-        found = errors_of([node.levels for node in nodes], self.cut.plan.ply.rule or INRIA)
-        faint = sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)
-        self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **found)
-
-
-def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]:
-    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's.
-
-    Args:
-        run_pass: runs the pass over the regions.
-        cut: pyramid to cut.
-        budget: largest number of Gaussians of the finest cut.
-
-    Returns:
-        The errors; and how many Gaussians of the finest cut are faint (`FAINT_LOGIT`).
-
-    Raises:
-        DataError: a block is damaged.
-    """
-    tree, store = cut.tiled_tree, cut.store
-    finest = tree.threshold(budget)
-    second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
-    values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
-    task = ErrorRegions(cut, cut.regions(finest), np.minimum(values, np.finfo(float).max))
-    run_pass(task, "errors")
-    parts = [store.load(task.kind, number) for number in range(len(task))]
-    found = CutErrors(task.values, **{name: np.concatenate([part[name] for part in parts]) for name in FIELDS})
-    return found, sum(int(part["faint"]) for part in parts)
 
 
 def level_errors(cuts: Sequence[Gaussians], rule: str | Rule = INRIA) -> tuple[np.ndarray, float, int]:

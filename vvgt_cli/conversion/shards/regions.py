@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.cameras.sets import RADIUS, pixel_width
+from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.shards.cut import Cut, CutNode, Regions
-from vvgt_cli.conversion.shards.level_selection import FIELDS, CutErrors, errors_of
-from vvgt_cli.conversion.stages.refinement import CHECK_EVERY, WIDER
-from vvgt_cli.conversion.stages.views import ray_settings, view_count
+from vvgt_cli.conversion.shards.level_selection import CUTS, FIELDS, STEP, CutErrors, errors_of
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import CheckViews, Refinement, TrainingViews
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT
+from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.block_store import BlockStore
@@ -29,12 +32,14 @@ from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, m
 from vvgt_cli.field.reader import Layers, Scalars, VoxelBox
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.frames import rescale
-from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
     from vvgt_cli.field.blocked import Pass
-    from vvgt_cli.score.record import Run
+    from vvgt_cli.field.field import Field
 
 
 REACH = 16  # voxels around a part that may hide it
@@ -65,6 +70,11 @@ class VolumePart:
         self.centre = (lo + hi) / 2 * frame.step - frame.half
         self.scale = PART_RADIUS / float(np.linalg.norm((hi - lo) / 2 * frame.step))
         self._empty = empty_distance(brick_ranges(self.box.values), self.box.optics)
+
+    @property
+    def views(self) -> VolumePart:
+        """The renderer of its pictures, as `vvgt_cli.field.field.Field.views`."""
+        return self
 
     def view(
         self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None, grown: np.ndarray | float = 0.0
@@ -167,13 +177,15 @@ class Refiner:
 
     Attributes:
         reader, light: see `vvgt_cli.field.cells.CellBlocks`.
-        descent: options of the descent.
+        fit: options of the descent.
+        limits: target PSNR on a part's own weighted check views, at which its descent ends.
         distances: distance from which each level is seen, unit frame.
     """
 
     reader: Scalars | Layers
     light: Light | None
-    descent: PartDescent
+    fit: FitOptions
+    limits: Limits
     distances: tuple[float, ...] = (RADIUS,)
 
 
@@ -187,6 +199,7 @@ class RegionNodes:
         thresholds, least: see `Cut.nodes`.
         kind: kind of the results.
         refiner: refiner of the Gaussians, None for the closed form.
+        compared: whether only errors of levels are saved, and how many Gaussians of the first are faint.
     """
 
     cut: Cut
@@ -194,21 +207,26 @@ class RegionNodes:
     thresholds: np.ndarray
     least: bool
     kind: str
-    refiner: Refiner | None
+    refiner: Refiner | None = None
+    compared: bool = False
 
     def __len__(self) -> int:
         """Return the number of regions."""
         return len(self.regions.ends)
 
     def __call__(self, number: int) -> None:
-        """Save the nodes of region ``number``, and the errors of their levels if these are refined."""
+        """Save the nodes of region ``number``, and the errors of their levels if these are refined or compared."""
         nodes = self.cut.nodes(*self.regions.rows(number), self.thresholds, self.least)
-        errors: dict[str, np.ndarray] = {}
         if self.refiner is not None:
             nodes = self._refined(nodes, number, self.refiner)
-            rule = self.refiner.descent.rule
-            errors = errors_of([node.levels for node in nodes], rule) if self.least else {}
-        save(self.cut.store, self.kind, number, nodes, errors)
+        errors: dict[str, np.ndarray] = {}
+        if self.least and (self.refiner is not None or self.compared):
+            errors = errors_of([node.levels for node in nodes], self.cut.plan.ply.rule or INRIA)
+        if not self.compared:
+            save(self.cut.store, self.kind, number, nodes, errors)
+            return
+        faint = [sum(int((node.levels[0].opacity_logits < FAINT_LOGIT).sum()) for node in nodes)]
+        self.cut.store.save(self.kind, number, ".npz", faint=np.array(faint), **errors)
 
     def _refined(self, nodes: list[CutNode], number: int, refiner: Refiner) -> list[CutNode]:
         """Return the nodes of a region, each level refined as a whole."""
@@ -218,7 +236,7 @@ class RegionNodes:
         levels = []
         for k, distance in enumerate(refiner.distances):
             own = [node.levels[k] for node in nodes]
-            refined = refiner.descent(part, concatenate(own), distance)
+            refined = refine_part(part, concatenate(own), refiner, distance)
             ends = np.cumsum([len(each) for each in own])
             levels.append([refined.take(np.arange(e - len(each), e)) for each, e in zip(own, ends, strict=True)])
         return [
@@ -303,7 +321,7 @@ def make_regions(
         DataError: a block is damaged.
     """
     regions = cut.regions(float(thresholds[0, 0]))
-    steps: Any = None if refiner is None else (digest(refiner.descent), refiner.distances)
+    steps: Any = None if refiner is None else (refiner.fit, refiner.limits, refiner.distances)
     key = digest(cut.key, thresholds, steps, regions, least)[:16]
     kind = f"{'closed' if refiner is None else 'refined'}-{key}"
     task = RegionNodes(cut, regions, thresholds, least, kind, refiner)
@@ -311,78 +329,67 @@ def make_regions(
     with run.stage(name) as stage:
         run_pass(task, name)
         workers, edge = run_pass.runner.workers, int((regions.width * cut.plan.grid.tile).max())
-        steps_of = "" if refiner is None else f"{refiner.descent.steps} steps in each of "
+        steps_of = "" if refiner is None else f"{refiner.fit.steps} steps in each of "
         stage.note = f"{steps_of}{len(task)} regions of {edge} voxels" + (f", {workers} workers" if workers > 1 else "")
     return StoredGaussians(cut.store, kind, regions.ends)
+
+
+def measure_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int]:
+    """Make and draw `CUTS` cuts of every node, or reuse an interrupted run's.
+
+    Args:
+        run_pass: runs the pass over the regions.
+        cut: pyramid to cut.
+        budget: largest number of Gaussians of the finest cut.
+
+    Returns:
+        The errors; and how many Gaussians of the finest cut are faint (`FAINT_LOGIT`).
+
+    Raises:
+        DataError: a block is damaged.
+    """
+    tree, most = cut.pyramid, np.finfo(float).max
+    finest = tree.threshold(budget)
+    second = max(tree.threshold(max(int(tree.counts(finest).sum()) // 2, 1)), np.finfo(float).tiny)
+    values = np.minimum(np.array([finest, *(second * STEP ** np.arange(CUTS - 1))]), most)
+    regions, thresholds = cut.regions(finest), np.broadcast_to(values, (len(tree), CUTS))
+    kind = f"errors-{digest(cut.key, values)[:16]}"
+    run_pass(RegionNodes(cut, regions, thresholds, True, kind, compared=True), "errors")
+    stored = StoredGaussians(cut.store, kind, regions.ends)
+    return replace(stored.errors(), thresholds=values), int(stored.field("faint").sum())
 
 
 PIXEL = 2.0  # width of a pixel of the training views, in median standard deviations of the middle axis
 SMALLEST, LARGEST, MULTIPLE = 64, 384, 16  # pixels along the edge of a view
 FACES = 3.0  # median standard deviations of the middle axis by which Gaussians reach over a face
-SPREAD = 0.5  # share of a screen pixel's width in a training pixel from which rays cover all of the latter
 
 
-@dataclass(frozen=True)
-class PartDescent:
-    """Options of the descent on a part.
+def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distance: float = RADIUS) -> Gaussians:
+    """Return Gaussians of the volume's box frame, refined; the given ones where descent does not help.
 
-    Attributes:
-        steps: number of steps.
-        size: pixels along the edge of the screen that the file is made for.
-        rule: rule by which viewers draw.
-        seed: seed of the order of views.
-        target_psnr: dB on a part's own weighted check views at which its descent ends; None for all steps.
+    Args:
+        part: voxels that the Gaussians stand for.
+        gaussians: Gaussians of the closed form.
+        refiner: options of the descent.
+        distance: distance in the unit frame from which they are seen, which decides on the screen's pixel.
     """
-
-    steps: int
-    size: int
-    rule: Rule
-    seed: int = 0
-    target_psnr: float | None = None
-
-    def __call__(self, part: VolumePart, gaussians: Gaussians, distance: float = RADIUS) -> Gaussians:
-        """Return Gaussians of the volume's box frame, refined; the given ones where descent does not help.
-
-        Args:
-            part: voxels that the Gaussians stand for.
-            gaussians: Gaussians of the closed form.
-            distance: distance in the unit frame from which they are seen, which decides on the screen's pixel.
-        """
-        from vvgt_cli.closed_form.shape import widened
-        from vvgt_cli.dvr import render_views
-        from vvgt_cli.refine import OptimizeOptions, optimize
-        from vvgt_cli.score.views import render_check_views
-
-        if not len(gaussians) or not self.steps:
-            return gaussians
-        start = part.moved_in(gaussians)
-        screen = pixel_width(self.size) * distance / RADIUS * part.scale
-        width = float(np.exp(np.median(np.sort(start.log_scales, axis=1)[:, 1])))
-        edge = view_edge(width, screen)
-        footprint = min(screen / pixel_width(edge), 1.0)
-        rule = self.rule.at(footprint)
-        settings = ray_settings(part, start, edge, rule, 1.0 if footprint >= SPREAD else footprint)
-        check = render_check_views(part, default_views("check", size=edge), settings)
-        weights = [part.weights(camera, FACES * width) for camera in check.cameras]
-        if check.blocks is not None:
-            weights = [b.pick(w[..., None])[..., 0] for b, w in zip(check.blocks, weights, strict=True)]
-        check = replace(check, weights=weights)
-        before, target = check.psnr(start, rule), self.target_psnr
-        if target is not None and before >= target:
-            return gaussians
-        cameras = default_views("train", view_count(self.steps, small=True), size=edge)
-        options = OptimizeOptions.of(
-            "frame", steps=self.steps, rule=rule, judge=rule, seed=self.seed, target_psnr=target,
-            check_every=max(self.steps // 2, 1) if target is None else CHECK_EVERY,
-        )  # fmt: skip
-        result, record = optimize(
-            widened(start, WIDER, screen), cameras, render_views(part, cameras, settings), options,
-            check=(check.cameras, check.images, check.blocks, check.weights),
-            weights=[part.weights(camera, FACES * width) for camera in cameras],
-        )  # fmt: skip
-        if not (record.psnr_after or 0.0) > before:
-            return gaussians
-        return as_stored(part.moved_out(result))
+    start, steps = part.moved_in(gaussians), refiner.fit.steps or 0
+    if not len(gaussians) or not steps:
+        return gaussians
+    screen = pixel_width(refiner.fit.size) * distance / RADIUS * part.scale
+    width = float(np.exp(np.median(np.sort(start.log_scales, axis=1)[:, 1])))
+    edge = view_edge(width, screen)
+    fit = replace(refiner.fit, size=max(round(pixel_width(1) / screen), edge))
+    field = cast("Field", part)  # only its pictures are drawn
+    run = Run(Console(quiet=True), ConversionReport("convert"))
+    work = Work(run, field, fit, refiner.limits, gaussians=start, weigh=lambda at: part.weights(at, FACES * width))
+    CheckViews(edge=edge).run(work)
+    if work.target_reached():
+        return gaussians
+    TrainingViews(view_count(steps, small=True), edge).run(work)
+    Refinement(steps, steps, small=True, overlap=True).run(work)
+    record = run.report.refinement
+    return as_stored(part.moved_out(work.current())) if record and record["kept"] else gaussians
 
 
 def view_edge(width: float, screen: float) -> int:

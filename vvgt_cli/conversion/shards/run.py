@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
@@ -21,9 +20,9 @@ from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.conversion.file_layout import degree_of, ply_options
 from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.plan import most_steps, steps_in_time
-from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest
-from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes, most_cells
-from vvgt_cli.conversion.shards.regions import PartDescent, Refiner, StoredGaussians, make_regions
+from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES, ConvertRequest, Limits
+from vvgt_cli.conversion.shards.cut import Cut, ShardPlan, cut_of, disk_bytes
+from vvgt_cli.conversion.shards.regions import Refiner, StoredGaussians, make_regions
 from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.refinement import HARMONICS
@@ -38,14 +37,14 @@ from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.field.settings import MANY, BlockOptions, worker_count
 from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.field.workload import pace
-from vvgt_cli.files import atomic_write, check_disk_space, is_stream
+from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
-from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
+from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import DRAW, INIT, OPTIMIZE, RENDER, for_blocks, for_degree
 from vvgt_cli.progress import Console
@@ -130,7 +129,7 @@ def gaussians_by_regions(run: Run, request: ConvertRequest, field: Blocked) -> G
     over = cut.over_tiles(threshold)
     refiner = refiner_of(run, request, field)
     if refiner is not None:
-        thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
+        thresholds = np.full((len(cut.pyramid), 1), threshold)
         stored = make_regions(run, field.run_pass, cut, thresholds, refiner, least=False)
     return concatenate([gaussians for gaussians, _ in chain(stored.regions(), [] if over is None else [over])])
 
@@ -154,8 +153,7 @@ def refiner_of(run: Run, request: ConvertRequest, field: Blocked) -> Refiner | N
     if not steps:
         return None
     run.compile(for_degree(OPTIMIZE, degree))
-    descent = PartDescent(steps, fit.size, rule_of(fit.rule), fit.seed, limits.target_psnr)
-    return Refiner(field.reader, field.light, descent)
+    return Refiner(field.reader, field.light, replace(fit, steps=steps), Limits(limits.target_psnr))
 
 
 def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
@@ -209,12 +207,14 @@ def _opened(
     run: Run, request: ConvertRequest, options: BlockOptions, store: BlockStore
 ) -> AbstractContextManager[Blocked]:
     budget = request.fit.max_gaussians
-    wanted = FieldNeeds(budget, request.fit.size, request.ply.sh_degree, most_cells(budget))
+    wanted = FieldNeeds(budget, request.fit.size, request.ply.sh_degree, on_disk=True)
     return blocked(run, request.source, options, store, wanted)
 
 
 def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     """Make all blocks, or reuse them, and the file's plan; raise MissingBlocks if other shards' are missing."""
+    from vvgt_cli.closed_form.closed_form import most_cells
+
     budget, size, store = request.fit.max_gaussians, request.fit.size, field.run_pass.store
     source, ply = field.source, ply_options(request, field.source)
     for line in placement_warnings(source.volume, ply):
@@ -222,7 +222,7 @@ def make_blocks(run: Run, request: ConvertRequest, field: Blocked) -> None:
     degree = degree_of(request, source)
     run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
     field.views.expect(scored_views(size))
-    cells = field.cells(size, budget, most_cells(budget))
+    cells = field.cells(size, most_cells(budget, on_disk=True))
     assert cells.rays is not None
     ShardPlan(
         cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
@@ -285,17 +285,16 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     if output != STDOUT:
         check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
     kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, size) < free else None
-    with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
-        sink.write(ply_header(count, degree, plan.ply))
+    with run.stage("write") as stage, _sink(output, overwrite) as sink:
+        written = sink.write(ply_header(count, degree, plan.ply))
         for gaussians, normals in chain(stored.regions(), [] if over is None else [over]):
             normals = None if normals is None else directions(normals @ turned)
-            sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
+            written += sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
             if kept is not None:
                 kept.append(gaussians)
-        written = sink.tell()
         stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB"
         if not removed and count < NEARLY * plan.budget:
-            base = cut.tiled_tree.base
+            base = cut.pyramid.base
             stage.note += f", no more: {base} cells suffice for the screen and {plan.budget} Gaussians"
     run.report.gaussians, run.report.bytes = count, written
     if kept is None:
@@ -318,8 +317,8 @@ def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, StoredGaussi
     """
 
     def cut_for(budget: int) -> tuple[tuple[float, StoredGaussians], int, bool]:
-        threshold = cut.tiled_tree.threshold(budget)
-        thresholds = np.full((len(cut.tiled_tree.tiles), 1), threshold)
+        threshold = cut.pyramid.threshold(budget)
+        thresholds = np.full((len(cut.pyramid), 1), threshold)
         found = make_regions(run, run_pass, cut, thresholds, least=False)
         logits = found.field("opacity_logits-0")
         return (threshold, found), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
@@ -331,21 +330,14 @@ def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, StoredGaussi
 
 
 @contextmanager
-def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
-    """Yield a file to write to; once complete, it replaces the output or is copied to its pipe."""
-    if output != STDOUT and not is_stream(output):
-        with atomic_write(output, overwrite) as temporary, open(temporary, "w+b") as sink:
-            yield sink
+def _sink(output: str, overwrite: bool) -> Iterator[IO[bytes]]:
+    """Yield standard output, or a file that replaces the output once it is complete."""
+    if output == STDOUT:
+        yield sys.stdout.buffer
+        sys.stdout.buffer.flush()
         return
-    with tempfile.TemporaryFile(dir=store.folder) as sink:
+    with atomic_write(output, overwrite) as temporary, open(temporary, "wb") as sink:
         yield sink
-        sink.seek(0)
-        if output == STDOUT:
-            shutil.copyfileobj(sink, sys.stdout.buffer)
-            sys.stdout.buffer.flush()
-        else:
-            with open(output, "ab") as stream:
-                shutil.copyfileobj(sink, stream)
 
 
 def scored_views(size: int) -> list[Picture]:

@@ -1,7 +1,7 @@
 """Streamed SOG: spatial nodes in levels by measured error, in files of SOG images, with `lod-meta.json`.
 
 The format is that of PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and
-splat-transform 3.7.0 (`writers/write-lod.ts`). A node is a tile of the pyramid (`vvgt_cli.field.tiled_tree`), with
+splat-transform 3.7.0 (`writers/write-lod.ts`). A node is a tile of the pyramid (`vvgt_cli.closed_form.pyramid`), with
 levels by `level_selection`.
 """
 
@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.conversion.shards.level_selection import measure_cuts
-from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions
+from vvgt_cli.conversion.shards.regions import StoredGaussians, make_regions, measure_cuts
 from vvgt_cli.conversion.stages.closed_form import TOO_FAINT, thin
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest
@@ -70,11 +69,10 @@ def write_streamed(
     """
     if cut.plan.ply.frame != "unit":
         raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
-    tiled_tree = cut.tiled_tree
     with run.stage("errors") as stage:
         errors, removed = _thinned(run_pass, cut)
         choices = np.stack(errors.levels(removed), axis=1)
-        stage.note = f"{choices.shape[1]} levels of {len(tiled_tree.tiles)} nodes"
+        stage.note = f"{choices.shape[1]} levels of {len(cut.pyramid)} nodes"
     if removed:
         run.skip(f"{removed} Gaussians", TOO_FAINT)
     if (refine := refiner()) is not None:
@@ -99,7 +97,7 @@ def write_streamed(
         stage.note = f"{output}: {len(nodes)} nodes, {len(parts)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level['gaussians']:,}" for level in levels)
         if not removed and levels[0]["gaussians"] < cut.plan.budget // 2:
-            stage.note += f", no more: {tiled_tree.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
+            stage.note += f", no more: {cut.pyramid.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
     remove_files(set(before) - set(level_files(target)))
     run.report.gaussians, run.report.bytes = levels[0]["gaussians"], total
 

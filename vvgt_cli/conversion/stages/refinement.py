@@ -75,13 +75,15 @@ class Refinement(Stage):
             remaining = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
         target = work.limits.target_psnr
         options = OptimizeOptions.of(
-            "frame", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule, judge=work.rule,
-            seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
+            "frame", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
+            judge=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.current()
         begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
-        work.gaussians = _drop_undrawn(work, refine(work.run, start, work.train, work.check, options, begin))
+        work.gaussians = refine(work.run, start, work.train, work.check, options, begin)
+        if work.weigh is None:
+            work.gaussians = _drop_undrawn(work, work.gaussians)
 
 
 def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
@@ -117,6 +119,7 @@ def refine(
             progress=run.console.bar("refinement"),
             stop=stop,
             free=free,
+            weights=train.weights,
         )
         result, record = _on_its_device(run, options, descend)
         if begin is not None:

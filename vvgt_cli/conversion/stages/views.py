@@ -44,10 +44,12 @@ class CheckViews(Stage):
 
     Attributes:
         fine: whether they are integrated over pixels.
+        edge: number of pixels along an edge; None for the screen's.
     """
 
     name: ClassVar[str] = "check views"
     fine: bool = True
+    edge: int | None = None
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels; memory includes one whole view, of which blocks are kept."""
@@ -73,11 +75,13 @@ class CheckViews(Stage):
 
         if work.check is not None:
             return
-        size = work.fit.size
+        size = self.edge or work.fit.size
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:
             work.check = render_check_views(work.field.views, cameras, RenderSettings() if self.fine else FIT_VIEWS)
             stage.note = f"{len(cameras)} of {size} px" + (", blocks of them" if work.check.blocks else "")
+        if work.weigh is not None:
+            work.check = work.check.weighed(work.weigh)
 
 
 @dataclass(frozen=True)
@@ -131,6 +135,8 @@ class TrainingViews(Stage):
             rays = "one ray" if settings.samples == 1 else "adaptive rays"
             stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
         work.train, work.train_settings = Views(cameras, images), settings
+        if work.weigh is not None:
+            work.train = work.train.weighed(work.weigh)
 
 
 def _spread(footprint: float) -> float:
