@@ -79,7 +79,7 @@ def test_a_function_of_whole_numbers() -> None:
         ("", "a.ctbl", "no label"),
         ("1 a 1 2 3 4\n1 b 1 2 3 4\n", "a.ctbl", "label 1 twice"),
         ("1 a 300 2 3 4\n", "a.ctbl", r"in \[0, 1\]"),
-        ("[1]", "a.json", "no object"),
+        ("[1]", "a.json", "'1', without a number"),
         ('{"liver": {}}', "a.json", "'liver'"),
         ('{"1": {"color": [0, 0, 1], "opacity": 2}}', "a.json", "opacity 2"),
         ('{"1": {"color": "red"}}', "a.json", "three numbers"),
@@ -118,7 +118,9 @@ def test_recognised_by_type_name_and_number() -> None:
         (Volume(balls().astype(np.float32), name="labels"), True),
         (Volume(balls() + np.float32(0.5), name="labels"), False),
         (Volume(np.where(balls(), 7, 0), name="liver_mask"), True),
-        (Volume(balls(), name="brainmask"), False),  # FreeSurfer's holds grey values
+        (Volume(balls().astype(np.float32), name="lungmask"), True),
+        (Volume(np.arange(27).reshape(3, 3, 3), name="brainmask"), False),  # FreeSurfer's holds grey values
+        (Volume(np.arange(27).reshape(3, 3, 3), name="organ_mask_labels"), True),
         (Volume(balls().astype(np.float64), name="t1_masked"), False),
         (Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), name="labels"), False),
     ):
@@ -249,7 +251,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):
-        assert said in vvgt.fails(2, "convert", seg, *out, *options)
+        assert said in vvgt.fails(2, "convert", seg, *(() if "-o" in options else out), *options)
     np.save(tmp_path / "empty_seg.npy", balls() * 0)
     assert (
         "no label other than 0"
@@ -418,6 +420,35 @@ def test_names_in_json(vvgt, tmp_path: Path, seg: Path, table_json, pick: str) -
         assert "a table of labels; expected a transfer function: give the table to --labels" in said
 
 
+@pytest.mark.parametrize(
+    "table_json",
+    [
+        [{"id": 1, "name": "skin", "color": [255, 0, 0]}, {"id": 3, "name": "core", "color": [0, 0, 128]}],
+        {"labels": [{"value": 1, "label": "skin", "color": "#ff0000"},
+                    {"value": 3, "label": "core", "color": "#000080"}]},
+        {"info": {}, "categories": [{"id": 1, "name": "skin", "rgb": [255, 0, 0]},
+                                    {"id": 3, "name": "core", "rgb": [0, 0, 128]}]},
+        [{"acronym": "s", "id": 1, "name": "skin", "rgb_triplet": [255, 0, 0]},
+         {"acronym": "c", "id": 3, "name": "core", "rgb_triplet": [0, 0, 128]}],
+        {"1": {"name": "skin", "color": [255, 0, 0, 255]}, "3": {"name": "core", "color": [0, 0, 128]}},
+        {"1": "#ff0000", "3": "#000080"},
+        {"1": [255, 0, 0], "3": [0, 0, 128]},
+    ],
+)  # fmt: skip
+def test_lists_and_colors_to_255_in_json(tmp_path: Path, table_json) -> None:
+    found = read_labels(table(tmp_path, json.dumps(table_json), "names.json")).structures
+    names = ["skin", "core"] if "skin" in str(table_json) else ["label 1", "label 3"]
+    assert [(e.number, e.name, e.opacity) for e in found] == [(1, names[0], 1), (3, names[1], 1)]
+    np.testing.assert_allclose([e.color for e in found], [(1, 0, 0), (0, 0, 128 / 255)])
+
+
+def test_a_fourth_channel_in_json_is_opacity(tmp_path: Path) -> None:
+    found = read_labels(
+        table(tmp_path, '{"1": [255, 0, 0, 51], "2": {"color": [0, 0, 1, 1], "opacity": 0.5}}', "a.json")
+    )
+    assert [e.opacity for e in found.labels] == [0.2, 0.5]
+
+
 def test_regions_are_groups_and_dataset_json_is_offered(vvgt, tmp_path: Path) -> None:
     regions = {"labels": {"background": 0, "whole": [1, 2, 3], "core": [2, 3], "enhancing": [3]}}
     path = table(tmp_path, json.dumps(regions), "dataset.json")
@@ -447,6 +478,10 @@ def test_regions_are_groups_and_dataset_json_is_offered(vvgt, tmp_path: Path) ->
         ('[{"IndexedColors": [0, 0, 0], "Annotations": ["low", "a"]}]', "no Annotations"),
         ('[{"IndexedColors": [0, 0, 0], "Annotations": ["1", "a", "1", "b"]}]', "label 1 twice"),
         ('{"labels": {"skin": 1', "not JSON"),
+        ('[{"name": "skin"}]', "without a number"),
+        ('[{"id": 1, "name": "skin"}, {"id": 1, "name": "core"}]', r"label 1 twice \(skin, core\)"),
+        ('{"1": [256, 0, 0]}', "label 1: colour: .*three numbers"),
+        ('{"1": ["a", 0, 0]}', "label 1: colour"),
     ],
 )
 def test_faulty_names_in_json(tmp_path: Path, text: str, said: str) -> None:

@@ -78,6 +78,20 @@ def test_a_set_of_masks_is_one_label_map(tmp_path: Path, ending: str, kind: Any,
     np.testing.assert_array_equal(cropped.data, EXPECTED[..., 2:9])
 
 
+def test_a_segment_of_a_file_keeps_its_name_and_color(tmp_path: Path) -> None:
+    for k, name in enumerate(("liver", "spleen")):
+        fields = {"Name": f"{name} of a child", "LabelValue": "1", "Layer": "0", "Color": "1 0 0.5"}
+        image = SimpleITK.GetImageFromArray(((1, 4)[k] == EXPECTED).astype(np.uint8))
+        for key, value in fields.items() if k else ():
+            image.SetMetaData(f"Segment0_{key}", value)
+        SimpleITK.WriteImage(image, str(tmp_path / f"{name}.nrrd"))
+    with pytest.warns(UserWarning, match="2 binary masks"):
+        found = read_volume(str(tmp_path)).segments or ()
+    assert [(one.number, one.name, one.color) for one in found] == [
+        (1, "liver", None), (2, "spleen of a child", (1, 0, 0.5))
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("names", "values"),
     [
@@ -103,6 +117,10 @@ def test_sets_that_are_none_are_one_line(vvgt, tmp_path: Path) -> None:
     assert "expected the grid of" in said and "liver.nii.gz, 15 x 14 x 13 voxels of 2 1 1" in said  # noqa: PT018
     write(folder / "liver.nii.gz", EXPECTED)
     assert "liver.nii.gz: values such as 1; expected a mask" in vvgt.fails(1, "convert", folder, "-o", out)
+    nibabel.save(
+        nibabel.Nifti1Image(np.stack([EXPECTED > 0] * 2, -1).astype(np.uint8), np.eye(4)), folder / "liver.nii.gz"
+    )
+    assert "liver.nii.gz: 2 time steps; expected one mask (" in vvgt.fails(1, "convert", folder, "-o", out)
     for path in folder.glob("*.nii.gz"):
         write(path, EXPECTED * 0)
     assert "4 masks, all empty" in vvgt.fails(1, "convert", folder, "-o", out)

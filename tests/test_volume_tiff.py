@@ -263,6 +263,16 @@ def test_renamed_files_are_known_by_their_uuid(tmp_path: Path, files: int, root:
         refused(DataError, "is in all.companion.ome, which is not beside it", read_volume, str(tmp_path / now[0]))
 
 
+@pytest.mark.parametrize("companion", [False, True])
+def test_names_that_changed_places_are_known_by_their_uuid(tmp_path: Path, companion: bool) -> None:
+    names = ["a.ome.tif", "b.ome.tif"]
+    write_set(tmp_path, names, names[::-1], companion=companion)
+    for name in names:
+        np.testing.assert_array_equal(read_volume(str(tmp_path / name)).data, VALUES[0, 0])
+    (tmp_path / "a.ome.tif").unlink()  # the second file; the first is called as it was
+    refused(DataError, r"b\.ome\.tif \(urn:uuid:1\), which is not", read_volume, str(tmp_path / "b.ome.tif"))
+
+
 def test_a_copy_is_read_itself_and_a_foreign_name_is_said(tmp_path: Path) -> None:
     """The original of a renamed copy may lie beside it, with other values."""
     write_set(tmp_path, ["old.ome.tif"], ["new.ome.tif"])

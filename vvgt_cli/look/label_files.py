@@ -6,7 +6,8 @@
 - ITK-SNAP: `number R G B A VIS MSH "name"`, colours 0 to 255, A in [0, 1], VIS 0 or 1.
 - .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
 - DICOM SEG: segment numbers, labels and recommended CIELab colours.
-- JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc". Names alone:
+- JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc", or from 0 to
+  255, with opacity as a fourth number. A list of such objects, with the number under a key of `COLUMNS`. Names alone:
   `{"1": "liver"}` or `{"liver": 1}`, also under "labels" (dataset.json of nnU-Net, whose regions are lists of numbers,
   and of the Medical Segmentation Decathlon) or by name in a map of such maps (TotalSegmentator).
 - ParaView: categorical presets with `IndexedColors` and `Annotations` [value, name, ...].
@@ -49,8 +50,9 @@ COLUMNS = {  # names of columns in lower case; the first whose cell is not empty
     "g": ("color_g", "g", "green"),
     "b": ("color_b", "b", "blue"),
     "a": ("color_a", "a", "alpha"),
-    "color": ("color", "colour"),
+    "color": ("color", "colour", "rgb", "rgba", "rgb_triplet"),
 }
+LISTS = ("labels", "categories")  # keys of a JSON object under which labels lie
 NAMELESS = ("index", "name", "r", "g", "b", "a")
 EXPECTED = (
     "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .csv or .tsv "
@@ -251,30 +253,58 @@ def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
     presets = parsed if isinstance(parsed, list) else [parsed]
     if presets and all(isinstance(one, dict) and "IndexedColors" in one for one in presets):
         return _table(_annotated(presets, what, pick), what)
-    parsed = parsed.get("labels", parsed) if isinstance(parsed, dict) else parsed  # dataset.json
+    if isinstance(parsed, dict):
+        parsed = next((parsed[key] for key in LISTS if key in parsed), parsed)
+    if isinstance(parsed, list):
+        if pick:
+            raise DataError(f"{what}: holds one table; omit #{pick}")
+        return _table(_entries([_record(one, what) for one in parsed], what), what)
     if not isinstance(parsed, dict):
         raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
     nested = all(one and isinstance(one, dict) and not _INTEGER.fullmatch(key) for key, one in parsed.items())
     tables = parsed if nested and parsed else {"": parsed}  # TotalSegmentator's maps by name
     if pick not in tables and (pick or len(tables) > 1):
         raise DataError(f"{what}: {pick!r}; expected FILE#NAME with one of {', '.join(tables)[:200] or 'no names'}")
-    found, regions = list[Label](), dict[str, list[int]]()
-    for key, entry in (tables[pick] if pick in tables else next(iter(tables.values()))).items():
+    return _table(_entries(list((tables[pick] if pick in tables else next(iter(tables.values()))).items()), what), what)
+
+
+def _record(one: Any, what: str) -> tuple[str, Any]:
+    """Return number and entry of a label that is one of a list, an object with keys as in `COLUMNS`."""
+    lower = {key.lower(): value for key, value in one.items()} if isinstance(one, dict) else {}
+    found = {key: next((lower[k] for k in keys if lower.get(k) is not None), None) for key, keys in COLUMNS.items()}
+    if not _INTEGER.fullmatch(str(found["number"])):
+        raise DataError(f"{what}: {str(one)[:40]!r}, without a number; {EXPECTED}")
+    entry = {key: found[key] for key in ("name", "color") if found[key] is not None}
+    return str(found["number"]), {key: lower[key] for key in ("opacity", "parents", "visible") if key in lower} | entry
+
+
+def _entries(entries: list[tuple[str, Any]], what: str) -> list[Label]:
+    """Return the labels of a JSON table's keys and values; its colours end at 255 if one is above 1."""
+    regions = dict[str, list[int]]()
+    known = list[tuple[str, dict[str, Any]]]()
+    for key, entry in entries:
         numbers = entry if isinstance(entry, list) else [entry]
-        if _INTEGER.fullmatch(key) and isinstance(entry, dict | str):
-            found.append(_entry(f"{what}: label {key}", int(key), {"name": entry} if isinstance(entry, str) else entry))
+        colored = entry.startswith("#") if isinstance(entry, str) else len(numbers) in (3, 4)
+        if _INTEGER.fullmatch(key) and (colored or isinstance(entry, dict | str)):
+            known.append((key, entry if isinstance(entry, dict) else {"color" if colored else "name": entry}))
         elif numbers and all(type(one) is int for one in numbers):
             regions[key] = numbers
         else:
             raise DataError(f"{what}: {key[:40]!r}; {EXPECTED}")
-    return _table(found + _of_regions(regions, what), what)
+    channels = [v for _, e in known if isinstance(e.get("color"), list) for v in e["color"]]
+    most = 255 if any(type(v) is int and v > 1 for v in channels) else 1
+    return [_entry(f"{what}: label {key}", int(key), e, most) for key, e in known] + _of_regions(regions, what)
 
 
-def _entry(here: str, value: int, entry: dict[str, Any]) -> Label:
-    """Return the label of an entry of a JSON table, or raise DataError."""
-    color = entry.get("color")
-    color = _hex(color) or color if isinstance(color, str) else color
-    opacity = number(f"{here}: opacity", entry.get("opacity", SOLID if value else 0.0))
+def _entry(here: str, value: int, entry: dict[str, Any], most: float = 1) -> Label:
+    """Return the label of an entry of a JSON table, whose channels end at ``most``, or raise DataError."""
+    color, seen = entry.get("color"), SOLID if value else 0.0
+    if isinstance(color, str):
+        color = _hex(color) or color
+    elif isinstance(color, list):
+        parts = [number(f"{here}: colour", v) / most for v in color]
+        color, seen = (parts[:3], parts[3]) if len(parts) == 4 else (parts, seen)
+    opacity = number(f"{here}: opacity", entry.get("opacity", seen))
     groups, shown = entry.get("parents", []), entry.get("visible", True)
     groups = [groups] if isinstance(groups, str) else groups
     if not isinstance(groups, list) or not all(isinstance(one, str) and one for one in groups):

@@ -17,6 +17,7 @@ from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
 
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
+MASKS = 16  # the same of a volume that is called a mask: the grey values of a masked scan are more
 NAMED = re.compile(r"label|seg(?![a-z])|segment|atlas|parc|aseg|mask(?!ed)", re.I)
 MAX_LABELS = 1 << 21  # labels that are counted
 SORTED = 1 << 16  # span of a plane's values above which they are sorted, not counted
@@ -56,7 +57,7 @@ def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in
     """
     if volume.segments is not None or not named_so(volume):
         return volume.segments is not None
-    most = 2 if "mask" in map(str.lower, NAMED.findall(volume.name)) else FEW  # a masked scan is no label map
+    most = MASKS if {word.lower() for word in NAMED.findall(volume.name)} == {"mask"} else FEW
     middle = len(volume.data) // 2
     first = volume.slope * np.unique(volume.data[middle : middle + 1]) + volume.intercept  # one slice decides for most
     try:

@@ -167,6 +167,7 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
         listing = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no DICOM files"
         structures = kinds["RTSTRUCT"] == kinds.total() > 0
         hint = "; of contours (RTSTRUCT) nothing is filled: export them as a label map or SEG" if structures else ""
+        hint = "; unpack a zip of other files" if not kinds and str(path).lower().endswith(".zip") else hint
         raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels{hint}")
     if wanted is None:
         return "", _only(found, path), ""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, VvgtError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.options import ReadOptions
@@ -103,12 +103,14 @@ def _formed(source: Path, files: Sequence[Path], dates: Sequence[int], options: 
     kind = np.min_scalar_type(len(files))
     first, labels = None, np.zeros(0, kind)
     sizes, shared = np.zeros(len(files) + 1, np.int64), np.zeros(len(files) + 1, np.int64)
+    named = list[Segment]()
     for number, path in enumerate(files, 1):
         try:
             volume, inside = _inside(path, options)
-        except DataError as error:
+        except (DataError, SeveralArrays, SeveralComponents, SeveralSteps) as error:
             way = "leave it out of the masks, or read frames of a series by a glob with --labels none"
-            raise DataError(f"{error} ({way})") from None
+            text = str(error) if isinstance(error, DataError) else f"{str(error).partition(';')[0]}; expected one mask"
+            raise DataError(f"{text} ({way})") from None
         if first is None:
             check_memory(kind.itemsize * inside.size, str(source))
             first, labels, sizes[0] = volume, np.zeros(inside.shape, kind), inside.size + 1
@@ -117,8 +119,10 @@ def _formed(source: Path, files: Sequence[Path], dates: Sequence[int], options: 
         shared += np.bincount(held, minlength=len(shared))
         shared[number] = np.count_nonzero(held)
         labels[inside] = np.where(sizes[number] < sizes[held], number, held)
+        own = volume.segments[0] if volume.segments and len(volume.segments) == 1 else Segment(number)
+        named.append(replace(own, number=number, name=own.name or volume_name(path)))
     assert first is not None
-    segments = tuple(Segment(k, volume_name(path)) for k, path in enumerate(files, 1) if sizes[k])
+    segments = tuple(one for one in named if sizes[one.number])
     if not segments:
         raise DataError(f"{source}: {len(files)} masks, all empty; expected one with a voxel")
     text = f"{source}: {len(files)} binary masks are read as one label map, named by the files"

@@ -93,17 +93,15 @@ def _name_files(root: ElementTree.Element, path: Path, uuid: str | None) -> None
         raise DataError(f"{path}: OME-XML of {len(pairs)} files; expected at most {_MOST_FILES}")
     names = Counter(key for key, _ in pairs)  # of a UUID: of several one is wrong
     uuid = uuid or (pairs[0][0] if len(names) == 1 else None)  # all planes are in one file, which is this one
-    others: dict[str, str] | None = None
+    alone = not pairs or (len(pairs) == 1 and (uuid in names or _is_beside(path, pairs[0][1])))
+    others = {uuid or "": path.name} if alone else _uuids(path.parent)
     present: dict[tuple[str, str], str] = {}
+    known = {key: others[key] for key in others if names[key] == 1}
     for key, name in pairs:
-        if name == path.name or (key == uuid and names[key] == 1):
-            present[key, name] = path.name
-        elif _is_beside(path, name):
-            present[key, name] = name
-        else:
-            others = _uuids(path.parent) if others is None else others
-            present[key, name] = others.get(key, "") if names[key] == 1 else ""
-    missing = [name or key for (key, name), file in present.items() if not file]
+        present[key, name] = known.get(key) or (name if _is_beside(path, name) and name not in known.values() else "")
+    missing = [
+        f"{name} ({key})" if name in known.values() else name or key for key, name in pairs if not present[key, name]
+    ]
     if len(pairs) == len(missing) == 1:
         warnings.warn(f"{path}: OME-XML names {missing[0]}, which is not here; its own pages are read", stacklevel=4)
         present[pairs[0]] = path.name
@@ -119,13 +117,13 @@ def _name_files(root: ElementTree.Element, path: Path, uuid: str | None) -> None
 
 
 def _uuids(folder: Path) -> dict[str, str]:
-    """Return the names of the OME-TIFFs in a folder, by their UUID."""
-    found = {}
+    """Return the names of the OME-TIFFs in a folder, by their UUID; one that several files have is left out."""
+    found: dict[str, list[str]] = {}
     for file in islice(sorted(folder.iterdir()), _MOST_FILES):
         with suppress(OSError, ValueError, DataError, struct.error):  # damaged, or no TIFF
             if file.name.lower().endswith(TIFF) and (uuid := _UUID.search(_description(file))):
-                found[uuid[1]] = file.name
-    return found
+                found.setdefault(uuid[1], []).append(file.name)
+    return {uuid: files[0] for uuid, files in found.items() if len(files) == 1}
 
 
 def _check_element(element: ElementTree.Element, path: Path) -> None:
