@@ -50,7 +50,8 @@ def test_an_option_of_one_value_is_given_once(command, vvgt):
         result = vvgt(*command.split(), *words[0], *words[1])
         names = "/".join([*option.opts, *option.secondary_opts])
         one = not (option.multiple or (option.is_flag and not option.secondary_opts))
-        assert (f"{names}: given 2 times; expected once" in result.err) == one
+        values = "" if option.is_flag else ", " + " and ".join(" ".join(word[1:]) for word in words)
+        assert (f"{names}: given 2 times{values}; expected one" in result.err) == one
         if one:
             assert result.code == 2
             assert "\n" not in result.error

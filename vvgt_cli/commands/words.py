@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import shlex
@@ -158,13 +159,23 @@ class SectionedCommand(click.Command):
             ) from None
 
     def _check_repeated(self, ctx: click.Context, args: list[str]) -> None:
-        """Raise click.UsageError for an option that is given several times, of which click would take the last."""
-        for option, times in Counter(self.make_parser(ctx).parse_args(args)[2]).items():
-            if not isinstance(option, click.Option) or option.multiple:
+        """Raise click.UsageError that names all values of an option given several times; click would take the last."""
+        parser = self.make_parser(ctx)
+        given = Counter(parser.parse_args(list(args))[2])
+        for option, times in given.items():
+            if not isinstance(option, click.Option) or option.multiple or times == 1:
                 continue
-            if times > 1 and (not option.is_flag or option.secondary_opts):
-                names = "/".join([*option.opts, *option.secondary_opts])
-                raise click.UsageError(f"{names}: given {times} times; expected once", ctx)
+            if option.is_flag and not option.secondary_opts:
+                continue
+            names, text = "/".join([*option.opts, *option.secondary_opts]), ""
+            if not option.is_flag:
+                collecting = copy.copy(option)
+                collecting.multiple = True
+                collecting.add_to_parser(parser, ctx)
+                values = parser.parse_args(list(args))[0][option.name]
+                values = [option.flag_value if not isinstance(v, str | tuple) else v for v in values]  # left out
+                text = ", " + " and ".join(" ".join(v) if isinstance(v, tuple) else str(v) for v in values)
+            raise click.UsageError(f"{names}: given {times} times{text}; expected one", ctx)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options under their headings."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
@@ -285,7 +286,7 @@ def _write_ply(run: Run, run_pass: Pass, cut: Cut, output: str, overwrite: bool)
     if output != STDOUT:
         check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
     kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, size) < free else None
-    with run.stage("write") as stage, _sink(output, overwrite) as sink:
+    with run.stage("write") as stage, _sink(store, output, overwrite) as sink:
         written = sink.write(ply_header(count, degree, plan.ply))
         for gaussians, normals in chain(stored.regions(), [] if over is None else [over]):
             normals = None if normals is None else directions(normals @ turned)
@@ -330,11 +331,14 @@ def closed_form(run: Run, run_pass: Pass, cut: Cut) -> tuple[float, StoredGaussi
 
 
 @contextmanager
-def _sink(output: str, overwrite: bool) -> Iterator[IO[bytes]]:
-    """Yield standard output, or a file that replaces the output once it is complete."""
+def _sink(store: BlockStore, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
+    """Yield a file to write to; once it is complete, it replaces the output or is copied to standard output."""
     if output == STDOUT:
-        yield sys.stdout.buffer
-        sys.stdout.buffer.flush()
+        with tempfile.TemporaryFile(dir=store.folder) as sink:
+            yield sink
+            sink.seek(0)
+            shutil.copyfileobj(sink, sys.stdout.buffer)
+            sys.stdout.buffer.flush()
         return
     with atomic_write(output, overwrite) as temporary, open(temporary, "wb") as sink:
         yield sink
