@@ -50,7 +50,7 @@ def test_a_level_is_the_face_of_a_solid_body(values, text, solid, clear) -> None
 
 def test_outer_surfaces_are_translucent_and_of_other_colours() -> None:
     shown = placed(BALL, "0.2:0.6,#ff0000")
-    assert 0 < shown.opacity(np.array([0.2]))[0] < 0.6
+    assert 0.7 < shown.opacity(np.array([0.2]))[0] < 0.9  # at 0.5 a steep skin is hardly seen
     np.testing.assert_array_equal(shown.color(np.array([0.9])), [[1, 0, 0]])
     assert np.abs(shown.color(np.array([0.2])) - shown.color(np.array([0.9]))).max() > 0.3
 

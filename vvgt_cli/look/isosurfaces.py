@@ -24,7 +24,7 @@ COLORS = ((0.3, 0.52, 0.86), (0.86, 0.33, 0.26), (0.95, 0.78, 0.36), (0.36, 0.68
 NEUTRAL = (0.87, 0.85, 0.8)
 EDGE = 0.02  # half the width of a surface's rise, as a share of the way from its level to the background
 FINEST = 2.0**-20  # least value of that half, as a share of half the range of the data
-SHELL, TRANSLUCENT = 0.3, 0.5  # width of an outer surface as a share of the way to the next one, and its opacity
+SHELL, TRANSLUCENT = 0.3, 0.8  # width of an outer surface as a share of the way to the next one, and its opacity
 RGB = tuple[float, float, float]
 
 
