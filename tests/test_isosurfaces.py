@@ -101,8 +101,12 @@ def test_levels_go_to_json_and_back(tmp_path: Path, vvgt) -> None:
         refused(DataError, "iso", read_transfer_function, wrong)
 
 
-def test_layers_take_levels() -> None:
+def test_layers_take_levels(tmp_path: Path) -> None:
     assert parse_layer("a.mrc,iso=0.03:1sigma,distance=2").tf == "iso:0.03:1sigma"
+    named = tmp_path / "v,iso=3.mrc"
+    named.touch()
+    assert (one := parse_layer(f"{named},iso=5")).volume == str(named)
+    assert one.tf == "iso:5"
     assert parse_layer_look("1,iso=0.5,#ff0000").tf == "iso:0.5,#ff0000"
     refused(UsageError, "expected FILE and any of iso=", parse_layer, "a.mrc,iso=1,tf=hot")
     refused(UsageError, "expected LAYER,tf=TF, LAYER,iso=LEVEL", parse_layer_look, "1,iso=1,tf=hot")

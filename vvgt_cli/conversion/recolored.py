@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.source import layer_words
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts, legend_text
@@ -81,7 +81,7 @@ Look = TransferFunction | LabelTable | SeveralLooks
 
 def parse_layer_look(text: str) -> LayerLook:
     """Parse ``LAYER[,tf=TF][,iso=LEVEL][,labels=TABLE][,distance=D]``; raise UsageError for other texts."""
-    name, *rest = re.split(r",(?=[a-z]+=)", text.replace(",iso=", ",tf=iso:"))
+    name, *rest = layer_words(text)
     given = dict(entry.split("=", 1) for entry in rest if "=" in entry)
     unknown = set(given) - {"tf", "labels", "distance"} or len(given) < len(rest)
     if not name or not rest or unknown or not all(given.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -69,16 +70,25 @@ class SourceRequest:
         return [path for path in given if isinstance(path, str) and path not in (AUTO, NO_LABELS)]
 
 
+def layer_words(text: str) -> list[str]:
+    """Split ``NAME[,KEY=VALUE]...`` into NAME, the longest that is a file if there is one, and ``KEY=VALUE``.
+
+    ``iso=LEVEL`` is returned as ``tf=iso:LEVEL``.
+    """
+    words = re.split(r",(?=[a-z]+=)", text)
+    n = next((k for k in range(len(words), 0, -1) if os.path.exists(",".join(words[:k]))), 1)
+    return [",".join(words[:n]), *(re.sub("^iso=", "tf=iso:", word) for word in words[n:])]
+
+
 def parse_layer(text: str, space: str | None = None) -> SourceRequest:
     """Parse a layer, ``FILE[,tf=TF][,iso=LEVEL][,labels=TABLE][,component=N]...``, or raise UsageError."""
-    path, *rest = re.split(r",(?=[a-z]+=)", text.replace(",iso=", ",tf=iso:"))
+    path, *rest = layer_words(text)
     given: dict[str, Any] = {}
     for part in rest:
         key, _, value = part.partition("=")
         if key not in KEYS or key in given or not value or (KEYS[key] is int and not value.isdecimal()):
-            raise UsageError(
-                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in ('iso', *KEYS))}"
-            )
+            keys, part = ", ".join(f"{k}=..." for k in ("iso", *KEYS)), part.replace("tf=iso:", "iso=")
+            raise UsageError(f"--layer {text}: {part!r}; expected FILE and any of {keys}")
         given["component" if key == "channel" else key] = KEYS[key](value)
     if not path:
         raise UsageError(f"--layer {text}: no file; expected FILE, as seg.nrrd or pet.nii,tf=hot.json")
