@@ -67,7 +67,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):
         (tmp_path / f"{name}.raw").write_bytes(head + values.tobytes())
     (tmp_path / "dump.raw.gz").write_bytes(gzip.compress(data.tobytes()))
+    (tmp_path / "segmentations").mkdir()
     nibabel.save(nibabel.Nifti1Image((data.T // 400).astype(np.uint8), affine), tmp_path / "atlas.nii.gz")
+    for number, organ in enumerate(("spleen", "liver"), start=1):
+        mask = nibabel.Nifti1Image(np.equal(data.T // 400, number).astype(np.uint8), affine)
+        nibabel.save(mask, tmp_path / "segmentations" / f"{organ}.nii.gz")
     for frame in range(3):
         anatomy.vti(tmp_path / f"run_{frame}.vti", (data // (frame + 1)).astype("<i2"), affine)
     vdb(tmp_path / "fire.vdb", plume(16))
