@@ -52,7 +52,7 @@ def picture(volume: Volume, name: str | None) -> tuple[np.ndarray, str]:
     numbers = statistics(volume)
     size = SIZE if name is None else SIZE_NAMED
     if name is None:
-        tf = from_histogram(numbers, volume.hounsfield, volume.density)
+        tf = from_histogram(numbers, volume.hounsfield, volume.preset)
     else:
         tf = resolve(read_transfer_function(name), numbers, hounsfield=volume.hounsfield)
     distance, limits = unit_distance(None, volume, tf)[0], (numbers.lo, numbers.hi)

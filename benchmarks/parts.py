@@ -28,7 +28,7 @@ from vvgt_cli.commands.main import run
 NONE = 10**12
 PARTS: dict[str, dict[str, Any]] = {
     "all": {},
-    "colours not sharpened": {"vvgt_cli.closed_form.closed_form.sharpened": lambda found, *_: found},
+    "colours not sharpened": {"vvgt_cli.closed_form.pyramid.sharpened": lambda found, *_: found},
     "no cells by error": {"vvgt_cli.conversion.stages.cells.CellsByError.run": lambda *_: None},
     "hidden cells too": {"vvgt_cli.closed_form.closed_form.UNSEEN": 0.0},
     "no floor of slopes": {"vvgt_cli.refine.states.WEAKEST": 0.0},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.closed_form import VbmOptions, closed_form, initialise, sharpen
+from vvgt_cli.closed_form import VbmOptions, initialise, sharpen
 from vvgt_cli.closed_form.sharpen import AMOUNT, BRIGHTEST, WINDOW, curves, sharpened
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.gaussians import Gaussians
@@ -141,5 +141,5 @@ def test_the_closed_form_gains_where_colours_vary(monkeypatch):
         return np.mean([psnr(view[..., :3], render(made, c)[..., :3]) for c, view in zip(cameras, views, strict=True)])
 
     with_it = score()
-    monkeypatch.setattr(closed_form, "sharpened", lambda gaussians, seen, half: gaussians)
+    monkeypatch.setattr("vvgt_cli.closed_form.pyramid.sharpened", lambda gaussians, seen, half: gaussians)
     assert with_it > score() + 1

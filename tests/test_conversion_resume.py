@@ -10,6 +10,7 @@ from vvgt_cli.conversion import convert as conversion
 from vvgt_cli.conversion.stages import scores, views
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.refine import loop
+from vvgt_cli.refine.states import OwnAxes
 
 LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "24")
 
@@ -26,7 +27,7 @@ def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
 def ended(monkeypatch, target: str, calls: int) -> None:
     """Let the function end the run at its call number ``calls`` (from 0)."""
     module, _, name = target.rpartition(".")
-    owner = {"loop": loop, "convert": conversion, "scores": scores}[module]
+    owner = {"loop": loop, "convert": conversion, "scores": scores, "states": OwnAxes}[module]
     own, count = getattr(owner, name), [0]
 
     def call(*args, **kwargs):
@@ -47,8 +48,8 @@ def by_start(scene, start, *_):
     ("target", "calls", "left"),
     [
         ("convert.improve", 0, {"closed-form.npz"}),  # its pyramid is needed again: cells are still to be cut by error
-        ("loop.step", 0, {"closed-form.npz", "cells.npz"}),
-        ("loop.step", 4, {"closed-form.npz", "cells.npz", "refinement.npz"}),
+        ("states.step", 0, {"closed-form.npz", "cells.npz"}),
+        ("states.step", 4, {"closed-form.npz", "cells.npz", "refinement.npz"}),
         ("scores.score_test_views", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
         ("convert.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
     ],
@@ -63,7 +64,7 @@ def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vv
     with monkeypatch.context() as patch:  # nothing is done twice
         if "fitted.npz" in left:
             ended(patch, "convert.improve", 0)
-        ended(patch, "loop.step", 20 if "refinement.npz" in left else 24)
+        ended(patch, "states.step", 20 if "refinement.npz" in left else 24)
         if "cells.npz" in left:
             patch.setattr("vvgt_cli.closed_form.initialise", None)
             patch.setattr("vvgt_cli.closed_form.cut_by_error", None)
@@ -90,7 +91,9 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
     with monkeypatch.context() as patch:
         ended(patch, "scores.score_test_views", 0)
         assert vvgt(*line).code == 130
-    assert "fitted.npz: belongs to another volume or other options" in vvgt.fails(2, *line, "--max-gaussians", "100")
+    assert "fitted.npz: belongs to another volume or other options" in vvgt.fails(
+        2, *replaced(line, "--max-gaussians", "100")
+    )
     kept = folder / "kept" / "fitted.npz"
     whole = kept.read_bytes()
     for content in (b"", whole[: len(whole) // 2], whole.replace(b"means", b"moons")):

@@ -263,7 +263,7 @@ def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goe
 
     value, name = probe()
     assert value == pytest.approx((1 - math.exp(-3)) / 3 + 0.01)
-    edit("refine/loss.py", '"""Numba', '"""A numba')  # of no use to it
+    edit("refine/loss.py", '"""The loss:', '"""A loss:')  # of no use to it
     assert probe() == (value, name)
     edit("dvr/kernel.py", "return (1.0 - math.exp(-depth)) / depth", "return (4.0 - math.exp(-depth)) / depth")
     assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.01)

@@ -170,7 +170,7 @@ def test_faulty_minimal_files_are_one_clear_line(file, fields, message):
         ("{'a': 1}", "not JSON .line 1, column 2"),
         ("[]", "not a transfer function"),
         ("3", "not a transfer function"),
-        ('{"a": 1}', "not a transfer function"),
+        ('{"a": 1.5}', "not a transfer function"),
         ("[" * 100_000, "not JSON|too deep"),
         ("1" * 10_000, "too long"),
     ],

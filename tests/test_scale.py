@@ -227,7 +227,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     run = vvgt.fails(2, "init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
     assert "expected full, or 0 to 2" in run
     run = vvgt.fails(2, "init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
-    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run
+    assert "has no resolution levels; expected OME-Zarr, N5, Imaris or BigDataViewer" in run
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
@@ -310,7 +310,7 @@ def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeyp
         ("v_1024x512x512_uint8.raw", None, True),
         ("seg_1024x512x512_uint8.raw", None, False),
         ("seg_1024x512x512_uint8.raw", "ct-bone", True),
-        ("seg_1024x512x512_float32.raw", None, True),
+        ("seg_1024x512x512_float32.raw", None, False),
     ):
         with open(tmp_path / name, "wb") as file:
             file.truncate(1024 * 512 * 512 * (4 if "float" in name else 1))  # a hole: nothing of it is read

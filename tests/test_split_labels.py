@@ -80,7 +80,7 @@ def test_every_label_is_told_of(vvgt, tmp_path: Path) -> None:
     told = vvgt.ok(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", *few, "-o", tmp_path / "{}.ply"
     ).err
-    assert told.count("converting what others hide of it") == 2, told
+    assert told.count("converting what others hide of it") == 3, told
 
 
 def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:

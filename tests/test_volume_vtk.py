@@ -220,7 +220,7 @@ def test_legacy_sections_written_by_hand(tmp_path: Path) -> None:
         (legacy(b"POINT_DATA 60\nSCALARS a int\n1 2 3\n", "ASCII"), "holds 3 values"),
         (legacy(b"POINT_DATA 60\nSCALARS a int\n" + b"one " * 60, "ASCII"), "not a list of int32 numbers"),
         (legacy(b"", "HEX"), "expected ASCII or BINARY"),
-        (legacy(b"", kind="POLYDATA"), "dataset POLYDATA.*Resample To Image"),
+        (legacy(b"", kind="POLYDATA"), "of a polydata.*Resample To Image"),
         (legacy(b"POINT_DATA 1\nSCALARS a char\n" + bytes(1), dims="1 x 1"), "damaged legacy VTK file"),
     ],
 )

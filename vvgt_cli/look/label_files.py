@@ -29,7 +29,7 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct, palette_color
-from vvgt_cli.look.readers import minimal, slicer
+from vvgt_cli.look.readers import lut, minimal, slicer
 from vvgt_cli.look.readers.fields import json_of, number, rgb, table, text_of
 from vvgt_cli.look.readers.paraview import choose
 from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, parents_of
@@ -81,7 +81,7 @@ def is_table(path: Path) -> bool:
         text = text_of(path, "a table of labels")
         if text.lstrip().startswith(("{", "[")):
             parsed = json_of(text, path)
-            function = '"RGBPoints"' in text or slicer.matches(parsed) or minimal.matches(parsed)
+            function = '"RGBPoints"' in text or any(one.matches(parsed) for one in (slicer, minimal, lut))
             return not function and bool(table_of(parsed, str(path)))
     except DataError:
         return False
