@@ -385,7 +385,7 @@ def checkpoint() -> list[Seed]:
     from vvgt_cli.refine.loop import begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
-        record, state = OptimizeRecord(), begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
+        record, state = OptimizeRecord(), begin(cloud(8), CAMERAS, OptimizeOptions.of(method, max_gaussians=16))
         return state, Judge(state, None, record), record
 
     seeds = []
