@@ -18,12 +18,8 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.conversion.writing import outputs_of, write, write_beside
-from vvgt_cli.errors import UsageError
-from vvgt_cli.field.blocked import MissingBlocks
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.formats.streamed import is_streamed
-from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.types import NOTHING
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -95,32 +91,3 @@ def _conversion(request: ConvertRequest, work: Work) -> Conversion:
     gaussians = NOTHING if work.gaussians is None else to_unit_frame(work.gaussians, work.field.source.volume)
     live = None if request.live else partial(editor_form, request)
     return Conversion(gaussians, work.run.report, work.ply, work.field, live)
-
-
-def write_shard(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Process the blocks of a shard that can be processed now, for `vvgt merge`, and report what remains.
-
-    Raises:
-        UsageError, DataError: see `convert`; a shard with a scheduler, a report or levels.
-    """
-    options, run = request.blocks, Run(console or Console(), ConversionReport("init"))
-    if options is None or options.scheduler is not None:
-        raise UsageError("--shard and --scheduler both distribute the blocks; give one of them")
-    levels = is_streamed(request.output)
-    if request.output in (None, STDOUT) or request.report or levels or not request.out_of_core:
-        raise UsageError(
-            "--shard: expected a folder of blocks as -o, no --report and no --init; 'vvgt merge' makes the .ply or "
-            "lod-meta.json (docs/scale.md)"
-        )
-    try:
-        with open_field(run, request) as field:
-            work = work_of(run, request, field)
-            fit(work, request)
-    except MissingBlocks as later:
-        run.console.message(
-            f"{later.what}: this shard is done, {later.missing} blocks of other shards are missing; run the same array "
-            "again once they are complete"
-        )
-    else:
-        run.console.message(f"all blocks are complete; next: vvgt merge {request.output} -o OUT.ply")
-    return run.finish()

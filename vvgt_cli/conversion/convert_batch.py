@@ -24,7 +24,7 @@ from vvgt_cli.conversion.batch import (
     options_in,
 )
 from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.conversion.convert import convert, write_shard
+from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import holds_several, is_page
@@ -43,6 +43,7 @@ from vvgt_cli.conversion.index import (
 )
 from vvgt_cli.conversion.labels import Labels
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
+from vvgt_cli.conversion.merge import write_shard
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError

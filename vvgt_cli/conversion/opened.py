@@ -50,9 +50,7 @@ def open_field(
 
     values = request.live or request.editor
     needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, request.out_of_core, values)
-    store = (
-        nullcontext(BlockStore(Path(str(beside)).absolute())) if shard else store_beside(beside)
-    )
+    store = nullcontext(BlockStore(Path(str(beside)).absolute())) if shard else store_beside(beside)
     with opened(run, request.source, request.blocks, needs, needed, store, request.fit.device) as field:
         yield field
         if isinstance(field, Blocked) and not shard:
