@@ -282,7 +282,7 @@ def test_in_python() -> None:
     entries = {1: {"color": [1, 0, 0], "opacity": 0.1}, 3: {"color": "#0000ff"}}
     result = library.convert(balls(), library.Look(labels=entries), {"max_gaussians": 300, "size": 64, "steps": 0})
     assert result.gaussians.colors[:, 1].max() < 0.05
-    _, images = library.render_views(balls(), library.Look(labels=entries), cameras=2, size=32)
+    _, images = library.render_views(balls(), library.Look(labels=entries), views=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
     assert images[..., 1].max() == 0
     refused(DataError, "no entry", library.convert, balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from vvgt_cli.commands.optimize import optimize
     from vvgt_cli.commands.recolor import recolor
     from vvgt_cli.commands.render import render
+    from vvgt_cli.commands.render_views import render_views
     from vvgt_cli.commands.synth import synth
     from vvgt_cli.commands.view import view
     from vvgt_cli.conversion.clouds import Clouds
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, read_ply, read_volume, render_views
+    from vvgt_cli.library.functions import convert, read_ply, read_volume
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
@@ -46,7 +47,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "read_ply", "read_volume", "render_views"),
+    "library.functions": ("convert", "read_ply", "read_volume"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
@@ -56,7 +57,7 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "volume": ("Volume",),
     **{
         f"commands.{name}": (name,)
-        for name in ("check", "evaluate", "infer", "optimize", "recolor", "render", "synth", "view")
+        for name in ("check", "evaluate", "infer", "optimize", "recolor", "render", "render_views", "synth", "view")
     },
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}

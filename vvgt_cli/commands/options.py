@@ -381,7 +381,9 @@ def arguments(
     from vvgt_cli.library.inputs import Look
 
     if optics is not None:
-        options["look"] = Look(**optics, light=light)
+        several = (optics["tf"] or [None]) if isinstance(optics["tf"], tuple) else [optics["tf"]]
+        looks = [Look(**optics | {"tf": tf}, light=light) for tf in several]
+        options["look"] = looks if len(looks) > 1 else looks[0]
     if blocks is not None:
         options["blocks"] = block_options_of(blocks)
     return {**options, **read, "progress": console}

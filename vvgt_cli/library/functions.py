@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Unpack
 
-from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     Goal,
     GoalLike,
-    LookLike,
     LooksLike,
     PathLike,
     Reading,
@@ -29,8 +26,6 @@ from vvgt_cli.library.inputs import (
 from vvgt_cli.volume import Volume
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from vvgt_cli.conversion.clouds import Clouds
 
 
@@ -115,47 +110,3 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     from vvgt_cli.conversion.gaussian_files import open_gaussians
 
     return open_gaussians(os.fspath(path))
-
-
-def render_views(
-    volume: VolumeLike,
-    look: LookLike = None,
-    cameras: Sequence[Camera] | int = 24,
-    *,
-    size: int = 400,
-    step: float = 0.5,
-    **reading: Unpack[Reading],
-) -> tuple[list[Camera], np.ndarray]:
-    """Render pictures of a volume in memory; ``vvgt render-views`` writes them for trainers.
-
-    >>> import vvgt_cli as vvgt
-    >>> cameras, images = vvgt.render_views("example:blob:16", cameras=2, size=32)
-    >>> images.shape
-    (2, 32, 32, 4)
-
-    Args:
-        volume: as in `convert`.
-        look: as in `convert`.
-        cameras: cameras in the unit frame, all of one size, or the number of training views.
-        size: pixels along the edge of the training views.
-        step: step along a ray, in voxels.
-
-    Returns:
-        cameras, images: (n, h, w, 4) float32, premultiplied RGBA.
-
-    Raises:
-        DataError, UsageError: see `convert`; cameras differ in size.
-    """
-    import numpy as np
-
-    from vvgt_cli.cameras.boxed import render_in_box
-    from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.field.source import load
-
-    views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
-    if len({(view.width, view.height) for view in views}) != 1:
-        raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
-    source = load(source_of(volume, look, reading))
-    scene = source.scene()
-    draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
-    return views, np.stack([draw(view) for view in views])
