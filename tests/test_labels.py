@@ -396,6 +396,12 @@ CATEGORICAL = [{"Name": "organs", "IndexedColors": [1, 0.2, 0, 0, 0, 1], "Annota
 NAMES = {"1": "skin", "3": "core"}
 
 
+def test_what_may_be_anything_is_no_table(vvgt, tmp_path: Path) -> None:
+    for name, text in (("a.json", '{"a": 1}'), ("b.csv", "x,y\n1,2\n"), ("c.csv", "1,2\n3,4\n")):
+        (tmp_path / name).write_text(text)
+        assert "of no known format" in vvgt.fails(1, "info", tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("table_json", "pick"),
     [

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from vvgt_cli.commands.check import check
     from vvgt_cli.commands.evaluate import evaluate
     from vvgt_cli.commands.infer import infer
+    from vvgt_cli.commands.info import info
     from vvgt_cli.commands.optimize import optimize
     from vvgt_cli.commands.recolor import recolor
     from vvgt_cli.commands.render import render
@@ -55,10 +56,8 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
-    **{
-        f"commands.{name}": (name,)
-        for name in ("check", "evaluate", "infer", "optimize", "recolor", "render", "render_views", "synth", "view")
-    },
+    **{f"commands.{name}": (name,) for name in ("check", "evaluate", "infer", "info", "optimize", "recolor", "render")},
+    **{f"commands.{name}": (name,) for name in ("render_views", "synth", "view")},
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -86,6 +85,7 @@ __all__ = [
     "evaluate",
     "export_plotter",
     "infer",
+    "info",
     "optimize",
     "orbit_views",
     "read_ply",
