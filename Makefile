@@ -1,8 +1,8 @@
-# make test | quick | lint | docs | long | mutants | viewers | page | model | ci
+# make test | quick | lint | formats | docs | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format docs long fuzz mutants viewers page model ci
+.PHONY: test quick lint format formats docs long fuzz mutants viewers page model ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -28,6 +28,10 @@ lint: $(VENV)/bin/pytest
 format: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
+
+# Endings of files in modules of other programs, which cannot read our table of formats.
+formats: $(VENV)/bin/pytest
+	$(VENV)/bin/python -m tests.endings
 
 # The documentation as a site that can be searched: out/docs/index.html.
 docs: $(VENV)/bin/pytest
