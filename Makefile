@@ -12,7 +12,7 @@ $(VENV)/bin/pytest: pyproject.toml constraints.txt
 test: $(VENV)/bin/pytest
 	$(VENV)/bin/pytest -n 2 --dist loadfile
 
-# While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
+# While working, for less than a minute once kernels are compiled: the order of subpackages, pages, cameras, pictures, metrics, the
 # splatter and the ray caster's scenes, transfer functions, most formats; ten examples a property, no conversions.
 QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images \
 	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene look_readers look_resolve volume_affines \

@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, read_ply, read_volume
+    from vvgt_cli.library.functions import Session, convert, read_ply, read_volume
     from vvgt_cli.library.inputs import Goal, Look
-    from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import Volume
@@ -48,9 +47,8 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "read_ply", "read_volume"),
+    "library.functions": ("Session", "convert", "read_ply", "read_volume"),
     "library.inputs": ("Goal", "Look"),
-    "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
     "conversion.result": ("Conversion", "Result"),
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),

@@ -1,10 +1,10 @@
-"""The commands as functions, with the options of docs/commands."""
+"""Conversions and reading as functions, and sessions: a volume for several conversions."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
@@ -18,12 +18,14 @@ from vvgt_cli.library.inputs import (
     VolumeLike,
     blocks_of,
     console_of,
+    content_of,
     looks_of,
     source_of,
     volume_of,
     with_look,
 )
 from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import Stored
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.clouds import Clouds
@@ -110,3 +112,41 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     from vvgt_cli.conversion.gaussian_files import open_gaussians
 
     return open_gaussians(os.fspath(path))
+
+
+class Session:
+    """A volume, read and laid out once, for conversions under one function after another.
+
+    >>> import vvgt_cli as vvgt
+    >>> session = vvgt.Session("example:blob:16")
+    >>> few = {"max_gaussians": 20, "size": 32, "steps": 0}
+    >>> [len(session.convert(tf, few).gaussians) <= 20 for tf in ("gray", "viridis")]
+    [True, True]
+
+    It can be passed wherever the library takes a volume.
+
+    Args:
+        volume, reading: as in `convert`.
+
+    Raises:
+        DataError, UsageError: see `convert`.
+    """
+
+    def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
+        """Read the volume; see the class."""
+        self.content = content_of(volume, reading)
+        if isinstance(self.volume.data, Stored):
+            raise UsageError(
+                f"{self.volume.name}: a Dask array, which is not in memory; convert it without a session, or pass "
+                "the result of its compute()"
+            )
+        self.content.prepare()
+
+    @property
+    def volume(self) -> Volume:
+        """Return the volume, or the first of colours and channels."""
+        return self.content.volumes[0]
+
+    def convert(self, look: LooksLike = None, goal: GoalLike = None, **options: Any) -> Conversion | Clouds:
+        """Convert the volume under another look, or several, with the options of `convert`."""
+        return convert(self, look, goal, **options)

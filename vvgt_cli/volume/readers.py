@@ -28,7 +28,7 @@ def lazy(name: str, *first: Any) -> Callable[..., Any]:
     """Make a function that stands for another one and imports its module when it is called.
 
     Args:
-        name: ``family.module.function`` in this room.
+        name: ``family.module.function`` in this subpackage.
         *first: arguments that go before those of the call.
     """
     return partial(_call, name, *first)
