@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.field.field import Field
 
-FORMATS = ("both", "exr", "png")
 CONTACT = "contact.png"
 POINTS_FILE = "points3d.ply"  # the original 3DGS code looks for this name
 POINTS = 20_000  # Gaussians of the closed form whose centres become the cloud
