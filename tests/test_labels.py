@@ -282,7 +282,7 @@ def test_in_python() -> None:
     entries = {1: {"color": [1, 0, 0], "opacity": 0.1}, 3: {"color": "#0000ff"}}
     result = library.convert(balls(), library.Look(labels=entries), {"max_gaussians": 300, "size": 64, "steps": 0})
     assert result.gaussians.colors[:, 1].max() < 0.05
-    _, images = library.render_views(balls(), library.Look(labels=entries), cameras=2, size=32)
+    _, images = library.render_views(balls(), library.Look(labels=entries), views=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
     assert images[..., 1].max() == 0
     refused(DataError, "no entry", library.convert, balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
@@ -394,6 +394,12 @@ NNUNET = {"channel_names": {"0": "CT"}, "labels": {"background": 0, "skin": 1, "
 DECATHLON = {"modality": {"0": "CT"}, "labels": {"0": "background", "1": "skin", "3": "core"}}
 CATEGORICAL = [{"Name": "organs", "IndexedColors": [1, 0.2, 0, 0, 0, 1], "Annotations": ["1", "skin", "3", "core"]}]
 NAMES = {"1": "skin", "3": "core"}
+
+
+def test_what_may_be_anything_is_no_table(vvgt, tmp_path: Path) -> None:
+    for name, text in (("a.json", '{"a": 1}'), ("b.csv", "x,y\n1,2\n"), ("c.csv", "1,2\n3,4\n")):
+        (tmp_path / name).write_text(text)
+        assert "of no known format" in vvgt.fails(1, "info", tmp_path / name)
 
 
 @pytest.mark.parametrize(

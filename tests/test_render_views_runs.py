@@ -8,7 +8,7 @@ import pytest
 
 from tests.processes import replaced
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
-from vvgt_cli.commands.view_sets import CameraRequest
+from vvgt_cli.commands.view_sets import camera_views
 from vvgt_cli.conversion.manifest import Manifest, Shard, read_manifest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import cameras_digest, volume_digest
@@ -188,7 +188,7 @@ def test_digests_tell_contents_apart():
     changed = data.copy()
     changed[1, 2, 3] += 1
     assert volume_digest(Volume(changed)) != base
-    cameras = [view.camera for view in CameraRequest(views=2, test_views=0, size=30).make()]
+    cameras = [view.camera for view in camera_views("sphere", 2, 0, 30)]
     assert cameras_digest(cameras) == cameras_digest([camera.resized(2) for camera in cameras])
     assert cameras_digest(cameras) != cameras_digest(cameras[::-1])
 

@@ -9,15 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.function import PER_VOXEL, TransferFunction
+from vvgt_cli.look.function import BY, PER_VOXEL, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import Volume
 
-BY = {"percentile": "percentiles", "foreground": "percentiles of the foreground", "sigma": "standard deviations"}
-BY |= {"mean": "multiples of the mean", "level": "levels"}
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
