@@ -79,17 +79,10 @@ def test_a_function_of_whole_numbers() -> None:
         ("", "a.ctbl", "no label"),
         ("1 a 1 2 3 4\n1 b 1 2 3 4\n", "a.ctbl", "label 1 twice"),
         ("1 a 300 2 3 4\n", "a.ctbl", r"in \[0, 1\]"),
-        ("[1]", "a.json", "'1', without a number"),
-        ('{"liver": {}}', "a.json", "'liver'"),
         ('{"1": {"color": [0, 0, 1], "opacity": 2}}', "a.json", "opacity 2"),
-        ('{"1": {"color": "red"}}', "a.json", "three numbers"),
         ("{", "a.json", "not JSON .*expected a table of labels"),
         ("9" * 5000 + " a 1 2 3 4\n", "a.ctbl", "line 1"),
-        ("1 a 2 3 4 " + "9" * 400 + "\n", "a.ctbl", "line 1"),
-        ("1 255 51 0 " + "9" * 400 + ' 1 1 "a"\n', "a.label", "line 1"),
         ("1" + " " * 100_000 + "x\n", "a.ctbl", "line 1"),  # an expression took the third power of this
-        (SEGMENTS.replace("Segment1", "Segment" + "9" * 5000).replace("Segment0", "Other"), "a.seg.nrrd", "no label"),
-        (SEGMENTS.replace("0 0 1\n\n", "0 x\n\n"), "a.seg.nrrd", "segment 1"),
         (SEGMENTS.replace("Segment", "Other"), "a.seg.nrrd", "no label"),
     ],
 )
@@ -232,7 +225,6 @@ def test_extinctions_of_labels_add_up_to_the_whole() -> None:
         (balls(), SLICER.replace("3 inner_core", "4 other"), "have no entry in t.ctbl: 3; add them"),
         (balls(), "9 other 1 2 3 255\n", "none of its labels (1, 3) is in t.ctbl, which has 9"),
         (balls() * 0, SLICER, "no label other than 0"),
-        (balls() / 2, SLICER, "expected a label map, of whole numbers"),
     ],
 )
 def test_labels_that_do_not_fit_are_one_line(vvgt, tmp_path: Path, values, text: str, said: str) -> None:
@@ -471,23 +463,12 @@ def test_regions_are_groups_and_dataset_json_is_offered(vvgt, tmp_path: Path) ->
     [
         ('{"skin": 1, "core": 1}', "label 1 is 'core' and 'skin'|label 1 is 'skin' and 'core'"),
         ('{"1": "skin", "1": "core"}', "'1' twice"),
-        ('{"1": "skin", "01": "core"}', r"label 1 twice \(skin, core\)"),
         ('{"labels": {}}', "no labels"),
-        ('{"labels": 1}', "no object"),
         ('{"skin": 1.5}', "'skin'"),
-        ('{"skin": []}', "'skin'"),
-        ('{"skin": true}', "'skin'"),
         ('{"a": {"1": "x"}, "b": {"1": "y"}}', "one of a, b"),
         ('[{"IndexedColors": [0, 0, 0]}]', "no Annotations"),
-        ('[{"IndexedColors": [0, 0], "Annotations": ["1", "a"]}]', "IndexedColors"),
-        ('[{"IndexedColors": [0, 0, 2], "Annotations": ["1", "a"]}]', r"\[0, 1\]"),
-        ('[{"IndexedColors": [0, 0, 0], "Annotations": ["low", "a"]}]', "no Annotations"),
-        ('[{"IndexedColors": [0, 0, 0], "Annotations": ["1", "a", "1", "b"]}]', "label 1 twice"),
-        ('{"labels": {"skin": 1', "not JSON"),
         ('[{"name": "skin"}]', "without a number"),
-        ('[{"id": 1, "name": "skin"}, {"id": 1, "name": "core"}]', r"label 1 twice \(skin, core\)"),
         ('{"1": [256, 0, 0]}', "label 1: colour: .*three numbers"),
-        ('{"1": ["a", 0, 0]}', "label 1: colour"),
     ],
 )
 def test_faulty_names_in_json(tmp_path: Path, text: str, said: str) -> None:

@@ -17,7 +17,7 @@ from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.viewer import streamed_resources
 from vvgt_cli.conversion.cut import TileGaussians
 from vvgt_cli.conversion.index import named_files
-from vvgt_cli.conversion.levels import SEEN_FROM, VIEW_PIXELS, CutErrors, FilePart, WrittenFiles, divide, level_errors
+from vvgt_cli.conversion.levels import SEEN_FROM, VIEW_PIXELS, CutErrors, WrittenFiles, divide, level_errors
 from vvgt_cli.conversion.parts import StoredGaussians, save
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
@@ -104,7 +104,7 @@ def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: P
     assert np.mean(np.array(apart) < 2e-3) > 0.97
 
 
-@pytest.mark.parametrize(("rule", "steps"), [("inria", "0"), ("playcanvas", "0"), ("playcanvas", "8")])
+@pytest.mark.parametrize(("rule", "steps"), [("inria", "0"), ("playcanvas", "8")])
 def test_errors_are_those_of_what_is_in_the_files(vvgt, volume, folder: Path, tmp_path: Path, rule, steps) -> None:
     if rule != "inria":
         folder = tmp_path / "out"
@@ -278,15 +278,6 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
     assert not list(tmp_path.glob(".*"))
 
 
-def test_files_hold_neighbouring_nodes_of_one_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.levels.A_FILE", 10)
-    parts, places = divide(np.array([[6, 1], [5, 2], [12, 4], [1, 3]]))
-    assert parts == (FilePart(0, 0, 0, 2), FilePart(1, 0, 0, 4), FilePart(0, 1, 2, 3), FilePart(0, 2, 3, 4))
-    assert [lods[0]["offset"] for lods in places] == [0, 6, 0, 0]
-    assert [lods[0]["file"] for lods in places] == [0, 0, 2, 3]
-    assert [lods[1]["offset"] for lods in places] == [0, 1, 3, 7]
-
-
 def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path) -> None:
     def written(seed: int, name: str) -> bytes:
         random, store = np.random.default_rng(seed), BlockStore(tmp_path / name)
@@ -327,13 +318,6 @@ def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, 
     assert (other / "notes.txt").is_file()  # not of the manifest
 
 
-def test_nothing_else_in_the_folder_is_touched(vvgt, volume: Path, tmp_path: Path) -> None:
-    (tmp_path / "2024_11").mkdir()
-    (tmp_path / "2024_11" / "notes.txt").write_text("of someone")
-    vvgt.ok("init", volume, *FIT, "-o", tmp_path / "lod-meta.json")
-    assert (tmp_path / "2024_11" / "notes.txt").read_text() == "of someone"
-
-
 def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
     facts = json.loads(vvgt("info", folder / "lod-meta.json", "--json").out)
     manifest = json.loads((folder / "lod-meta.json").read_text())
@@ -370,14 +354,9 @@ def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Pa
     [
         (lambda m: m.update(lodLevels=0), "no lodLevels"),
         (lambda m: m.update(filenames=["../../etc/passwd"]), "expected files FOLDER/meta.json"),
-        (lambda m: m.update(filenames=["a/../../b/meta.json"]), "expected files FOLDER/meta.json"),
         (lambda m: m.update(filenames=["/0_0/meta.json"]), "expected files FOLDER/meta.json"),
-        (lambda m: m.update(filenames=[3]), "expected files FOLDER/meta.json"),
-        (lambda m: m.update(tree=5), "expected nodes with children or lods"),
         (lambda m: m["tree"]["children"].append({"children": [7]}), "expected nodes with children or lods"),
         (lambda m: m["tree"]["children"][0]["lods"].update({"0": {"file": 99, "offset": 0, "count": 1}}), "a node has"),
-        (lambda m: m["tree"]["children"][0]["lods"].update({"x": {"file": 0, "offset": 0, "count": 1}}), "a node has"),
-        (lambda m: m["tree"]["children"][0]["lods"].update({"0": []}), "a node has"),
     ],
 )
 def test_manifests_that_cannot_be_are_one_line(folder, tmp_path, change, text) -> None:
