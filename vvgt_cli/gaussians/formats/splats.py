@@ -125,6 +125,12 @@ def logits_of(opacities: np.ndarray) -> np.ndarray:
     return result
 
 
+def log_scales_of(scales: np.ndarray) -> np.ndarray:
+    """Return the natural logarithms (K, 3) float32 of standard deviations, -80 and above so that they are finite."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(scales.astype(np.float64)), -80).astype(np.float32)
+
+
 def morton_order(means: np.ndarray) -> np.ndarray:
     """Return the order (K,) along the Morton curve, which keeps neighbours in space close together."""
     low, high = means.min(axis=0), means.max(axis=0)
