@@ -66,7 +66,7 @@ def test_twin_of_the_normal_equations(degree, monkeypatch):
 
 def test_adjoint():
     g = shiny(50, 3)
-    system = fit.ViewDependentSystem(g, [c.position for c in CAMERAS], [project(g, c) for c in CAMERAS], 1.0)
+    system = fit.ViewDependentSystem(g, [project(g, c) for c in CAMERAS], [c.position for c in CAMERAS])
     rng = np.random.default_rng(0)
     unknowns = rng.standard_normal((50, 16, 3))
     images = [rng.standard_normal((40, 40, 3)).astype(np.float32) for _ in CAMERAS]

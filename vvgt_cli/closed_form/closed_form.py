@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
+from vvgt_cli.closed_form.fit import blending_weights, solve_colors, weights_and_errors
 from vvgt_cli.closed_form.lit import Shading
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.pyramid import Pyramid, Tile
@@ -124,7 +124,7 @@ class ClosedForm(Pyramid):
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
             gaussians = solve_colors(self.gaussians_of(leaves, style), cameras, views, rounds=1, rule=rule)
-            error = image_errors(gaussians, cameras, views, rule)
+            _, error = weights_and_errors(gaussians, cameras, views, rule)
             room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
             order = np.argsort(-error, kind="stable")
             order = order[leaves.edge[order].min(axis=1) >= smallest]
@@ -311,8 +311,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
     """
     wrong, predicted = np.zeros(len(tree)), np.zeros(len(tree))
     wrong[ids], predicted[ids] = errors, score[ids]
-    levels = list(_levels(tree))
-    for level in levels[:0:-1]:
+    for level in tree.levels[:-1]:
         parents = tree.parent[level]
         for sums in (wrong, predicted):
             sums[parents[0] : parents[-1] + 1] += np.bincount(parents - parents[0], sums[level])
@@ -320,7 +319,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         return score
     factor, mean = np.ones(len(tree)), wrong[-1] / predicted[-1]
     prior = SHARED * predicted[-1] / len(ids)
-    for level in levels[1:]:
+    for level in tree.levels[-2::-1]:
         above = factor[tree.parent[level]]
         factor[level] = np.where(
             predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
@@ -334,14 +333,3 @@ def unseen(weights: np.ndarray, most: int) -> np.ndarray:
     found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
     found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
     return found
-
-
-def _levels(tree: Tree) -> Iterator[np.ndarray]:
-    """Yield the rows of each level, which lie together, from the root down."""
-    level = np.array([len(tree) - 1])
-    while True:
-        yield level
-        inner = level[tree.children[level] > 0]
-        if not len(inner):
-            return
-        level = np.arange(tree.first[inner[0]], tree.first[inner[-1]] + tree.children[inner[-1]])

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Voxels
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import Optics
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.scene import Scene
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -69,7 +72,7 @@ def shade_cell(shape: Sequence[int]) -> int:
     return cell
 
 
-def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
+def mean_extinction(scene: Scene, cell: int) -> np.ndarray:
     """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
     from vvgt_cli.dvr.shadows import cell_extinction
 
@@ -78,29 +81,9 @@ def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
     return out
 
 
-class Absorbing(Protocol):
-    """Medium that attenuates rays, as kernels take it, and its voxels' edges (3,) in the unit frame."""
-
-    @property
-    def voxels(self) -> Voxels:
-        """Stored values."""
-
-    @property
-    def optics(self) -> Optics:
-        """Optics over the stored values."""
-
-    @property
-    def empty(self) -> np.ndarray:
-        """Distance to visible bricks, (bz, by, bx) uint8."""
-
-    @property
-    def step(self) -> np.ndarray:
-        """Voxel edges (3,), unit frame."""
-
-
 @dataclass(frozen=True)
 class Matter:
-    """A grid of extinction, as `Absorbing` has it."""
+    """A grid of extinction; attributes as of `Scene`."""
 
     voxels: Voxels
     optics: Optics
@@ -118,7 +101,7 @@ class Matter:
 
 
 def transmittance(
-    matter: Absorbing, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
+    matter: Matter | Scene, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
     offset: float | None = None, wanted: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].
