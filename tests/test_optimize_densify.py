@@ -92,14 +92,14 @@ def test_what_a_gaussian_has_learned_goes_with_it():
     state = Densified(g, CAMERAS, options)
     for camera, image in zip(CAMERAS, target, strict=True):
         state.step(camera, image, 0.0, 1.0)
-    before = [moment[0].copy() for moment in state.running]
+    before = [moment.copy() for moment in state.running]
     state.slopes[:] = np.where(np.arange(60) < 7, 1.0, 0.0)
     state._densify()
     assert len(state.arrays[0]) == 67
     for moment, kept in zip(state.running, before, strict=True):
-        np.testing.assert_array_equal(moment[0][7:60], kept[7:])
-        assert not moment[0][60:].any()
-        assert not moment[0][:7].any()  # both halves of a split are new
+        np.testing.assert_array_equal(moment[7:60], kept[7:])
+        assert not moment[60:].any()
+        assert not moment[:7].any()  # both halves of a split are new
 
 
 def test_a_run_grows_to_its_limit_and_gets_nearer():

@@ -46,7 +46,7 @@ SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 
 REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 CUT_VIEWS = 8
-TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
+LARGER_SIZE_WEIGHT = 0.6  # of the error at twice the size, where styles of surface compete
 INSIDE = 0.1  # least transmittance of what other functions may show (0: dark insides; 0.3: surfaces lose 1 dB)
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
 
@@ -278,15 +278,15 @@ def fit(
 
 
 def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> float:
-    """Return mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+    """Return mean squared colour error at the views' size, plus `LARGER_SIZE_WEIGHT` times that at twice the size.
 
-    A file that leans on the renderer's 0.3 px looks right at one size only.
+    That is of pictures averaged 2 x 2. A file that leans on the renderer's 0.3 px looks right at one size only.
     """
     total = 0.0
     for camera, view in zip(cameras, views, strict=True):
         halved = render(gaussians, camera, rule.at(0.5))
         total += float(np.mean((render(gaussians, camera, rule) - view)[..., :3] ** 2))
-        total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
+        total += LARGER_SIZE_WEIGHT * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)
 
 

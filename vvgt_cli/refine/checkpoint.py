@@ -29,7 +29,7 @@ _FAULTS = (
     *(zipfile.BadZipFile, struct.error),
 )
 
-STEPPED = 5  # raised when the same start and options step otherwise, or what is kept has other names
+STEPPED = 6  # raised when the same start and options step otherwise, or what is kept has other names
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:

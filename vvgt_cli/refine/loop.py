@@ -37,16 +37,10 @@ KEEP = 30.0  # seconds after which a run is kept, scored or not
 
 
 def run(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: np.ndarray,
-    options: OptimizeOptions,
-    check: Check | None,
-    progress: Progress | None,
-    stop: Callable[[], bool] | None,
-    free: np.ndarray | None = None,
-    weights: Sequence[np.ndarray] | None = None,
-) -> tuple[Gaussians, OptimizeRecord]:
+    gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, options: OptimizeOptions, check: Check | None,
+    progress: Progress | None, stop: Callable[[], bool] | None, free: np.ndarray | None,
+    weights: Sequence[np.ndarray] | None,
+) -> tuple[Gaussians, OptimizeRecord]:  # fmt: skip
     """Run `optimize` without its defaults."""
     _fit("training", cameras, images, None, weights)
     if check is not None:
@@ -220,13 +214,7 @@ class Densified(Fields):
         self.slopes, self.seen = np.zeros(len(self.arrays[0])), np.zeros(len(self.arrays[0]), np.int64)
 
     def descend(
-        self,
-        camera: Camera,
-        projection: Projection,
-        image: np.ndarray,
-        grad: np.ndarray,
-        share: float,
-        speed: float,
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, share: float, speed: float
     ) -> None:
         """Take one step, with density control where it is due."""
         seen = self.colors_from(camera)
@@ -261,15 +249,13 @@ class Densified(Fields):
         score = self.slopes / np.maximum(self.seen, 1)
         denser, origin = densify(self.gaussians(), score, self.limit, self.extent, self.rng)
         self.arrays = tuple(denser.arrays().values())
-        for index, moment in enumerate(self.running):
-            kept = [np.where(_wide(origin >= 0, a), a[origin], 0) for a in moment]
-            self.running[index] = (kept[0], kept[1])
+        self.running = [np.where(_wide(origin >= 0, moment), moment[origin], 0) for moment in self.running]
         self._forget()
 
     def _reset(self) -> None:
         logits, most = self.arrays[3], math.log(RESET_TO / (1 - RESET_TO))
         np.minimum(logits, most, out=logits)
-        for moment in self.running[3]:
+        for moment in self.running[6:8]:
             moment[:] = 0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -25,11 +24,11 @@ from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, p
 MEMORY = 0.9  # share of the running error that a step keeps
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
-WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
+DAMPING = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
 MEDIAN = 512  # of the sample that the median is of, or less than twice as many; all, where there are fewer
-GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
-OUTLIER = 100.0  # times the median that a slope counts in that mean
-GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
+DAMPING_OF_SOME = 1.0  # instead, where some are free: descended on before, so only what is wrong now goes far
+SLOPE_CAP = 100.0  # times the median: what a slope counts at most in that mean
+KNOWN_HARMONICS_RATE = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
 
 DEFAULT = OptimizeOptions()
 
@@ -47,15 +46,16 @@ def _has_harmonics(harmonics: np.ndarray | None) -> bool:
     return bool(harmonics[:, degree**2 - 1 :].any())
 
 
-class State(Protocol):
+class State(ABC):
     """What a descent works on, whatever its method and wherever it is.
 
     Attributes:
         STEADY: what falls far behind its best can be put back there, and a run without gain is at its end.
     """
 
-    STEADY: bool
+    STEADY = True
 
+    @abstractmethod
     def step(
         self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
     ) -> None:
@@ -64,30 +64,35 @@ class State(Protocol):
         Rates are multiplied by ``speed``, differences from the view by ``weight`` (h, w).
         """
 
+    @abstractmethod
     def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
         """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
 
+    @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on and that the start does not give again; the fields ``array_i``."""
 
+    @abstractmethod
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
 
+    @abstractmethod
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians, as a file has them."""
 
 
-class OnHost(ABC):
+class OnHost(State):
     """A state whose steps the CPU takes.
 
     Attributes:
         arrays: what is descended on, colours and harmonics last.
+        running: Adam's two moments of each array that it takes one by one.
         error: running RMS error of the pictures.
         taken: number of steps.
     """
 
-    STEADY = True
     arrays: tuple[np.ndarray, ...]
+    running: list[np.ndarray]
 
     def __init__(self, options: OptimizeOptions) -> None:
         """Begin before the first step."""
@@ -104,18 +109,20 @@ class OnHost(ABC):
         self.descend(camera, projection, image, grad, share, speed)
 
     def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
-        """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
+        """Implement `State.picture`."""
         colors = np.maximum(self.colors_from(camera), 0)
         return blend(self.project(camera, rule), colors, camera.height, camera.width, blocks)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Return the fields, and what is counted."""
-        counted = {"step": np.array(self.taken), "error": np.array(self.error)}
-        return {f"array_{i}": array for i, array in enumerate(self.arrays)} | counted
+        """Return the fields, their moments, and what is counted."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        named |= {f"running_{i}": array for i, array in enumerate(self.running)}
+        return named | {"step": np.array(self.taken), "error": np.array(self.error)}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.taken, self.error = int(saved["step"]), float(saved["error"])
 
     @abstractmethod
@@ -132,10 +139,6 @@ class OnHost(ABC):
     ) -> None:
         """Take one step from a picture and the slope of the loss by it, (h, w, 4); others as of `State.step`."""
 
-    @abstractmethod
-    def gaussians(self) -> Gaussians:
-        """Return the current Gaussians, as a file has them."""
-
 
 class OwnAxes(OnHost):
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
@@ -143,7 +146,7 @@ class OwnAxes(OnHost):
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
     run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), or only
     some are free, of however many, rates count `OWN` times, and slopes that are small beside the others' count less.
-    Harmonics up to a degree that the start has change by `GIVEN` of the rate of those that begin at zero.
+    Harmonics up to a degree that the start has go by `KNOWN_HARMONICS_RATE` of the rate of those that begin at zero.
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
@@ -168,7 +171,7 @@ class OwnAxes(OnHost):
             np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
             *([] if harmonics is None else [harmonics.copy()]),
         )
-        self.harmonic_rate = float(self.RATES[5]) * (GIVEN if _has_harmonics(harmonics) else 1.0)
+        self.harmonic_rate = float(self.RATES[5]) * (KNOWN_HARMONICS_RATE if _has_harmonics(harmonics) else 1.0)
         self.running = [np.zeros_like(array) for array in self.arrays[4:] for _ in range(2)]
         self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
         self.first, self.second = (np.zeros((steps.COUNT, len(gaussians)), np.float32) for _ in range(2))
@@ -176,8 +179,8 @@ class OwnAxes(OnHost):
         self.spread = options.rule.dilation * pixel**2
         # what has been descended on before is not wrong alike any more
         self.shared = shared_steps(*self.arrays[:4]) if free is None else None
-        self.weakest = 0.0 if free is None and self.shared is None else WEAKEST if free is None else GOING_ON
-        self.own_rates = self.RATES * self.OWN if self.weakest else self.RATES
+        self.damping = DAMPING_OF_SOME if free is not None else DAMPING if self.shared is not None else 0.0
+        self.own_rates = self.RATES * self.OWN if self.damping else self.RATES
         self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
@@ -225,30 +228,28 @@ class OwnAxes(OnHost):
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what is added to Adam's divisors, features and shared weights; from slopes ``rows`` (COUNT, K)."""
-        if not self.weakest:
+        if not self.damping:
             return np.full(len(rows), EPSILON, np.float32), *NONE
         every, count = sample_of(rows.shape[1])
         directions, sizes = np.empty((2, len(rows), count), np.float32)
         steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.taken, every, directions, sizes)
         few = sizes[:, :: max(count // MEDIAN, 1)]
         medians = [np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few]
-        most = np.array([OUTLIER * median for median in medians], np.float64)
+        most = np.array([SLOPE_CAP * median for median in medians], np.float64)
         floors = np.empty(len(rows), np.float32)
-        steps.adam_directions(sizes, most, self.weakest, directions, floors)
+        steps.adam_directions(sizes, most, self.damping, directions, floors)
         if self.shared is None:
             return floors, *NONE
         return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Return all that the next steps depend on and that the start does not give again."""
-        named = super().saved() | {f"running_{i}": array for i, array in enumerate(self.running)}
-        named |= self.shared.saved() if self.shared is not None else {}
-        return named | {"first": self.first.T, "second": self.second.T}
+        """Implement `State.saved`."""
+        shared = {} if self.shared is None else self.shared.saved()
+        return super().saved() | shared | {"first": self.first.T, "second": self.second.T}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         super().restore(saved)
-        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
         if self.shared is not None:
             self.shared.restore(saved)
@@ -279,7 +280,7 @@ class Fields(OnHost):
         """Begin at ``gaussians``, with moments of 0; all of them move."""
         super().__init__(options)
         self.arrays = tuple(array.copy() for array in gaussians.arrays().values())
-        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
+        self.running = [np.zeros_like(array) for array in self.arrays for _ in range(2)]
 
     def colors_from(self, camera: Camera) -> np.ndarray:
         """Return (K, 3) colours as the camera sees them, which may be negative."""
@@ -303,23 +304,10 @@ class Fields(OnHost):
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.taken += 1
-        found = [getattr(slopes, field) for field in gaussians.arrays()]
-        used = rates[: len(found)]
-        for array, slope, rate, (first, second) in zip(self.arrays, found, used, self.running, strict=True):
-            values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
-            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.taken, moment, square)
-
-    def saved(self) -> dict[str, np.ndarray]:
-        """Return all that the next steps depend on."""
-        named = super().saved()
-        for i, (first, second) in enumerate(self.running):
-            named |= {f"first_{i}": first, f"second_{i}": second}
-        return named
-
-    def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Put back what `saved` gave."""
-        super().restore(saved)
-        self.running = [(saved[f"first_{i}"], saved[f"second_{i}"]) for i in range(len(self.arrays))]
+        for i, field in enumerate(gaussians.arrays()):
+            columns = self.arrays[i], getattr(slopes, field), *self.running[2 * i : 2 * i + 2]
+            values, slope, moment, square = (array.reshape(-1) for array in columns)
+            steps.adam(values, slope, rates[i], *self.BETAS, self.taken, moment, square)
 
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians."""
