@@ -18,7 +18,7 @@ from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks
 from vvgt_cli.field.digests import digest, values_digest
-from vvgt_cli.field.field import Picture, ViewRenderer
+from vvgt_cli.field.field import Field, Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.reader import Scalars
@@ -85,8 +85,8 @@ class MissingBlocks(Exception):
 
 
 @dataclass
-class Blocked:
-    """A field (`vvgt_cli.field.field.Field`) that reads its volume block by block, and renders its own pictures.
+class Blocked(Field):
+    """A field that reads its volume block by block, and renders its own pictures.
 
     Attributes:
         source: the opened volume and its look.
@@ -111,11 +111,6 @@ class Blocked:
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
     renderer: ViewRenderer | None = None
-
-    @property
-    def views(self) -> ViewRenderer:
-        """Implement `Field.views`."""
-        return self.renderer or self
 
     @cached_property
     def frame(self) -> BoxFrame:
@@ -258,10 +253,9 @@ class Blocked:
         """Implement `Field.normals`."""
         if self.light is None:
             return None
-        from vvgt_cli.closed_form.lit import mean_normals, normal_points
+        from vvgt_cli.closed_form.lit import mean_normals
 
-        points = normal_points(gaussians)
-        return mean_normals(points, self._normals_and_extinction(points), self.frame.half)
+        return mean_normals(gaussians, self._normals_and_extinction, self.frame.half)
 
     def _normals_at(self, points: np.ndarray) -> np.ndarray:
         return self._normals_and_extinction(points)[:, :3]

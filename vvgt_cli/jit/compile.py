@@ -59,24 +59,23 @@ def usual_types(kernel: Any, volume: str) -> tuple[Any, ...]:
     `V` are read-only values (nz, ny, nx) of type ``volume``, `E` of float32.
     """
     tuples = {kind.__name__: (kind, fields) for kind, fields in kernel.tuples.items()}
-    return _types(kernel.usual, tuples, volume)
 
+    def types(usual: str) -> tuple[Any, ...]:
+        found: list[Any] = []
+        for word in usual.split():
+            name, _, axes = word.partition(":")
+            if name in tuples:
+                kind, fields = tuples[name]
+                found.append(numba.types.BaseTuple.from_types(types(fields), kind))
+            elif name in ("V", "E"):
+                values = getattr(numba.types, volume if name == "V" else "float32")
+                found.append(numba.types.Array(values, 3, "C", readonly=True))
+            else:
+                scalar = getattr(numba.types, name)
+                found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
+        return tuple(found)
 
-def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tuple[Any, ...]:
-    """Return numba types for short names, and for those of named ``tuples`` {name: (class, types of its fields)}."""
-    found: list[Any] = []
-    for word in usual.split():
-        name, _, axes = word.partition(":")
-        if name in tuples:
-            kind, fields = tuples[name]
-            found.append(numba.types.BaseTuple.from_types(_types(fields, {}, volume), kind))
-        elif name in ("V", "E"):
-            values = getattr(numba.types, volume if name == "V" else "float32")
-            found.append(numba.types.Array(values, 3, "C", readonly=True))
-        else:
-            scalar = getattr(numba.types, name)
-            found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
-    return tuple(found)
+    return types(kernel.usual)
 
 
 def missing(jobs: Iterable[CompileJob]) -> list[CompileJob]:

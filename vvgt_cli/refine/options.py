@@ -41,7 +41,7 @@ class OptimizeOptions:
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
         texture: weight of the square of the high-frequency part of r, where the view is smooth
-            (`vvgt_cli.refine.texture`).
+            (`vvgt_cli.refine.loss`).
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.
         judge: by which the check views are drawn.

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import SH_C0, Gaussians
-from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
 from vvgt_cli.refine.loss import picture_slope
@@ -162,11 +162,10 @@ class OwnAxes(OnHost):
     ) -> None:  # fmt: skip
         """Keep only ``free`` (K,) bool moving; None: all."""
         super().__init__(options)
-        scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
         self.arrays = (
             gaussians.means.copy(),
-            np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
+            np.ascontiguousarray(axes_of(gaussians), np.float32),
             gaussians.opacity_logits.copy(),
             np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
             *([] if harmonics is None else [harmonics.copy()]),
@@ -200,17 +199,17 @@ class OwnAxes(OnHost):
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
-        slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
+        rows, by_harmonics = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         rates, pace = self.rates(share, speed)
         steps.own_axes(
-            slopes.rows, rates, self.CLIPS, self.spread,
+            rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.taken, means, factors, logits, colors, self.darkest, self.first, self.second,
-            *self.common(slopes.rows),
+            *self.common(rows),
         )  # fmt: skip
-        if harmonics is not None and slopes.harmonics is not None:
+        if harmonics is not None and by_harmonics is not None:
             rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
             first, second = (array.reshape(-1) for array in self.running)
-            values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
+            values, slope = harmonics.reshape(-1), by_harmonics.reshape(-1)
             steps.adam(values, slope, rate, *self.BETAS, self.taken, first, second)
         if len(self.fixed):
             for array, there in zip(self.arrays, self.there, strict=True):
