@@ -16,10 +16,9 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.checkpoint import fingerprint, resume, save
-from vvgt_cli.refine.judge import Judge
-from vvgt_cli.refine.loop import SLOPE, Densified, begin, densify
-from vvgt_cli.refine.states import KNOWN_HARMONICS_RATE
+from vvgt_cli.refine.checkpoint import Judge, fingerprint, resume, save
+from vvgt_cli.refine.loop import begin
+from vvgt_cli.refine.states import KNOWN_HARMONICS_RATE, SLOPE, Densified, densify
 from vvgt_cli.splat import render
 
 CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)

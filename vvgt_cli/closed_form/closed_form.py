@@ -32,6 +32,7 @@ from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import render
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
@@ -49,8 +50,6 @@ CUT_VIEWS = 8
 LARGER_SIZE_WEIGHT = 0.6  # of the error at twice the size, where styles of surface compete
 INSIDE = 0.1  # least transmittance of what other functions may show (0: dark insides; 0.3: surfaces lose 1 dB)
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +136,7 @@ def closed_form(
     budget: int,
     size: int,
     cameras: Sequence[Camera] | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     degree: int = 0,
     values: bool = False,
 ) -> ClosedForm:
@@ -161,7 +160,7 @@ def closed_form(
     )  # fmt: skip
 
 
-def part(progress: Progress | None, first: int, last: int) -> Callable[[float], None]:
+def part(progress: ProgressCallback | None, first: int, last: int) -> Callable[[float], None]:
     """Return a callback that maps its share to ``first`` to ``last`` per cent of the whole and reports it."""
     return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
 
@@ -244,7 +243,7 @@ def fit(
     form: ClosedForm,
     cameras: Sequence[Camera],
     views: np.ndarray,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
     """Cut the pyramid where views see errors, then colour its cells by all of them.

@@ -12,7 +12,7 @@ all that is seen of a Gaussian, `SHARE`. The mean square of a harmonic is 1/(4 p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import Projection, blend, gather, project, render
 from vvgt_cli.splat.render import seen_colors
 
@@ -28,8 +29,6 @@ PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
 ROUNDS = 6
 ENOUGH = 0.005  # share of the squared error below which another round is not worth its time
 BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other views thin the splats in front
-
-Progress = Callable[[int, int], None]
 
 
 def weights_and_errors(
@@ -61,7 +60,7 @@ def solve_colors(
     cameras: Sequence[Camera],
     views: np.ndarray,
     rounds: int = ROUNDS,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     twice_every: int = 0,
     rule: Rule = INRIA,
 ) -> Gaussians:
@@ -119,7 +118,7 @@ class System:
         return result
 
 
-def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress | None) -> np.ndarray:
+def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressCallback | None) -> np.ndarray:
     """Return the unknowns after conjugate gradients of `solve_colors`."""
     found = system.start.copy()
     rows = tuple(range(found.ndim - 1))  # all axes but the channels

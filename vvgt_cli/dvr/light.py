@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Voxels
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import Optics
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr.scene import Scene
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -72,15 +68,6 @@ def shade_cell(shape: Sequence[int]) -> int:
     return cell
 
 
-def mean_extinction(scene: Scene, cell: int) -> np.ndarray:
-    """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
-    from vvgt_cli.dvr.shadows import cell_extinction
-
-    out = np.empty(tuple(-(-n // cell) for n in scene.voxels.values.shape), np.float32)
-    cell_extinction(scene.voxels, scene.optics, scene.empty, cell, out)
-    return out
-
-
 @dataclass(frozen=True)
 class Matter:
     """A grid of extinction; attributes as of `Scene`."""
@@ -101,7 +88,7 @@ class Matter:
 
 
 def transmittance(
-    matter: Matter | Scene, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
+    matter: Matter, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
     offset: float | None = None, wanted: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].

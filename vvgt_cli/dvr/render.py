@@ -14,6 +14,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
+from vvgt_cli.progress import ProgressCallback
 
 # Pixels that differ from a neighbour by more than this get that many rays.
 ADAPTIVE = ((0.08, 5), (0.3, 13))
@@ -175,7 +176,7 @@ def render_views(
     scene: Scene | Viewed,
     cameras: Sequence[Camera],
     settings: RenderSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> np.ndarray:
     """Render views of one size: (n, height, width, 4) float32, premultiplied; ``progress(done, total)`` after each."""
     images = []

@@ -28,6 +28,7 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 
-Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds per step of a ray outside empty space: bonsai-tree in blocks of 128, two threads
 PATH_LENGTH = 1.5  # of a typical ray through the box, unit-frame lengths
 
@@ -53,7 +53,7 @@ class Pass:
 
     runner: Runner
     store: BlockStore
-    bar: Callable[[str], Progress | None]
+    bar: Callable[[str], ProgressCallback | None]
     shard: tuple[int, int] | None = None
 
     def __call__(self, task: Task, name: str, numbers: Sequence[int] | None = None) -> int:
@@ -170,7 +170,7 @@ class Blocked(Field):
             self.run_pass.store.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light, self.source.labels_alone)
 
-    def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import start_of
         from vvgt_cli.closed_form.closed_form import form_of, most_cells

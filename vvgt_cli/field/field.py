@@ -16,6 +16,7 @@ from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
@@ -73,7 +74,7 @@ class Field(ViewRenderer, Protocol):
     def workload(self, size: int, gaussians: int) -> Workload:
         """Return the counts and timings that stage costs depend on, for ``size`` px images and a Gaussian budget."""
 
-    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
@@ -127,7 +128,7 @@ class Resident(Field):
         """Implement `Field.workload`."""
         return measure(self.scene, size, gaussians)
 
-    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import initialise
 

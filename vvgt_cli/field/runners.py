@@ -10,7 +10,7 @@ import signal
 import subprocess
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import get_context
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import discard_leftovers
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.resources import memory_limit
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 
-Progress = Callable[[int, int], None]
 IDLE = 3  # consecutive pools that broke without finishing a block
 
 
@@ -60,7 +60,7 @@ class Runner:
     def __exit__(self, *error: object) -> None:
         """End the workers."""
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Process the blocks ``numbers``."""
         for done, number in enumerate(numbers, 1):
             task(number)
@@ -110,7 +110,7 @@ class Processes(Runner):
             self._alive.close()
             self._pool = None
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Process the blocks ``numbers``; raise DataError if workers are killed repeatedly without finishing one."""
         from concurrent.futures import ProcessPoolExecutor, as_completed
         from concurrent.futures.process import BrokenProcessPool
@@ -187,7 +187,7 @@ class DaskRunner(Runner):
         """End the workers that were started."""
         self._stack.close()
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Run the tasks; those of a lost worker are repeated on another.
 
         Raises:
