@@ -101,15 +101,12 @@ def test_every_round_lowers_the_objective() -> None:
 def test_adjoint() -> None:
     """<forward c, y> = <c, back y>."""
     gaussians = cloud(100, seed=1)
-    projections = [project(gaussians, camera) for camera in CAMERAS]
+    system = fit_module.System(gaussians, [project(gaussians, camera) for camera in CAMERAS])
     rng = np.random.default_rng(0)
     colors = rng.standard_normal((100, 3)).astype(np.float32)
     images = [rng.standard_normal((40, 40, 3)).astype(np.float32) for _ in CAMERAS]
-    left = sum(
-        float((fit_module._forward(p, colors, (40, 40)).astype(np.float64) * y).sum())
-        for p, y in zip(projections, images, strict=True)
-    )
-    back = fit_module._back(projections, images, 100)[:, 1:4]
+    left = sum((system.forward(i, colors, (40, 40)) * y).sum(dtype=np.float64) for i, y in enumerate(images))
+    back = system.back(images)
     assert left == pytest.approx(float((back * colors).sum()), rel=1e-4)
 
 

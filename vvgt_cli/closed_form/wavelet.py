@@ -48,7 +48,8 @@ def detail_energy(tree: Tree) -> np.ndarray:
     np.add.at(energy, tree.parent[:-1], (mass**2 / volume)[:-1])
     energy -= mass**2 / volume
     energy[tree.children == 0] = 0
-    energy = np.maximum(energy, 0) * np.sqrt(tree.largest)
+    np.maximum(energy, 0, out=energy)
+    energy *= np.sqrt(tree.largest)
     for level in tree.levels[1:]:  # the segments of reduceat are the children of each cell
         children = np.maximum.reduceat(energy[: level.start], tree.first[level])
         energy[level] = np.maximum(energy[level], children)
