@@ -19,8 +19,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import read_ply
 from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.refine.loss import loss_gradient
-from vvgt_cli.refine.ssim import add_ssim_gradient
+from vvgt_cli.refine.loss import add_ssim_gradient, loss_gradient
 from vvgt_cli.refine.states import OwnAxes
 from vvgt_cli.refine.steps import own_axes
 from vvgt_cli.splat import blend, render
@@ -47,7 +46,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     squares = np.empty(camera.height)
     loss_gradient(image, target, *weights, grad, squares)
     pairs = moments(p, colors, image, grad)
-    slopes = own_axes_backward(means, factors, colors, camera, p, pairs)
+    rows, _ = own_axes_backward(means, factors, colors, camera, p, pairs)
     state.taken = 1
     still = np.zeros(5), state.CLIPS, state.spread, *state.BETAS, 1  # rates 0: the scene stays as it is
     tiles_y = -(-camera.height // 16)
@@ -61,7 +60,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
         "moments": lambda: moments(p, colors, image, grad),
         "gradients": lambda: own_axes_backward(means, factors, colors, camera, p, pairs),
         "update": lambda: own_axes(
-            slopes.rows, *still, *state.arrays, state.darkest, state.first, state.second, *state.common(slopes.rows)
+            rows, *still, *state.arrays, state.darkest, state.first, state.second, *state.common(rows)
         ),
     }
 

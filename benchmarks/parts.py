@@ -31,7 +31,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "colours not sharpened": {"vvgt_cli.closed_form.pyramid.sharpened": lambda found, *_: found},
     "no cells by error": {"vvgt_cli.conversion.stages.cells.CellsByError.run": lambda *_: None},
     "hidden cells too": {"vvgt_cli.closed_form.closed_form.UNSEEN": 0.0},
-    "no floor of slopes": {"vvgt_cli.refine.states.WEAKEST": 0.0},
+    "no floor of slopes": {"vvgt_cli.refine.states.DAMPING": 0.0},
     "no steps in common": {"vvgt_cli.refine.shared.LEAST": NONE},
 }
 

@@ -380,8 +380,7 @@ def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
     from vvgt_cli.refine import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.refine.checkpoint import resume, save
-    from vvgt_cli.refine.judge import Judge
+    from vvgt_cli.refine.checkpoint import Judge, resume, save
     from vvgt_cli.refine.loop import begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:

@@ -5,7 +5,7 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import fit as fit_module
-from vvgt_cli.closed_form.fit import BRIGHTEST, PRIOR, blending_weights, image_errors, solve_colors, weights_and_errors
+from vvgt_cli.closed_form.fit import BRIGHTEST, PRIOR, blending_weights, solve_colors, weights_and_errors
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.splat import blend, project, render
@@ -101,15 +101,12 @@ def test_every_round_lowers_the_objective() -> None:
 def test_adjoint() -> None:
     """<forward c, y> = <c, back y>."""
     gaussians = cloud(100, seed=1)
-    projections = [project(gaussians, camera) for camera in CAMERAS]
+    system = fit_module.System(gaussians, [project(gaussians, camera) for camera in CAMERAS])
     rng = np.random.default_rng(0)
     colors = rng.standard_normal((100, 3)).astype(np.float32)
     images = [rng.standard_normal((40, 40, 3)).astype(np.float32) for _ in CAMERAS]
-    left = sum(
-        float((fit_module._forward(p, colors, (40, 40)).astype(np.float64) * y).sum())
-        for p, y in zip(projections, images, strict=True)
-    )
-    back = fit_module._back(projections, images, 100)[:, 1:4]
+    left = sum((system.forward(i, colors, (40, 40)) * y).sum(dtype=np.float64) for i, y in enumerate(images))
+    back = system.back(images)
     assert left == pytest.approx(float((back * colors).sum()), rel=1e-4)
 
 
@@ -136,7 +133,7 @@ def test_few_gaussians(count: int) -> None:
     assert np.isfinite(solved.colors).all()
     if count:
         assert (objective(solved, start, views) < 0.5 * objective(start, start, views)).all()
-    assert image_errors(solved, CAMERAS, views).shape == (count,)
+    assert weights_and_errors(solved, CAMERAS, views)[1].shape == (count,)
 
 
 def test_colours_stay_in_range() -> None:
@@ -167,16 +164,14 @@ def test_views_that_count_at_twice_the_size_draw_the_colours_there(monkeypatch: 
 def test_image_errors() -> None:
     truth = cloud(60, seed=5)
     views = pictures(truth)
-    assert image_errors(truth, CAMERAS, views).max() == 0
+    assert weights_and_errors(truth, CAMERAS, views)[1].max() == 0
     wrong = truth.colors.copy()
     wrong[17] += 0.2
     wrong = with_colors(truth, wrong)
-    errors = image_errors(wrong, CAMERAS, views)
+    weights, errors = weights_and_errors(wrong, CAMERAS, views)
     assert errors.min() >= 0
     a = design(truth)
     expected = a.T @ (0.6 * a[:, 17])  # weight x error: three channels that are 0.2 a[:, 17] off
     np.testing.assert_allclose(errors, expected, rtol=1e-3, atol=1e-4)
-    weights, again = weights_and_errors(wrong, CAMERAS, views)
-    np.testing.assert_array_equal(again, errors)
     np.testing.assert_allclose(weights, a.sum(axis=0), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(blending_weights(wrong, CAMERAS), weights, rtol=1e-12)

@@ -6,7 +6,7 @@ import pytest
 from tests.test_light import ABOVE, SLANTED, function
 from tests.test_light_vtk import smooth_ball
 from vvgt_cli.closed_form import METHODS, VbmOptions, initialise
-from vvgt_cli.closed_form.lit import at_points, even, highlights, mean_normals, normal_points
+from vvgt_cli.closed_form.lit import at_points, even, highlights, mean_normals
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.reference import normals
@@ -130,8 +130,7 @@ def test_of_an_opaque_body_the_surface_counts():
 def test_normals_of_a_ball_point_along_the_radius():
     scene = smooth_ball().lit(Lighting())
     gaussians = made(scene, 2)
-    points = normal_points(gaussians)
-    found = mean_normals(points, at_points(scene, points), scene.half)
+    found = mean_normals(gaussians, lambda points: at_points(scene, points), scene.half)
     radius = gaussians.means / np.linalg.norm(gaussians.means, axis=1, keepdims=True)
     surface = np.linalg.norm(gaussians.means, axis=1) > 0.4
     assert np.median(-(found * radius).sum(axis=1)[surface]) > 0.99  # values fall outwards

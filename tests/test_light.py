@@ -12,7 +12,7 @@ from vvgt_cli.closed_form.lit import ARRIVING, TINT, _shade, point_normals
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.light import ANGLE, OFFSET, RAYS, cone, sphere, transmittance
+from vvgt_cli.dvr.light import ANGLE, OFFSET, RAYS, Matter, cone, sphere, transmittance
 from vvgt_cli.dvr.reference import grid_values, normals, optics, trilinear
 from vvgt_cli.errors import UsageError
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
@@ -149,6 +149,10 @@ def brute_force(scene, points, directions, offset):
     return total / len(directions)
 
 
+def matter(scene):
+    return Matter(scene.voxels, scene.optics, scene.empty, scene.step)
+
+
 def test_the_grid_of_shadows_converges_to_rays_from_every_place():
     thick = blob(24)
     faint = function([0.0, 0.3, 0.5, 1.0], [0, 0, 0.1, 0.05])  # of what is thick no grid shows the first half voxel
@@ -160,7 +164,7 @@ def test_the_grid_of_shadows_converges_to_rays_from_every_place():
     assert exact.max() > 0.9
     errors = []
     for cell in (8, 4, 2, 1):
-        grid = transmittance(scene, directions, cell, step=0.125, offset=1.5)
+        grid = transmittance(matter(scene), directions, cell, step=0.125, offset=1.5)
         errors.append(np.abs(grid_values(grid, (points + 0.5) / cell - 0.5) - exact).mean())
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.005
@@ -172,7 +176,7 @@ def test_shadows_of_the_lowest_and_the_highest_value_are_as_deep_as_any():
     found = []
     for value in (0.0, 0.5, 1.0):
         scene = Scene.build(Volume(np.full((16, 16, 16), value, np.float32)), tf, 1.0)
-        found.append(transmittance(scene, np.array([ABOVE, SLANTED]), 4, step=0.5, offset=1.0))
+        found.append(transmittance(matter(scene), np.array([ABOVE, SLANTED]), 4, step=0.5, offset=1.0))
     assert found[1].min() < 0.7
     np.testing.assert_allclose(found[0], found[1], atol=1e-5)
     np.testing.assert_allclose(found[2], found[1], atol=1e-5)
@@ -203,7 +207,7 @@ def test_a_thin_sheet_right_behind_empty_bricks_throws_its_shadow(thick):
     directions = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96]])
     points = np.array([[12.0, 12.0, z] for z in (3.0, 5.0, 8.0)])
     for offset in (1.5, 4.0):
-        found = grid_values(transmittance(scene, directions, 1, step=0.125, offset=offset), points)
+        found = grid_values(transmittance(matter(scene), directions, 1, step=0.125, offset=offset), points)
         np.testing.assert_allclose(found, brute_force(scene, points, directions, offset), atol=0.03)
         assert found.max() < 0.6
 

@@ -17,10 +17,9 @@ from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.gaussian_samples import (
     NORMAL_SUMS,
     POINTS,
-    add_normals,
     in_voxels,
     offsets,
-    sample_points,
+    samples_of,
     values_of,
 )
 from vvgt_cli.conversion.live import fog
@@ -180,13 +179,10 @@ def test_values_under_gaussians_of_a_linear_field() -> None:
     stored.flags.writeable = False
     half, step = np.array([1.1, 1.05, 1.0]), np.full(3, 0.1)
     some = replace(cloud(), log_scales=np.full((40, 3), np.log(0.05)), means=cloud().means * 0.8)
-    samples, sums = np.full((40, POINTS), np.nan, np.float32), np.zeros((40, NORMAL_SUMS))
     nothing = np.zeros(3, np.int64)
     where = in_voxels(some, half, step)
     everywhere = nothing, nothing, np.array([22, 21, 20])
-    sample_points(Voxels(stored), *where, offsets(), *everywhere, samples)
-    add_normals(Voxels(stored), *where, offsets(), *everywhere, step, sums)
-    found = values_of(samples, sums, some, -2.0, 0.0)
+    found = values_of(*samples_of(Voxels(stored), *where, *everywhere, step), some, -2.0, 0.0)
     at = where[0]
     np.testing.assert_allclose(found[:, 0], 3 * at[:, 0] - at[:, 2] + 7, atol=1e-3)
     spread = np.sqrt(((offsets() @ np.array([[3, 0, -1]]).T * 0.5) ** 2).mean())

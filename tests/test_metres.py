@@ -13,7 +13,7 @@ from vvgt_cli.conversion.place import with_place as layout
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
-from vvgt_cli.gaussians.formats.metres import placed
+from vvgt_cli.gaussians.formats.nodes import placed
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.volume import Volume
 

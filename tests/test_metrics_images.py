@@ -7,8 +7,7 @@ import pytest
 
 from tests.refused import refused
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.filters import separable
-from vvgt_cli.images.metrics import CAP, flip, psnr, ssim
+from vvgt_cli.images.metrics import CAP, flip, psnr, separable, ssim
 
 
 def picture(height=70, width=90, seed=0):

@@ -12,7 +12,7 @@ from vvgt_cli.conversion.label_assignment import HiddenCells, assign_labels
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import read_splats
-from vvgt_cli.gaussians.formats.gltf import glb_of_nodes, read_glb
+from vvgt_cli.gaussians.formats.gltf import glb, read_glb
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.look.label_files import read_labels
@@ -280,7 +280,7 @@ ONE = Splats(*(np.zeros(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4),
 
 @pytest.mark.parametrize("wrong", [b'{"visible":"no"}', b'{"visible":null}', b"[]", b'"off"'])
 def test_a_wrong_visibility_is_refused_in_a_line(wrong: bytes) -> None:
-    content = glb_of_nodes([Node("a", ONE, visible=False), Node("b", ONE)], "x")
+    content = glb([Node("a", ONE, visible=False), Node("b", ONE)], "x")
     size = struct.unpack_from("<I", content, 12)[0]
     head = content[20 : 20 + size].replace(b'{"visible":false}', wrong)
     with pytest.raises(DataError, match=r"^x: not a \.glb of Gaussians \(.*\); expected meshes"):
@@ -289,7 +289,7 @@ def test_a_wrong_visibility_is_refused_in_a_line(wrong: bytes) -> None:
 
 def test_groups_have_names_that_no_node_has() -> None:
     nodes = [Node("Liver", ONE), Node("cyst", ONE, ("Liver",)), Node("vein", ONE, ("Blood", "Liver"))]
-    size = struct.unpack_from("<I", content := glb_of_nodes(nodes, "a"), 12)[0]
+    size = struct.unpack_from("<I", content := glb(nodes, "a"), 12)[0]
     names = [node["name"] for node in json.loads(content[20 : 20 + size])["nodes"]]
     assert names == ["Splats", "Liver group", "Blood", "Liver group group", "Liver", "cyst", "vein"]
 

@@ -7,7 +7,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.refine import OptimizeOptions, optimize
-from vvgt_cli.refine.loop import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
+from vvgt_cli.refine.states import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
 from vvgt_cli.splat import render
 
 EXTENT = 3.3

@@ -16,10 +16,9 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.checkpoint import fingerprint, resume, save
-from vvgt_cli.refine.judge import Judge
-from vvgt_cli.refine.loop import SLOPE, Densified, begin, densify
-from vvgt_cli.refine.states import GIVEN
+from vvgt_cli.refine.checkpoint import Judge, fingerprint, resume, save
+from vvgt_cli.refine.loop import begin
+from vvgt_cli.refine.states import KNOWN_HARMONICS_RATE, SLOPE, Densified, densify
 from vvgt_cli.splat import render
 
 CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)
@@ -61,7 +60,7 @@ def test_harmonics_of_the_start_move_slower_than_those_from_zero():
         state.step(CAMERAS[0], images[0], 0.0, 1.0)
         end = state.gaussians()
         moved.append(np.abs(end.harmonics - harmonics).max() / np.abs(end.colors - truth.colors).max())
-    assert moved[1] == pytest.approx(GIVEN * moved[0], rel=0.02)
+    assert moved[1] == pytest.approx(KNOWN_HARMONICS_RATE * moved[0], rel=0.02)
     assert moved[2] == pytest.approx(moved[0], rel=0.02)
 
 
@@ -111,8 +110,8 @@ def test_clones_splits_and_moments_go_with_their_harmonics():
         state.step(camera, image, 0.0, 1.0)
     state.slopes[:] = np.where(np.arange(60) < 7, 1.0, 0.0)
     state._densify()
-    assert len(state.arrays) == len(state.running) == 6
-    assert {len(array) for array in state.arrays} == {len(m) for pair in state.running for m in pair} == {67}
+    assert 2 * len(state.arrays) == len(state.running) == 12
+    assert {len(array) for array in state.arrays} == {len(moment) for moment in state.running} == {67}
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -10,10 +10,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.metrics import C1, C2, ssim
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.refine.loop import begin
-from vvgt_cli.refine.loss import loss_gradient
+from vvgt_cli.refine.loss import KERNEL, SMOOTH, add_ssim_gradient, add_texture_gradient, loss_gradient
 from vvgt_cli.refine.options import TEXTURE
-from vvgt_cli.refine.ssim import KERNEL, add_ssim_gradient
-from vvgt_cli.refine.texture import SMOOTH, add_texture_gradient
 
 
 def pictures(height=31, width=26, seed=0):

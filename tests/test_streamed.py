@@ -22,7 +22,7 @@ from vvgt_cli.conversion.parts import StoredGaussians, save
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
-from vvgt_cli.field.runners import InProcess
+from vvgt_cli.field.runners import Runner
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog import images_of, splats_in
@@ -289,7 +289,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
         assert places == [[{"file": 0, "offset": 0, "count": 50}]]
         task = WrittenFiles(StoredGaussians(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())
         task.forget_changed()
-        Pass(InProcess(), store, lambda _: None)(task, "write")
+        Pass(Runner(), store, lambda _: None)(task, "write")
         assert task.size(0) == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())
         return (tmp_path / "0_0" / "means_l.webp").read_bytes()
 

@@ -11,7 +11,7 @@ from vvgt_cli.closed_form.lit import base_rows
 from vvgt_cli.conversion.cut import cut_of
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
-from vvgt_cli.field.runners import InProcess
+from vvgt_cli.field.runners import Runner
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.progress import Console
@@ -75,7 +75,7 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, tmp_path: Path) -> None:
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]
     assert files[0] == files[1]
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == before
-    run_pass = Pass(InProcess(), BlockStore(tmp_path / "parts"), lambda _: None)
+    run_pass = Pass(Runner(), BlockStore(tmp_path / "parts"), lambda _: None)
     pyramid = cut_of(Run(Console(quiet=True), ConversionReport("merge")), run_pass).pyramid
     top, root = pyramid.top, pyramid.leaves_over_tiles(np.finfo(float).max)
     assert root is not None

@@ -40,7 +40,7 @@ from vvgt_cli.volume.shapes import make_shape
 torch = pytest.importorskip("torch")
 pytest.importorskip("yaml")
 
-from vvgt_cli.network.checkpoint import load_checkpoint  # noqa: E402
+from vvgt_cli.network.checkpoint import load_checkpoint, tensors_of  # noqa: E402
 from vvgt_cli.network.training import loop, sample  # noqa: E402
 from vvgt_cli.network.training.config import config_text, read_config  # noqa: E402
 from vvgt_cli.network.training.sample import gsplat_picture, splat  # noqa: E402
@@ -378,7 +378,8 @@ def test_a_step_follows_the_gradient_before_any_training():
     network = sample.Vvgt(STEPPER)
     prepared = sample.prepare(other, cameras, views, STEPPER)
     with torch.no_grad():
-        better = prepared.restore(sample.run_network(network, sample.tensors(prepared), torch.device("cpu")).numpy())
+        rows = sample.run_network(network, tensors_of(prepared.arrays()), torch.device("cpu"))
+        better = prepared.restore(rows.numpy())
     errors = [np.mean([(render(g, c) - v) ** 2 for c, v in zip(cameras, views, strict=True)]) for g in (other, better)]
     assert errors[1] < 0.9 * errors[0]
     assert np.abs(as_rows(better) - pack(other)).max() > 1e-3

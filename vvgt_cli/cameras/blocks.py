@@ -48,6 +48,17 @@ class Blocks:
         return picked.reshape(-1, BLOCK, image.shape[2])
 
 
+def picked(image: np.ndarray, blocks: Blocks | None) -> np.ndarray:
+    """Return `Blocks.pick` of an image (h, w, c), or the image itself without blocks."""
+    return image if blocks is None else blocks.pick(image)
+
+
+def drawn_pixels(size: int, enough: int = ENOUGH) -> int:
+    """Return how many pixels of a square picture of ``size`` px are drawn: all, or those of `spread_blocks`."""
+    blocks = spread_blocks(size, size, enough=enough)
+    return size**2 if blocks is None else blocks.numbers.size * BLOCK**2
+
+
 def spread_blocks(width: int, height: int, shift: int = 0, enough: int = ENOUGH) -> Blocks | None:
     """Return about ``enough`` blocks on a lattice over a picture, None if that is nearly all of it.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
+from vvgt_cli.progress import ProgressCallback
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)  # voxels
 FINEST = 1 / 64
@@ -63,7 +63,7 @@ class _Ranges:
         return high - low, high
 
 
-def measure_changes(scene: Scene, progress: Callable[[int, int], None] | None = None) -> tuple[float, float]:
+def measure_changes(scene: Scene, progress: ProgressCallback | None = None) -> tuple[float, float]:
     """Measure `Stiffness.change_per_voxel` and `Stiffness.abrupt`, skipping neighbours that are not finite."""
     ranges = None if scene.grid is not None else _Ranges(scene.optics.nodes[:, 3])  # a grid stores extinction
     top = scene.optics.largest_extinction()
@@ -106,7 +106,7 @@ def measure_step_errors(scene: Scene) -> dict[float, float]:
     return errors
 
 
-def measure_stiffness(scene: Scene, tolerance: float, progress: Callable[[int, int], None] | None = None) -> Stiffness:
+def measure_stiffness(scene: Scene, tolerance: float, progress: ProgressCallback | None = None) -> Stiffness:
     """Measure the stiffness of a scene; ``tolerance`` is the RMS error of RGBA that views may have."""
     change, abrupt = measure_changes(scene, progress)
     depth_per_voxel = scene.optics.largest_extinction() * float(scene.step.min())

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vvgt_cli.defaults import MAX_GAUSSIANS, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
 
 METHODS = ("vbm", "wavelet", "uniform")
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Start:
     leaves: Leaves | None = None
 
 
-def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = None) -> Start:
+def initialise(scene: Scene, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
     """Return Gaussians by the closed form alone, without rendering; none where no view sees anything."""
     from vvgt_cli.closed_form.closed_form import closed_form
 
@@ -116,8 +116,9 @@ def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rul
 
 
 def backproject(
-    start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None, rule: Rule = INRIA
-) -> tuple[Gaussians, str]:
+    start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: ProgressCallback | None = None,
+    rule: Rule = INRIA,
+) -> tuple[Gaussians, str]:  # fmt: skip
     """Improve by views what needs no gradient descent: which cells are split, the style of surfaces, and colours.
 
     Args:

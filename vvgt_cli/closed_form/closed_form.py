@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
+from vvgt_cli.closed_form.fit import blending_weights, solve_colors, weights_and_errors
 from vvgt_cli.closed_form.lit import Shading
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.pyramid import Pyramid, Tile
@@ -32,6 +32,7 @@ from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import render
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
@@ -46,11 +47,9 @@ SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 
 REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 CUT_VIEWS = 8
-TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
+LARGER_SIZE_WEIGHT = 0.6  # of the error at twice the size, where styles of surface compete
 INSIDE = 0.1  # least transmittance of what other functions may show (0: dark insides; 0.3: surfaces lose 1 dB)
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +123,7 @@ class ClosedForm(Pyramid):
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
             gaussians = solve_colors(self.gaussians_of(leaves, style), cameras, views, rounds=1, rule=rule)
-            error = image_errors(gaussians, cameras, views, rule)
+            _, error = weights_and_errors(gaussians, cameras, views, rule)
             room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
             order = np.argsort(-error, kind="stable")
             order = order[leaves.edge[order].min(axis=1) >= smallest]
@@ -137,7 +136,7 @@ def closed_form(
     budget: int,
     size: int,
     cameras: Sequence[Camera] | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     degree: int = 0,
     values: bool = False,
 ) -> ClosedForm:
@@ -161,7 +160,7 @@ def closed_form(
     )  # fmt: skip
 
 
-def part(progress: Progress | None, first: int, last: int) -> Callable[[float], None]:
+def part(progress: ProgressCallback | None, first: int, last: int) -> Callable[[float], None]:
     """Return a callback that maps its share to ``first`` to ``last`` per cent of the whole and reports it."""
     return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
 
@@ -244,7 +243,7 @@ def fit(
     form: ClosedForm,
     cameras: Sequence[Camera],
     views: np.ndarray,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
     """Cut the pyramid where views see errors, then colour its cells by all of them.
@@ -278,15 +277,15 @@ def fit(
 
 
 def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> float:
-    """Return mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+    """Return mean squared colour error at the views' size, plus `LARGER_SIZE_WEIGHT` times that at twice the size.
 
-    A file that leans on the renderer's 0.3 px looks right at one size only.
+    That is of pictures averaged 2 x 2. A file that leans on the renderer's 0.3 px looks right at one size only.
     """
     total = 0.0
     for camera, view in zip(cameras, views, strict=True):
         halved = render(gaussians, camera, rule.at(0.5))
         total += float(np.mean((render(gaussians, camera, rule) - view)[..., :3] ** 2))
-        total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
+        total += LARGER_SIZE_WEIGHT * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)
 
 
@@ -311,8 +310,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
     """
     wrong, predicted = np.zeros(len(tree)), np.zeros(len(tree))
     wrong[ids], predicted[ids] = errors, score[ids]
-    levels = list(_levels(tree))
-    for level in levels[:0:-1]:
+    for level in tree.levels[:-1]:
         parents = tree.parent[level]
         for sums in (wrong, predicted):
             sums[parents[0] : parents[-1] + 1] += np.bincount(parents - parents[0], sums[level])
@@ -320,7 +318,7 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         return score
     factor, mean = np.ones(len(tree)), wrong[-1] / predicted[-1]
     prior = SHARED * predicted[-1] / len(ids)
-    for level in levels[1:]:
+    for level in tree.levels[-2::-1]:
         above = factor[tree.parent[level]]
         factor[level] = np.where(
             predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
@@ -334,14 +332,3 @@ def unseen(weights: np.ndarray, most: int) -> np.ndarray:
     found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
     found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
     return found
-
-
-def _levels(tree: Tree) -> Iterator[np.ndarray]:
-    """Yield the rows of each level, which lie together, from the root down."""
-    level = np.array([len(tree) - 1])
-    while True:
-        yield level
-        inner = level[tree.children[level] > 0]
-        if not len(inner):
-            return
-        level = np.arange(tree.first[inner[0]], tree.first[inner[-1]] + tree.children[inner[-1]])

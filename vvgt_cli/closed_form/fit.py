@@ -12,15 +12,15 @@ all that is seen of a Gaussian, `SHARE`. The mean square of a harmonic is 1/(4 p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import Projection, blend, gather, project, render
 from vvgt_cli.splat.render import seen_colors
 
@@ -30,18 +30,14 @@ ROUNDS = 6
 ENOUGH = 0.005  # share of the squared error below which another round is not worth its time
 BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other views thin the splats in front
 
-Progress = Callable[[int, int], None]
-
-
-def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
-    """Sum blending weight x error of RGB and alpha over views (n, h, w, 4) and pixels, (K,)."""
-    return weights_and_errors(gaussians, cameras, views, rule)[1]
-
 
 def weights_and_errors(
     gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (K,) sums over views and pixels of blending weight, and `image_errors` of the errors' ``power``."""
+    """Return (K,) sums over views (n, h, w, 4) and pixels of blending weight, and of it times errors of RGBA.
+
+    ``power`` is that of the errors.
+    """
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera, rule)
@@ -64,7 +60,7 @@ def solve_colors(
     cameras: Sequence[Camera],
     views: np.ndarray,
     rounds: int = ROUNDS,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     twice_every: int = 0,
     rule: Rule = INRIA,
 ) -> Gaussians:
@@ -81,58 +77,48 @@ def solve_colors(
         for i, camera in enumerate(cameras)
     ]
     if gaussians.harmonics is None:
-        found = np.clip(_descend(_Single(gaussians, projections), views, rounds, progress), 0, BRIGHTEST)
-        return replace(gaussians, colors=found)
-    system = ViewDependentSystem(gaussians, [camera.position for camera in cameras], projections, PRIOR)
+        colors = np.clip(_descend(System(gaussians, projections), views, rounds, progress), 0, BRIGHTEST)
+        return replace(gaussians, colors=colors)
+    system = ViewDependentSystem(gaussians, projections, [camera.position for camera in cameras])
     return system.gaussians(_descend(system, views, rounds, progress), BRIGHTEST)
 
 
-class System(Protocol):
-    """Pictures as a linear function of unknowns (K, ..., 3), channel by channel.
+class System:
+    """Pictures as a linear function of unknowns, channel by channel: one colour a Gaussian, (K, 3).
 
     Attributes:
         start: unknowns to begin with, float64.
     """
 
-    start: np.ndarray
-
-    def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Render the RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
-
-    def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Apply the adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
-
-    def pull(self, change: np.ndarray) -> np.ndarray:
-        """Return half the gradient of the penalty on a ``change`` of the unknowns."""
-
-    def scaled(self, gradient: np.ndarray) -> np.ndarray:
-        """Return the preconditioned gradient; call `back` first."""
-
-
-class _Single:
-    """One colour a Gaussian: unknowns (K, 3)."""
-
     def __init__(self, gaussians: Gaussians, projections: Sequence[Projection]) -> None:
-        self.projections, self.start = projections, gaussians.colors.astype(np.float64)
+        """Prepare for ``projections`` of the views."""
+        self.given, self.projections = gaussians, projections
+        self.start: np.ndarray = gaussians.colors.astype(np.float64)
         self.weight = np.zeros((len(gaussians), 1))
 
     def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        return _forward(self.projections[view], unknowns, shape)
+        """Render the RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...); colours have signs."""
+        return blend(self.projections[view], unknowns, shape[0], shape[1])[..., :3]
 
     def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        sums = _back(self.projections, images, len(self.start))
+        """Apply the adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
+        sums = np.zeros((len(self.start), 5))
+        for projection, image in zip(self.projections, images, strict=True):
+            gather(projection, _fields(image), sums)
         self.weight = np.maximum(sums[:, :1], SEEN) + PRIOR
         return sums[:, 1:4]
 
     def pull(self, change: np.ndarray) -> np.ndarray:
+        """Return half the gradient of the penalty on a ``change`` of the unknowns."""
         return PRIOR * change
 
     def scaled(self, gradient: np.ndarray) -> np.ndarray:
+        """Return the preconditioned gradient; call `back` first."""
         result: np.ndarray = gradient / self.weight
         return result
 
 
-def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress | None) -> np.ndarray:
+def _descend(system: System, views: np.ndarray, rounds: int, progress: ProgressCallback | None) -> np.ndarray:
     """Return the unknowns after conjugate gradients of `solve_colors`."""
     found = system.start.copy()
     rows = tuple(range(found.ndim - 1))  # all axes but the channels
@@ -164,19 +150,11 @@ def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress 
     return found
 
 
-def _forward(projection: Projection, colors: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Render the RGB image (h, w, 3) of signed colours."""
-    return blend(projection, np.ascontiguousarray(colors, np.float32), shape[0], shape[1])[..., :3]
-
-
-def _back(projections: Sequence[Projection], images: Sequence[np.ndarray], count: int) -> np.ndarray:
-    """Return (K, 5): blending weights, then the adjoint of `_forward` in columns 1 to 3."""
-    sums = np.zeros((count, 5))
-    for projection, image in zip(projections, images, strict=True):
-        fields = np.zeros((4, *image.shape[:2]), np.float32)
-        fields[:3] = image.transpose(2, 0, 1)
-        gather(projection, fields, sums)
-    return sums
+def _fields(image: np.ndarray) -> np.ndarray:
+    """Return RGB (h, w, 3) as `gather` takes it, (4, h, w) float32: behind the sums' column of weights."""
+    fields = np.zeros((4, *image.shape[:2]), np.float32)
+    fields[:3] = image.transpose(2, 0, 1)
+    return fields
 
 
 PIXELS = 1.0
@@ -184,28 +162,25 @@ SHARE = 0.001
 CHUNK = 1 << 14  # Gaussians whose matrices are inverted at once
 
 
-class ViewDependentSystem:
-    """A `vvgt_cli.closed_form.fit.System` with unknowns (K, 1 + M, 3): colours, then harmonics."""
+class ViewDependentSystem(System):
+    """A `System` with unknowns (K, 1 + M, 3): colours, then harmonics."""
 
-    def __init__(
-        self, gaussians: Gaussians, eyes: Sequence[np.ndarray], projections: Sequence[Projection], prior: float
-    ) -> None:
-        """Prepare for ``eyes`` (3,) and ``projections`` of the views; ``prior`` of the colours, pixels."""
+    def __init__(self, gaussians: Gaussians, projections: Sequence[Projection], eyes: Sequence[np.ndarray]) -> None:
+        """Prepare for ``projections`` of the views and their ``eyes`` (3,)."""
         assert gaussians.harmonics is not None
-        self.given, self.eyes, self.projections = gaussians, eyes, projections
+        super().__init__(gaussians, projections)
+        self.eyes = eyes
         self.start = np.concatenate([gaussians.colors[:, None], gaussians.harmonics], axis=1).astype(np.float64)
-        self.color_prior = prior
         self.prior: np.ndarray | None = None  # (K, 1 + M, 1), once `back` has seen the weights
         self.inverse: np.ndarray | None = None  # (K, 1 + M, 1 + M) float32
 
     def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Render the RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
+        """Implement `System.forward`."""
         colors, harmonics = (np.ascontiguousarray(part, np.float32) for part in (unknowns[:, 0], unknowns[:, 1:]))
-        seen = seen_colors(self.given.means, colors, harmonics, self.eyes[view])
-        return blend(self.projections[view], seen, shape[0], shape[1])[..., :3]
+        return super().forward(view, seen_colors(self.given.means, colors, harmonics, self.eyes[view]), shape)
 
     def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Apply the adjoint of `forward`, summed over the views' ``images``."""
+        """Implement `System.back`."""
         from vvgt_cli.splat import harmonics
 
         means, out = self.given.means, np.zeros_like(self.start)
@@ -213,10 +188,8 @@ class ViewDependentSystem:
         if self.inverse is None:
             matrices = np.zeros((len(means), *(self.start.shape[1],) * 2), np.float32)
         for eye, projection, image in zip(self.eyes, self.projections, images, strict=True):
-            fields = np.zeros((4, *image.shape[:2]), np.float32)
-            fields[:3] = image.transpose(2, 0, 1)
             sums = np.zeros((len(means), 5))
-            gather(projection, fields, sums)
+            gather(projection, _fields(image), sums)
             harmonics.deposit(means, eye, np.ascontiguousarray(sums[:, 1:4]), out)
             if matrices is not None:
                 harmonics.deposit_squares(means, eye, np.ascontiguousarray(sums[:, 0]), matrices)
@@ -226,7 +199,7 @@ class ViewDependentSystem:
 
     def _invert(self, matrices: np.ndarray) -> None:
         """Return priors from the weights, which stand in the corner of ``matrices``, and inverses of both together."""
-        self.prior = np.full((*self.start.shape[:2], 1), self.color_prior)
+        self.prior = np.full((*self.start.shape[:2], 1), PRIOR)
         self.prior[:, 1:, 0] = PIXELS + SHARE * matrices[:, :1, 0]
         for first in range(0, len(matrices), CHUNK):
             part = slice(first, first + CHUNK)
@@ -235,7 +208,7 @@ class ViewDependentSystem:
         self.inverse = matrices
 
     def pull(self, change: np.ndarray) -> np.ndarray:
-        """Return half the gradient of the penalty on a ``change`` of the unknowns."""
+        """Implement `System.pull`."""
         assert self.prior is not None
         result: np.ndarray = self.prior * change
         return result

@@ -10,7 +10,7 @@ from vvgt_cli.dvr.kernel import FLAGS, sample
 from vvgt_cli.dvr.layout import TUPLES, Voxels
 from vvgt_cli.dvr.shading import normal
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.frames import axes_of, rotations
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
@@ -45,18 +45,20 @@ def _radical(k: int, base: int) -> float:
     return found
 
 
-@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f4:2", TUPLES, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f8:1 f4:2 f8:2", TUPLES, fastmath=FLAGS, error_model="numpy")
 def sample_points(
     thread: ThreadSlice,
     voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
-    hi: np.ndarray, out: np.ndarray,
+    hi: np.ndarray, step: np.ndarray, out: np.ndarray, normals: np.ndarray,
 ) -> None:  # fmt: skip
     """Write ``voxels`` at ``centres`` (n, 3) + ``arms`` (n, 3, 3) ``points`` (m, 3) into ``out`` (n, m).
 
     All in voxel coordinates of the volume, of which ``begin`` (3,) is the first of ``voxels``. Written are values of
-    points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre.
+    points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre. Their normals, zero
+    without a gradient, are added to ``normals`` (n, NORMAL_SUMS); ``step`` (3,) edges of a voxel, box frame.
     """
     for k in iterations(thread, len(centres)):
+        row = normals[k]
         for m in range(len(points)):
             p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
             x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)
@@ -65,27 +67,6 @@ def sample_points(
             inside = x >= lo[0] - 0.5 and y >= lo[1] - 0.5 and z >= lo[2] - 0.5
             if inside and x < hi[0] - 0.5 and y < hi[1] - 0.5 and z < hi[2] - 0.5:
                 out[k, m] = sample(voxels.values, x - begin[0], y - begin[1], z - begin[2])
-
-
-@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f8:1 f8:2", TUPLES, fastmath=FLAGS, error_model="numpy")
-def add_normals(
-    thread: ThreadSlice,
-    voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
-    hi: np.ndarray, step: np.ndarray, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Add to ``out`` (n, NORMAL_SUMS) the normals at the points that `sample_points` reads, zero without a gradient.
-
-    ``step`` (3,) edges of a voxel, box frame; other arguments as of `sample_points`.
-    """
-    for k in iterations(thread, len(centres)):
-        row = out[k]
-        for m in range(len(points)):
-            p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
-            x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)
-            y = centres[k, 1] + (arms[k, 1, 0] * p0 + arms[k, 1, 1] * p1 + arms[k, 1, 2] * p2)
-            z = centres[k, 2] + (arms[k, 2, 0] * p0 + arms[k, 2, 1] * p1 + arms[k, 2, 2] * p2)
-            inside = x >= lo[0] - 0.5 and y >= lo[1] - 0.5 and z >= lo[2] - 0.5
-            if inside and x < hi[0] - 0.5 and y < hi[1] - 0.5 and z < hi[2] - 0.5:
                 n0, n1, n2 = normal(voxels.values, step, x - begin[0], y - begin[1], z - begin[2])
                 row[0] += n0 * n0
                 row[1] += n0 * n1
@@ -96,10 +77,19 @@ def add_normals(
                 row[6] += 1.0
 
 
+def samples_of(
+    voxels: Voxels, centres: np.ndarray, arms: np.ndarray, begin: np.ndarray, lo: np.ndarray, hi: np.ndarray,
+    step: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return `sample_points` at `offsets`: values (n, POINTS) float32, NaN outside, and (n, NORMAL_SUMS)."""
+    samples, sums = np.full((len(centres), POINTS), np.nan, np.float32), np.zeros((len(centres), NORMAL_SUMS))
+    sample_points(voxels, centres, arms, offsets(), begin, lo, hi, step, samples, sums)
+    return samples, sums
+
+
 def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (K, 3) and axes of a standard deviation (K, 3, 3), columns, of box-frame Gaussians, in voxels."""
-    axes = rotations(gaussians.quaternions.astype(np.float64))
-    arms = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :] / step[:, None]
+    arms = axes_of(gaussians) / step[:, None]
     return (gaussians.means.astype(np.float64) + half) / step - 0.5, np.ascontiguousarray(arms)
 
 
@@ -113,7 +103,7 @@ def values_of(
 
     Args:
         samples: (K, POINTS) as kernels read them.
-        sums: (K, NORMAL_SUMS) of `add_normals`.
+        sums: (K, NORMAL_SUMS) of normals.
         gaussians: in the box frame, as are the axis and the gradient.
         slope: of the data value ``slope * sample + intercept``.
         intercept: of the data value.

@@ -22,7 +22,7 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.frames import C2, basis, rotations
+from vvgt_cli.gaussians.frames import C2, axes_of, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
@@ -174,23 +174,18 @@ def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def normal_points(gaussians: Gaussians) -> np.ndarray:
-    """Return points (7 K, 3) for `mean_normals`, box frame: centres, and a standard deviation along each axis."""
-    axes = rotations(gaussians.quaternions.astype(np.float64))  # columns
-    arms = (axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]).transpose(0, 2, 1)  # (K, 3, 3)
-    arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
-    found: np.ndarray = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
-    return found
-
-
-def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.ndarray:
+def mean_normals(gaussians: Gaussians, look_up: Callable[[np.ndarray], np.ndarray], half: np.ndarray) -> np.ndarray:
     """Return (K, 3) unit directions of the mean gradient of optical mass around Gaussians, box frame; zeros for none.
 
     Args:
-        points: (7 K, 3) of `normal_points`; the mean over each seven is weighted by the extinction there.
-        found: (7 K, 4) normals and extinction at them.
+        gaussians: box frame; each counts at its centre, and a standard deviation along each axis.
+        look_up: returns normals and extinction (n, 4) at points (n, 3); normals are weighted by the extinction.
         half: (3,) half extents of the box: beyond it nothing counts.
     """
+    arms = axes_of(gaussians).transpose(0, 2, 1)  # (K, 3, 3)
+    arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
+    points = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
+    found = look_up(points)
     inside = (np.abs(points) < half).all(axis=1)
     weight = np.where(inside, found[:, 3], 0)
     weight[::7] = np.maximum(weight[::7], 1e-12)  # where there is nothing, the direction at the centre

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +57,12 @@ class Tree:
         """(n, 3) float64 cell edges, unit-frame lengths."""
         result: np.ndarray = self.edges[self.level]
         return result
+
+    @property
+    def levels(self) -> list[slice]:
+        """The rows of each level, from the base cells up."""
+        ends = np.searchsorted(self.level, np.arange(len(self.edges) + 1, dtype=self.level.dtype))
+        return [slice(begin, end) for begin, end in pairwise(ends.tolist())]
 
 
 def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | None = None) -> Tree:
@@ -131,9 +138,9 @@ def split_score(tree: Tree, plain: float = PLAIN) -> np.ndarray:
     The variance of the colours is that of its base cells, by what is seen of them; ``plain``: infinite where colours do
     not count.
     """
-    score, ends = np.empty(len(tree)), np.searchsorted(tree.level, np.arange(len(tree.edges) + 1))
-    for edge, first, last in zip(tree.edges, ends[:-1], ends[1:], strict=True):
-        score_splits(tree.moments[first:last], tree.largest[first:last], edge, plain, score[first:last])
+    score = np.empty(len(tree))
+    for edge, rows in zip(tree.edges, tree.levels, strict=True):
+        score_splits(tree.moments[rows], tree.largest[rows], edge, plain, score[rows])
     return score
 
 
@@ -223,14 +230,8 @@ def _bins(scores: np.ndarray) -> np.ndarray:
 def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
     """Lower each cell's score to the smallest above it."""
     capped = score.copy()
-    level = np.arange(len(tree))[-1:]
-    while len(level):
-        inner = level[tree.children[level] > 0]
-        if not len(inner):
-            break
-        lo, hi = tree.first[inner[0]], tree.first[inner[-1]] + tree.children[inner[-1]]
-        level = np.arange(lo, hi)  # a level is contiguous
-        capped[lo:hi] = np.minimum(capped[lo:hi], capped[tree.parent[lo:hi]])
+    for level in tree.levels[-2::-1]:
+        capped[level] = np.minimum(capped[level], capped[tree.parent[level]])
     return capped
 
 

@@ -14,7 +14,8 @@ from vvgt_cli.closed_form.cell_kernels import look_up
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
-from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
+from vvgt_cli.dvr.render import BoxFrame, camera_arrays
+from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
 from vvgt_cli.jit.threads import ThreadSlice, iterations
 
@@ -158,7 +159,7 @@ def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
     )
 
 
-def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray:
+def _mean_extinction(cells: Cells, scene: Scene | BoxFrame, wider: int) -> np.ndarray:
     """Return (nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
     shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
@@ -167,7 +168,7 @@ def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray
     return result
 
 
-def voxels_of(box: BoxGeometry) -> np.ndarray:
+def voxels_of(box: Scene | BoxFrame) -> np.ndarray:
     """Return the voxels (3,) along x, y, z of a box."""
     result: np.ndarray = np.round(2 * np.asarray(box.half) / np.asarray(box.step))
     return result
@@ -193,7 +194,7 @@ def summed(index: np.ndarray, values: np.ndarray, wider: int, shape: np.ndarray)
 
 
 def visibility(
-    scene: BoxGeometry, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
+    scene: Scene | BoxFrame, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
 ) -> Visibility:
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
@@ -226,7 +227,7 @@ def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: 
 def march_views(
     extinction: np.ndarray,
     voxels: np.ndarray,
-    scene: BoxGeometry,
+    scene: Scene | BoxFrame,
     cameras: Sequence[Camera],
     progress: Callable[[float], None] | None = None,
 ) -> Visibility:

@@ -48,15 +48,12 @@ def detail_energy(tree: Tree) -> np.ndarray:
     np.add.at(energy, tree.parent[:-1], (mass**2 / volume)[:-1])
     energy -= mass**2 / volume
     energy[tree.children == 0] = 0
-    energy = np.maximum(energy, 0) * np.sqrt(tree.largest)
-    inner = np.flatnonzero(tree.children > 0)
-    while len(inner):  # once a level, upwards; the segments of reduceat are the children of each inner cell
-        raised = np.maximum(energy[inner], np.maximum.reduceat(energy, tree.first[inner]))
-        if np.array_equal(raised, energy[inner]):
-            break
-        energy[inner] = raised
-    result: np.ndarray = energy
-    return result
+    np.maximum(energy, 0, out=energy)
+    energy *= np.sqrt(tree.largest)
+    for level in tree.levels[1:]:  # the segments of reduceat are the children of each cell
+        children = np.maximum.reduceat(energy[: level.start], tree.first[level])
+        energy[level] = np.maximum(energy[level], children)
+    return energy
 
 
 def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -69,38 +68,9 @@ def shade_cell(shape: Sequence[int]) -> int:
     return cell
 
 
-def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
-    """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
-    from vvgt_cli.dvr.shadows import cell_extinction
-
-    out = np.empty(tuple(-(-n // cell) for n in scene.voxels.values.shape), np.float32)
-    cell_extinction(scene.voxels, scene.optics, scene.empty, cell, out)
-    return out
-
-
-class Absorbing(Protocol):
-    """Medium that attenuates rays, as kernels take it, and its voxels' edges (3,) in the unit frame."""
-
-    @property
-    def voxels(self) -> Voxels:
-        """Stored values."""
-
-    @property
-    def optics(self) -> Optics:
-        """Optics over the stored values."""
-
-    @property
-    def empty(self) -> np.ndarray:
-        """Distance to visible bricks, (bz, by, bx) uint8."""
-
-    @property
-    def step(self) -> np.ndarray:
-        """Voxel edges (3,), unit frame."""
-
-
 @dataclass(frozen=True)
 class Matter:
-    """A grid of extinction, as `Absorbing` has it."""
+    """A grid of extinction; attributes as of `Scene`."""
 
     voxels: Voxels
     optics: Optics
@@ -118,7 +88,7 @@ class Matter:
 
 
 def transmittance(
-    matter: Absorbing, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
+    matter: Matter, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
     offset: float | None = None, wanted: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].

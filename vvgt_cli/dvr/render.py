@@ -14,6 +14,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
+from vvgt_cli.progress import ProgressCallback
 
 # Pixels that differ from a neighbour by more than this get that many rays.
 ADAPTIVE = ((0.08, 5), (0.3, 13))
@@ -72,26 +73,14 @@ def ray_offsets(count: int) -> np.ndarray:
     return np.stack([np.tile(place, edge), np.repeat(place, edge)], axis=1)
 
 
-class BoxGeometry(Protocol):
-    """A box: half extents and voxel edges (3,) float64 in the unit frame, (x, y, z), as `Scene` has them."""
-
-    @property
-    def half(self) -> np.ndarray:
-        """Half extents (3,), unit frame."""
-
-    @property
-    def step(self) -> np.ndarray:
-        """Voxel edges (3,), unit frame."""
-
-
 class BoxFrame(NamedTuple):
-    """A volume's half extents and voxel edges (3,), as `BoxGeometry` has them."""
+    """A volume's half extents and voxel edges (3,) float64 in the unit frame, (x, y, z), as `Scene` has them."""
 
     half: np.ndarray
     step: np.ndarray
 
 
-def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def camera_arrays(scene: Scene | BoxFrame, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
     eye = (camera.position + scene.half) / scene.step - 0.5
     basis = camera.rotation / scene.step[None, :]
@@ -138,7 +127,7 @@ def more_rays(settings: RenderSettings, image: np.ndarray, everywhere: np.ndarra
     return more
 
 
-def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> RenderSettings:
+def for_thin(settings: RenderSettings, box: Scene | BoxFrame, camera: Camera) -> RenderSettings:
     """Set many rays for every pixel if the whole box may fall between the middles of two rows or columns."""
     if 2 * box.half.min() * camera.fx >= np.linalg.norm(camera.position):
         return settings
@@ -187,7 +176,7 @@ def render_views(
     scene: Scene | Viewed,
     cameras: Sequence[Camera],
     settings: RenderSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> np.ndarray:
     """Render views of one size: (n, height, width, 4) float32, premultiplied; ``progress(done, total)`` after each."""
     images = []

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
-from vvgt_cli.dvr.light import mean_extinction, scene_light
+from vvgt_cli.dvr.light import scene_light
 from vvgt_cli.look.function import Named, TransferFunctionLike
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import Optics, build_tables
@@ -139,10 +139,16 @@ class Scene:
 
     def lit(self, lighting: Lighting) -> Scene:
         """Return the same scene under light; shadows and occlusion are marched here."""
-        light = scene_light(
-            lighting, self.volume.axes, self.step, self.values.shape, lambda cell: mean_extinction(self, cell)
-        )
+        light = scene_light(lighting, self.volume.axes, self.step, self.values.shape, self._mean_extinction)
         return replace(self, lighting=lighting, light=light)
+
+    def _mean_extinction(self, cell: int) -> np.ndarray:
+        """Average extinction per unit-frame length over cubes of ``cell`` voxels, (cz, cy, cx) float32."""
+        from vvgt_cli.dvr.shadows import cell_extinction
+
+        out = np.empty(tuple(-(-n // cell) for n in self.values.shape), np.float32)
+        cell_extinction(self.voxels, self.optics, self.empty, cell, out)
+        return out
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:

@@ -18,7 +18,7 @@ from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_
 from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks
 from vvgt_cli.field.digests import digest, values_digest
-from vvgt_cli.field.field import Picture, ViewRenderer
+from vvgt_cli.field.field import Field, Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.reader import Scalars
@@ -28,6 +28,7 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 
-Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds per step of a ray outside empty space: bonsai-tree in blocks of 128, two threads
 PATH_LENGTH = 1.5  # of a typical ray through the box, unit-frame lengths
 
@@ -53,7 +53,7 @@ class Pass:
 
     runner: Runner
     store: BlockStore
-    bar: Callable[[str], Progress | None]
+    bar: Callable[[str], ProgressCallback | None]
     shard: tuple[int, int] | None = None
 
     def __call__(self, task: Task, name: str, numbers: Sequence[int] | None = None) -> int:
@@ -85,8 +85,8 @@ class MissingBlocks(Exception):
 
 
 @dataclass
-class Blocked:
-    """A field (`vvgt_cli.field.field.Field`) that reads its volume block by block, and renders its own pictures.
+class Blocked(Field):
+    """A field that reads its volume block by block, and renders its own pictures.
 
     Attributes:
         source: the opened volume and its look.
@@ -111,11 +111,6 @@ class Blocked:
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
     renderer: ViewRenderer | None = None
-
-    @property
-    def views(self) -> ViewRenderer:
-        """Implement `Field.views`."""
-        return self.renderer or self
 
     @cached_property
     def frame(self) -> BoxFrame:
@@ -175,7 +170,7 @@ class Blocked:
             self.run_pass.store.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light, self.source.labels_alone)
 
-    def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import start_of
         from vvgt_cli.closed_form.closed_form import form_of, most_cells
@@ -258,10 +253,9 @@ class Blocked:
         """Implement `Field.normals`."""
         if self.light is None:
             return None
-        from vvgt_cli.closed_form.lit import mean_normals, normal_points
+        from vvgt_cli.closed_form.lit import mean_normals
 
-        points = normal_points(gaussians)
-        return mean_normals(points, self._normals_and_extinction(points), self.frame.half)
+        return mean_normals(gaussians, self._normals_and_extinction, self.frame.half)
 
     def _normals_at(self, points: np.ndarray) -> np.ndarray:
         return self._normals_and_extinction(points)[:, :3]

@@ -196,14 +196,7 @@ class ValueBlocks(Blockwise):
 
         Saved are the values, with the points' numbers over all Gaussians, and the sums of each Gaussian's normals.
         """
-        from vvgt_cli.closed_form.gaussian_samples import (
-            NORMAL_SUMS,
-            POINTS,
-            add_normals,
-            offsets,
-            reach,
-            sample_points,
-        )
+        from vvgt_cli.closed_form.gaussian_samples import NORMAL_SUMS, POINTS, reach, samples_of
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")
@@ -214,12 +207,9 @@ class ValueBlocks(Blockwise):
         sums = np.zeros((len(which), NORMAL_SUMS))
         if len(which):
             box = self.box(number, LIT_HALO)
-            samples = np.full((len(which), POINTS), np.nan, np.float32)
-            some, begin = np.array(rows[which]), box.begin.astype(np.int64)
-            where = some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy(), offsets()
-            part = begin, lo.astype(np.int64), hi.astype(np.int64)
-            sample_points(box.voxels, *where, *part, samples)
-            add_normals(box.voxels, *where, *part, np.array(self.grid.step), sums)
+            some, part = np.array(rows[which]), (box.begin.astype(np.int64), lo.astype(np.int64), hi.astype(np.int64))
+            where = some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy()
+            samples, sums = samples_of(box.voxels, *where, *part, np.array(self.grid.step))
             row, column = np.nonzero(np.isfinite(samples))
             found, numbers = samples[row, column], which[row] * POINTS + column
         self.store.save(self.kind, number, numbers=numbers, found=found, which=which, sums=sums)

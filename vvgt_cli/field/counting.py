@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import Content, content_of, open_content
+from vvgt_cli.field.layered import Access, Content, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
@@ -119,8 +119,8 @@ def _brick(
     return values[z : z + k, y : y + j, x : x + i]
 
 
-class BlockAccess:
-    """`vvgt_cli.field.layered.Access` block by block; each volume is counted once, on first use."""
+class BlockAccess(Access):
+    """`Access` block by block; each volume is counted once, on first use."""
 
     def __init__(
         self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool

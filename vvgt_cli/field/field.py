@@ -16,6 +16,7 @@ from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
@@ -54,28 +55,26 @@ class ViewRenderer(Protocol):
         """Release a picture that will not be requested again."""
 
 
-class Field(Protocol):
-    """Everything a conversion needs to know about a volume.
+class Field(ViewRenderer, Protocol):
+    """Everything a conversion needs to know about a volume, which renders its own pictures.
 
     Attributes:
         source: the volume and its look; the values may still be in the file.
         renderer: renders its pictures; None selects the field itself.
     """
 
+    source: Source
     renderer: ViewRenderer | None
 
     @property
     def views(self) -> ViewRenderer:
         """The renderer of its pictures."""
-
-    @property
-    def source(self) -> Source:
-        """The volume and its look."""
+        return self.renderer or self  # a reference to itself would keep the volume until Python looks for cycles
 
     def workload(self, size: int, gaussians: int) -> Workload:
         """Return the counts and timings that stage costs depend on, for ``size`` px images and a Gaussian budget."""
 
-    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Return the closed form: the pyramid of cells, and the Gaussians that fit the budget."""
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
@@ -95,7 +94,7 @@ class Field(Protocol):
 
 
 @dataclass
-class Resident:
+class Resident(Field):
     """A field with its values in memory, which renders its own pictures.
 
     Attributes:
@@ -113,11 +112,6 @@ class Resident:
     report: Callable[[str], None] = print
     _drawn: dict[str, np.ndarray] = field(default_factory=dict)  # pixels of pictures' blocks, by `Picture.key`
 
-    @property
-    def views(self) -> ViewRenderer:
-        """Implement `Field.views`."""
-        return self.renderer or self  # a reference to itself would keep the volume until Python looks for cycles
-
     @classmethod
     def of(cls, source: Source, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:
         """Return the field of a source, with its values laid out for the kernels."""
@@ -134,7 +128,7 @@ class Resident:
         """Implement `Field.workload`."""
         return measure(self.scene, size, gaussians)
 
-    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+    def pyramid(self, options: VbmOptions, progress: ProgressCallback | None = None) -> Start:
         """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import initialise
 
@@ -164,33 +158,22 @@ class Resident:
         """Implement `Field.normals`."""
         if self.scene.light is None:
             return None
-        from vvgt_cli.closed_form.lit import at_points, mean_normals, normal_points
+        from vvgt_cli.closed_form.lit import at_points, mean_normals
 
-        points = normal_points(gaussians)
-        return mean_normals(points, at_points(self.scene, points), self.scene.half)
+        return mean_normals(gaussians, lambda points: at_points(self.scene, points), self.scene.half)
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Implement `Field.sample`."""
-        from vvgt_cli.closed_form.gaussian_samples import (
-            NORMAL_SUMS,
-            POINTS,
-            add_normals,
-            in_voxels,
-            offsets,
-            sample_points,
-            values_of,
-        )
+        from vvgt_cli.closed_form.gaussian_samples import in_voxels, samples_of, values_of
 
         self.source.require_scalar_field()
         scene, values = self.scene, np.empty((len(gaussians), 8), np.float32)
         nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
         for k in range(0, len(gaussians), AT_ONCE):
             part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
-            samples = np.full((len(part), POINTS), np.nan, np.float32)
-            where, sums = in_voxels(part, scene.half, scene.step), np.zeros((len(part), NORMAL_SUMS))
-            sample_points(scene.voxels, *where, offsets(), nothing, nothing, dims, samples)
-            add_normals(scene.voxels, *where, offsets(), nothing, nothing, dims, scene.step, sums)
-            values[k : k + len(part)] = values_of(samples, sums, part, self.layout.slope, self.layout.intercept)
+            where = in_voxels(part, scene.half, scene.step)
+            found = samples_of(scene.voxels, *where, nothing, nothing, dims, scene.step)
+            values[k : k + len(part)] = values_of(*found, part, self.layout.slope, self.layout.intercept)
         return values
 
     def with_look(self, source: Source) -> Resident:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -103,36 +103,23 @@ class Content:
             _ = self.statistics, self.layout  # both are cached
 
 
-class Access(Protocol):
-    """Access to volumes and statistics of their values, in memory or block by block."""
+class Access:
+    """Access to volumes and statistics of their values; here to volumes that are read whole."""
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
         """Open a file, or content that is already open."""
-
-    def statistics(self, volume: Volume) -> Statistics:
-        """Return the statistics of a volume's data values."""
-
-    def labels(self, volume: Volume) -> list[int]:
-        """Return the labels that a volume holds, ascending."""
-
-
-class InMemory:
-    """`Access` to volumes that are read whole."""
-
-    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """Implement `Access.open`."""
         return open_content(source, read) if isinstance(source, str) else content_of(source).loaded()
 
     def statistics(self, volume: Volume) -> Statistics:
-        """Implement `Access.statistics`."""
+        """Return the statistics of a volume's data values."""
         return statistics(volume)
 
     def labels(self, volume: Volume) -> list[int]:
-        """Implement `Access.labels`."""
+        """Return the labels that a volume holds, ascending."""
         return labels_in(volume)
 
 
-IN_MEMORY = InMemory()
+IN_MEMORY = Access()
 
 
 def content_of(source: Volume | Content) -> Content:

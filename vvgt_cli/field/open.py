@@ -20,7 +20,7 @@ from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import TILE_VOXELS
 from vvgt_cli.field.layered import Content, content_of, open_content
-from vvgt_cli.field.runners import InProcess, Processes, Runner
+from vvgt_cli.field.runners import Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
@@ -372,7 +372,7 @@ def runner_of(options: BlockOptions, threads: int) -> Runner:
         from vvgt_cli.field.runners import DaskRunner
 
         return DaskRunner(options.scheduler, workers, threads)
-    return Processes(workers, threads) if workers > 1 else InProcess()
+    return Processes(workers, threads) if workers > 1 else Runner()
 
 
 def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import get_context
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import discard_leftovers
+from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.resources import memory_limit
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 
-Progress = Callable[[int, int], None]
 IDLE = 3  # consecutive pools that broke without finishing a block
 
 
@@ -44,25 +44,12 @@ class Task(Protocol):
         """Process block ``number`` and save its result."""
 
 
-class Runner(Protocol):
-    """A runner that processes each block at least once, and the context of its workers."""
+class Runner:
+    """A runner that processes each block at least once, here one after the other, and the context of its workers.
 
-    @property
-    def workers(self) -> int:
-        """Number of workers that run in parallel."""
-
-    def __enter__(self) -> Any:
-        """Return the runner."""
-
-    def __exit__(self, *error: object) -> None:
-        """End the workers."""
-
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Process the blocks ``numbers``."""
-
-
-class InProcess:
-    """A runner that processes one block after the other in this process."""
+    Attributes:
+        workers: number of workers that run in parallel.
+    """
 
     workers = 1
 
@@ -71,10 +58,10 @@ class InProcess:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Do nothing: there are no workers."""
+        """End the workers."""
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
-        """Process blocks in the order of ``numbers``."""
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
+        """Process the blocks ``numbers``."""
         for done, number in enumerate(numbers, 1):
             task(number)
             if progress:
@@ -108,17 +95,13 @@ def _interrupts_blocked() -> Iterator[None]:
         mask(getattr(signal, "SIG_SETMASK", 0), before)
 
 
-class Processes:
+class Processes(Runner):
     """A pool of worker processes for all passes; blocks of a killed worker are repeated by others."""
 
     def __init__(self, workers: int, threads: int) -> None:
         """Share ``threads`` among ``workers``."""
         self.workers, self.threads = workers, max(threads // workers, 1)
         self._pool: ProcessPoolExecutor | None = None
-
-    def __enter__(self) -> Self:
-        """Return the runner."""
-        return self
 
     def __exit__(self, *error: object) -> None:
         """End the pool, without waiting for it after an error."""
@@ -127,7 +110,7 @@ class Processes:
             self._alive.close()
             self._pool = None
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Process the blocks ``numbers``; raise DataError if workers are killed repeatedly without finishing one."""
         from concurrent.futures import ProcessPoolExecutor, as_completed
         from concurrent.futures.process import BrokenProcessPool
@@ -175,12 +158,8 @@ def _need(name: str) -> Any:
         raise DataError(f"--scheduler: {name} is not installed; try: pip install 'vvgt[cluster]'") from None
 
 
-class DaskRunner:
-    """A runner on Dask workers, and the context within which workers started for it stay alive.
-
-    Attributes:
-        workers: number of workers requested.
-    """
+class DaskRunner(Runner):
+    """A runner on Dask workers, and the context within which workers started for it stay alive."""
 
     def __init__(self, scheduler: str, workers: int, threads: int) -> None:
         """Check the scheduler: "local", "slurm" or an address; ``threads`` are shared by local workers, or per job.
@@ -204,15 +183,11 @@ class DaskRunner:
             if memory_limit() is None:
                 raise UsageError("--scheduler slurm: no memory size for its jobs; expected --memory, as --memory 16G")
 
-    def __enter__(self) -> DaskRunner:
-        """Return the runner."""
-        return self
-
     def __exit__(self, *error: object) -> None:
         """End the workers that were started."""
         self._stack.close()
 
-    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+    def run(self, task: Task, numbers: Sequence[int], progress: ProgressCallback | None) -> None:
         """Run the tasks; those of a lost worker are repeated on another.
 
         Raises:

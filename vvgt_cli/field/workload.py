@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
+from vvgt_cli.cameras.blocks import FEW, drawn_pixels
 from vvgt_cli.gaussians import Gaussians, as_stored
 
 if TYPE_CHECKING:
@@ -59,16 +59,12 @@ class Workload:
     @cached_property
     def test_view_pixels(self) -> int:
         """Number of pixels that are rendered of a test view: all, or those of blocks."""
-        return self._pixels(ENOUGH)
+        return drawn_pixels(self.size)
 
     @cached_property
     def check_view_pixels(self) -> int:
         """Number of pixels that are rendered of a check view: all, or those of blocks."""
-        return self._pixels(FEW)
-
-    def _pixels(self, enough: int) -> int:
-        blocks = spread_blocks(self.size, self.size, enough=enough)
-        return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
+        return drawn_pixels(self.size, FEW)
 
     def reference_seconds(self, pixels: int) -> float:
         """Return the seconds for a reference of this many pixels."""

@@ -153,6 +153,12 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
+def axes_of(gaussians: Gaussians) -> np.ndarray:
+    """Return the M of covariances ``M M^T``: axes as columns, each a standard deviation long, (K, 3, 3) float64."""
+    scaled: np.ndarray = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    return scaled
+
+
 C1 = 0.4886025119029199
 C2 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
 C3 = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277

@@ -21,7 +21,7 @@ from statistics import NormalDist
 import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
-from vvgt_cli.gaussians.frames import factored, rotations
+from vvgt_cli.gaussians.frames import axes_of, factored
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT, LABEL_ROW, LAYER_ID
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
@@ -205,7 +205,7 @@ def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussi
     opaque, facing = -np.expm1(-tau * gaussians.live[:, LENGTH]), explained**2
     thin = np.sqrt(np.maximum(1 - facing * (1 - variance), THINNEST**2) * (1 - opaque * facing * (1 - SHARP)))
     flat = np.sqrt(1 - opaque * (1 - facing) * (1 - SHARP))
-    axes = _axes(gaussians)
+    axes = axes_of(gaussians)
     narrow = _narrowed(axes, along, thin)
     quaternions, log_scales = factored(_narrowed(narrow, _within(narrow, gaussians.live[:, AXIS]), flat))
     return Gaussians(
@@ -246,14 +246,7 @@ def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient directions in units of each Gaussian's own axes, (K, 3) unit vectors, and r (K,)."""
     assert gaussians.live is not None
     gradient = gaussians.live[:, GRADIENT].astype(np.float64)
-    return _within(_axes(gaussians), gradient), np.minimum(np.linalg.norm(gradient, axis=1), 1)
-
-
-def _axes(gaussians: Gaussians) -> np.ndarray:
-    """Return the axes of a standard deviation (K, 3, 3), columns."""
-    turned = rotations(gaussians.quaternions.astype(np.float64))
-    found: np.ndarray = turned * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    return found
+    return _within(axes_of(gaussians), gradient), np.minimum(np.linalg.norm(gradient, axis=1), 1)
 
 
 def _within(axes: np.ndarray, directions: np.ndarray) -> np.ndarray:

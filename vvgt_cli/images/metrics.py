@@ -16,7 +16,6 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.images.compose import over
-from vvgt_cli.images.filters import separable
 
 CAP = 150.0  # dB: an RMS error of 3e-8, half a float32 step at 1; the value of identical images
 RADIUS, SIGMA = 5, 1.5  # of SSIM's window, 11 x 11
@@ -24,6 +23,7 @@ C1, C2 = 0.01**2, 0.03**2  # of SSIM
 FOREGROUND = 0.01  # alpha of the reference above which a pixel is foreground
 FINE, COARSE = 1.2, 5.0  # standard deviations in pixels of the blurs whose difference is texture
 REACH = 3.0  # standard deviations at which a blur is truncated
+ROWS = 64  # outputs of a product in `correlate`; the share of useful work is largest near the kernel's size
 BLOCK = 32  # pixels along an edge of the blocks in which texture is measured
 OPAQUE, SMOOTH = 0.97, 1.0  # least alpha, and largest texture of the reference (levels of 255), of measured blocks
 WORST = 0.1  # share of the blocks that count as the worst
@@ -113,6 +113,31 @@ def _gaussian(radius: int, sigma: float) -> np.ndarray:
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     result: np.ndarray = kernel / kernel.sum()
     return result
+
+
+def correlate(image: np.ndarray, kernel: np.ndarray, axis: int) -> np.ndarray:
+    """Correlate an image (h, w) with ``kernel`` (k,) along an axis, which shrinks by k - 1 to the valid part.
+
+    As products with short banded matrices, which is fast without SciPy.
+    """
+    if axis == 1:
+        return correlate(image.T, kernel, 0).T
+    count = image.shape[0] - kernel.size + 1
+    outputs = min(ROWS, count)
+    band = np.zeros((outputs, outputs + kernel.size - 1), image.dtype)  # row i holds the kernel from column i
+    for i in range(outputs):
+        band[i, i : i + kernel.size] = kernel
+    out = np.empty((count, image.shape[1]), image.dtype)
+    for start in range(0, count, ROWS):
+        size = min(ROWS, count - start)
+        reach = size + kernel.size - 1
+        np.matmul(band[:size, :reach], image[start : start + reach], out=out[start : start + size])
+    return out
+
+
+def separable(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    """Correlate an image (h, w) with the outer product of two kernels, valid part only."""
+    return correlate(correlate(image, along_x, 1), along_y, 0)
 
 
 @dataclass(frozen=True)

@@ -49,11 +49,7 @@ DESCENT = (
     PAIR_SUMS,
     "vvgt_cli.splat.backward:own_axes",
     "vvgt_cli.splat.kernel:project_factors",
-    "vvgt_cli.refine.loss:loss_gradient",
-    "vvgt_cli.refine.ssim:blur",
-    "vvgt_cli.refine.texture:part_planes",
-    "vvgt_cli.refine.texture:weigh",
-    "vvgt_cli.refine.texture:add_fine",
+    *(f"vvgt_cli.refine.loss:{name}" for name in ("loss_gradient", "blur", "part_planes", "weigh", "add_fine")),
 )
 REFINE = (AXES_STEPS, *DESCENT)
 SHARED = (*REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
@@ -72,7 +68,7 @@ SEGMENTS = {
     GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
 }
 CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points", "vvgt_cli.closed_form.gaussian_samples:add_normals")
+LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.cell_kernels:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)

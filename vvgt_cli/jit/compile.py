@@ -8,7 +8,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +18,7 @@ import numba
 
 from vvgt_cli.jit.numba_internals import config
 from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
+from vvgt_cli.progress import ProgressCallback
 
 VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
 
@@ -59,24 +60,23 @@ def usual_types(kernel: Any, volume: str) -> tuple[Any, ...]:
     `V` are read-only values (nz, ny, nx) of type ``volume``, `E` of float32.
     """
     tuples = {kind.__name__: (kind, fields) for kind, fields in kernel.tuples.items()}
-    return _types(kernel.usual, tuples, volume)
 
+    def types(usual: str) -> tuple[Any, ...]:
+        found: list[Any] = []
+        for word in usual.split():
+            name, _, axes = word.partition(":")
+            if name in tuples:
+                kind, fields = tuples[name]
+                found.append(numba.types.BaseTuple.from_types(types(fields), kind))
+            elif name in ("V", "E"):
+                values = getattr(numba.types, volume if name == "V" else "float32")
+                found.append(numba.types.Array(values, 3, "C", readonly=True))
+            else:
+                scalar = getattr(numba.types, name)
+                found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
+        return tuple(found)
 
-def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tuple[Any, ...]:
-    """Return numba types for short names, and for those of named ``tuples`` {name: (class, types of its fields)}."""
-    found: list[Any] = []
-    for word in usual.split():
-        name, _, axes = word.partition(":")
-        if name in tuples:
-            kind, fields = tuples[name]
-            found.append(numba.types.BaseTuple.from_types(_types(fields, {}, volume), kind))
-        elif name in ("V", "E"):
-            values = getattr(numba.types, volume if name == "V" else "float32")
-            found.append(numba.types.Array(values, 3, "C", readonly=True))
-        else:
-            scalar = getattr(numba.types, name)
-            found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
-    return tuple(found)
+    return types(kernel.usual)
 
 
 def missing(jobs: Iterable[CompileJob]) -> list[CompileJob]:
@@ -84,7 +84,7 @@ def missing(jobs: Iterable[CompileJob]) -> list[CompileJob]:
     return [job for job in jobs if job.kernel().kernel_cache.find(job.file) is None]
 
 
-def compile_in_subprocess(jobs: Sequence[CompileJob], progress: Callable[[int, int], None] | None = None) -> bool:
+def compile_in_subprocess(jobs: Sequence[CompileJob], progress: ProgressCallback | None = None) -> bool:
     """Compile ``jobs`` in another process, one at a time on each processor.
 
     Args:
@@ -117,7 +117,7 @@ def compile_in_subprocess(jobs: Sequence[CompileJob], progress: Callable[[int, i
         process.wait()
 
 
-def _follow(process: Any, order: bytes, count: int, progress: Callable[[int, int], None] | None) -> bool:
+def _follow(process: Any, order: bytes, count: int, progress: ProgressCallback | None) -> bool:
     """Send the order and follow what the worker prints, a line per kernel; return whether all went well."""
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(order)
@@ -137,9 +137,7 @@ def _kill(process: Any) -> None:
             process.kill()
 
 
-def compile_ahead(
-    names: Iterable[str], progress: Callable[[int, int], None] | None = None
-) -> tuple[int, int, Path | None]:
+def compile_ahead(names: Iterable[str], progress: ProgressCallback | None = None) -> tuple[int, int, Path | None]:
     """Compile kernels that are not on disk, for every type of values.
 
     Args:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,6 +90,11 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise DataError(f"{path}: holds a {type(document).__name__}; expected a checkpoint")
     return document
+
+
+def tensors_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    """Return arrays, as of `vvgt_cli.network.prepare.Prepared.arrays`, as tensors."""
+    return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:

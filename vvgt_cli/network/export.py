@@ -24,7 +24,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, graph_record
-from vvgt_cli.network.checkpoint import load_checkpoint
+from vvgt_cli.network.checkpoint import load_checkpoint, tensors_of
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.model import GeometrySide, ImageSide, Vvgt
 from vvgt_cli.network.prepare import Prepared, prepare
@@ -70,10 +70,6 @@ def random_scene(config: NetworkConfig, count: int, views: int, seed: int = 0) -
     return prepare(gaussians, default_views("train", views, size=32), images, config)
 
 
-def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence the exporter, which prints its steps and warns of its own internals; errors still raise."""
@@ -95,7 +91,7 @@ def trace(network: Vvgt) -> dict[str, Any]:
     # small windows: at least two of them at every stage of so few points
     small = replace(config, geometry=replace(config.geometry, window=2))
     scene = random_scene(small, *TRACED)
-    views, tensors = _tensors(scene.views), _tensors(scene.part())
+    views, tensors = tensors_of(scene.views), tensors_of(scene.part())
     traced: dict[str, Any] = {}
     if network.image is not None:
         images = tuple(views.pop(name) for name in IMAGE_INPUTS)
@@ -173,7 +169,7 @@ def difference(network: Vvgt, model: Model) -> float:
     for seed, (count, views) in enumerate(CHECKED, 1):
         scene = random_scene(network.config, count, views, seed)
         with torch.inference_mode():
-            expected = network(_tensors(scene.arrays())).numpy()
+            expected = network(tensors_of(scene.arrays())).numpy()
         if np.allclose(expected, scene.rows, atol=1e-5):
             raise DataError("the network's head is zero: it returns its input and cannot be compared")
         found = model.run_rows(scene)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vvgt_cli.gaussians.formats.splats import interleave
 from vvgt_cli.network.config import STAGES, GeometryConfig
 
 OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])  # (27, 3)
@@ -163,22 +164,6 @@ def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
 
 BITS = 16  # an axis; three of them fit 48 bits of an int64
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
-_SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-           (2, 0x1249249249249249))  # fmt: skip
-
-
-def spread(values: np.ndarray) -> np.ndarray:
-    """Return ``values`` (below 2^21) with bit i moved to bit 3 i."""
-    bits = values.astype(np.uint64)
-    for shift, mask in _SPREAD:
-        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
-    return bits.astype(np.int64)
-
-
-def interleave(cells: np.ndarray) -> np.ndarray:
-    """Return the Z-order codes (n,) int64 of ``cells`` (n, 3) non-negative integers below 2^21, first axis first."""
-    result: np.ndarray = spread(cells[:, 0]) << 2 | spread(cells[:, 1]) << 1 | spread(cells[:, 2])
-    return result
 
 
 def hilbert(cells: np.ndarray, bits: int) -> np.ndarray:

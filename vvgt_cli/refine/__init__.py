@@ -7,7 +7,8 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from vvgt_cli.refine.options import LOSS_3DGS, METHODS, Check, OptimizeOptions, OptimizeRecord, Progress
+from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.refine.options import LOSS_3DGS, METHODS, Check, OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +23,7 @@ def optimize(
     images: np.ndarray,
     options: OptimizeOptions | None = None,
     check: Check | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     stop: Callable[[], bool] | None = None,
     free: np.ndarray | None = None,
     weights: Sequence[np.ndarray] | None = None,

@@ -21,13 +21,11 @@ from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.jit.gpu import SIMULATED, Recorded, cuda, free_bytes, gpu_kernel, sent
-from vvgt_cli.refine.loss import error_slope
+from vvgt_cli.refine.loss import KERNEL, error_slope, smooth_share
 from vvgt_cli.refine.options import OptimizeOptions
 from vvgt_cli.refine.shared import AGREEING, BOUNDS, PACE, RECALL, sample_of
-from vvgt_cli.refine.ssim import KERNEL
-from vvgt_cli.refine.states import MEDIAN, MEMORY, OUTLIER, OwnAxes
+from vvgt_cli.refine.states import MEDIAN, MEMORY, SLOPE_CAP, OwnAxes, State
 from vvgt_cli.refine.steps import COUNT, EPSILON, FEATURES, KNOWN, RUN, adam_parts, clip, move_one
-from vvgt_cli.refine.texture import smooth_share
 from vvgt_cli.splat.buffer import ZERO, f32
 from vvgt_cli.splat.lanes import LANES
 from vvgt_cli.splat.on_device import KERNELS as splatting
@@ -62,7 +60,7 @@ def sum_block(value, sums):  # type: ignore[no-untyped-def]
 
 @gpu_kernel("f4:3 f4:4 f4:3 f8:1 f4:1 f4:3")
 def find_texture(image, targets, weights, now, window, fine):  # type: ignore[no-untyped-def]
-    """Write the errors less their blur, weighted as `texture.weigh` does, into ``fine`` (h, w, 3), a thread a pixel."""
+    """Write the errors less their blur, weighted as `loss.weigh` does, into ``fine`` (h, w, 3), a thread a pixel."""
     p, (height, width), view = cuda.grid(1), fine.shape[:2], int(now[PLACE])
     if p >= height * width:
         return
@@ -123,7 +121,7 @@ def grade(image, targets, weights, now, window, fine, losses, grad, squares):  #
 
 
 @gpu_kernel("f4:2 f4:2 f4:2 f8:1 f4:1 i8 f8 f4:2 f4:2 f4:1")
-def direct(rows, first, second, now, betas, every, weakest, towards, sizes, floors):  # type: ignore[no-untyped-def]
+def direct(rows, first, second, now, betas, every, damping, towards, sizes, floors):  # type: ignore[no-untyped-def]
     """Do what `OwnAxes.common` does for a field, a block each: its divisors' floor, and directions of the sample."""
     row, i, count = cuda.blockIdx.x, cuda.threadIdx.x, sizes.shape[1]
     sums = cuda.shared.array(THREADS, np.float64)  # one a line, by which the simulator tells them apart
@@ -143,11 +141,11 @@ def direct(rows, first, second, now, betas, every, weakest, towards, sizes, floo
     sort_block(few, 0, FEW)
     bound, total = ZERO, 0.0
     if seen > 0:
-        bound = f32(OUTLIER) * (f32(0.5) * (few[(seen - 1) // 2] + few[seen // 2]))
+        bound = f32(SLOPE_CAP) * (f32(0.5) * (few[(seen - 1) // 2] + few[seen // 2]))
     for n in range(i, count, cuda.blockDim.x):
         size = sizes[row, n]
         total += np.float64(size if size < bound else bound)
-    floor = f32(weakest * sum_block(total, sums) / count + EPSILON)
+    floor = f32(damping * sum_block(total, sums) / count + EPSILON)
     if i == 0:
         floors[row] = floor
     for n in range(i, count, cuda.blockDim.x):
@@ -315,7 +313,7 @@ class _Views:
             self.again()
 
 
-class OwnAxesOnDevice:
+class OwnAxesOnDevice(State):
     """`OwnAxes` whose steps a CUDA device takes, and whose pictures it draws.
 
     A step is only begun: the next one, or whoever asks for the state, waits for it.
@@ -323,8 +321,6 @@ class OwnAxesOnDevice:
     Attributes:
         host: the state on the CPU, as it was when it was last asked for.
     """
-
-    STEADY = True
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
@@ -368,13 +364,8 @@ class OwnAxesOnDevice:
         """Return what steps change, from the host: four arrays, two moments, the course, what `SharedSteps` has."""
         host = self.host
         course = np.array([-1.0 if math.isnan(host.error) else host.error, 0.0])
-        return (
-            *host.arrays,
-            host.first,
-            host.second,
-            course,
-            np.empty(0) if host.shared is None else host.shared.last(),
-        )
+        last = np.empty(0) if host.shared is None else host.shared.last()
+        return *host.arrays, host.first, host.second, course, last
 
     def step(
         self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
@@ -408,9 +399,9 @@ class OwnAxesOnDevice:
         grade[views.blocks](*seen, self.losses, views.grad, views.squares)
         splatter.slopes(means, factors, colors, now, views.grad, self.rows)
         moving, room = (self.rows, first, second, now, self.betas), (splatter.status, splatter.room)
-        if host.weakest:
+        if host.damping:
             every = sample_of(len(self.held))[0]
-            direct[COUNT, ADDERS, stream](*moving, every, host.weakest, self.towards, self.sizes, self.floors)
+            direct[COUNT, ADDERS, stream](*moving, every, host.damping, self.towards, self.sizes, self.floors)
         if host.shared is not None:
             regress[FEATURES, ADDERS, stream](self.solver, self.towards, self.plain)
         set_pace[1, ADDERS, stream](

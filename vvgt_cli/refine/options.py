@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,7 +21,6 @@ METHODS = ("frame", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log/closed-form.md)
 LOSSES: dict[str, dict[str, float]] = {"frame": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
-Progress = Callable[[int, int], None]
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
 Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None, Sequence[np.ndarray] | None]"
 
@@ -41,7 +40,7 @@ class OptimizeOptions:
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
         texture: weight of the square of the high-frequency part of r, where the view is smooth
-            (`vvgt_cli.refine.texture`).
+            (`vvgt_cli.refine.loss`).
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.
         judge: by which the check views are drawn.

@@ -1,18 +1,26 @@
-"""States of gradient descent: a state takes steps, draws itself, and can be put back to where it was."""
+"""States of gradient descent: a state takes steps, draws itself, and can be put back to where it was.
+
+`Densified` is 3DGS as it was published (Kerbl et al. 2023), for comparison: Gaussians are cloned, split and pruned on
+the way. There, of 30,000 steps, every 100th from the 500th to the 15,000th densifies; here the same shares of the run,
+but not before `FEWEST` views have been seen since the last time. Opacities are reset in every 3,000th step, where that
+leaves `RECOVERY` steps to recover in. Clones share the opacity of what they were cloned from, ``1 - sqrt(1 - o)`` each
+(Rota Bulo et al. 2024): twice the original would darken the picture.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import SH_C0, Gaussians
-from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.frames import axes_of, rotations
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
 from vvgt_cli.refine.loss import picture_slope
@@ -20,16 +28,23 @@ from vvgt_cli.refine.options import OptimizeOptions
 from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, blend, project
-from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
+from vvgt_cli.splat.render import (
+    fields_backward,
+    moments,
+    own_axes_backward,
+    project_factors,
+    screen_slopes,
+    seen_colors,
+)
 
 MEMORY = 0.9  # share of the running error that a step keeps
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
-WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
+DAMPING = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
 MEDIAN = 512  # of the sample that the median is of, or less than twice as many; all, where there are fewer
-GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
-OUTLIER = 100.0  # times the median that a slope counts in that mean
-GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
+DAMPING_OF_SOME = 1.0  # instead, where some are free: descended on before, so only what is wrong now goes far
+SLOPE_CAP = 100.0  # times the median: what a slope counts at most in that mean
+KNOWN_HARMONICS_RATE = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
 
 DEFAULT = OptimizeOptions()
 
@@ -47,15 +62,16 @@ def _has_harmonics(harmonics: np.ndarray | None) -> bool:
     return bool(harmonics[:, degree**2 - 1 :].any())
 
 
-class State(Protocol):
+class State(ABC):
     """What a descent works on, whatever its method and wherever it is.
 
     Attributes:
         STEADY: what falls far behind its best can be put back there, and a run without gain is at its end.
     """
 
-    STEADY: bool
+    STEADY = True
 
+    @abstractmethod
     def step(
         self, camera: Camera, target: np.ndarray, share: float, speed: float, weight: np.ndarray | None = None
     ) -> None:
@@ -64,30 +80,35 @@ class State(Protocol):
         Rates are multiplied by ``speed``, differences from the view by ``weight`` (h, w).
         """
 
+    @abstractmethod
     def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
         """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
 
+    @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on and that the start does not give again; the fields ``array_i``."""
 
+    @abstractmethod
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
 
+    @abstractmethod
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians, as a file has them."""
 
 
-class OnHost(ABC):
+class OnHost(State):
     """A state whose steps the CPU takes.
 
     Attributes:
         arrays: what is descended on, colours and harmonics last.
+        running: Adam's two moments of each array that it takes one by one.
         error: running RMS error of the pictures.
         taken: number of steps.
     """
 
-    STEADY = True
     arrays: tuple[np.ndarray, ...]
+    running: list[np.ndarray]
 
     def __init__(self, options: OptimizeOptions) -> None:
         """Begin before the first step."""
@@ -104,18 +125,20 @@ class OnHost(ABC):
         self.descend(camera, projection, image, grad, share, speed)
 
     def picture(self, camera: Camera, rule: Rule, blocks: Blocks | None = None) -> np.ndarray:
-        """Return (h, w, 4) as drawn by a rule; with ``blocks`` zero elsewhere."""
+        """Implement `State.picture`."""
         colors = np.maximum(self.colors_from(camera), 0)
         return blend(self.project(camera, rule), colors, camera.height, camera.width, blocks)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Return the fields, and what is counted."""
-        counted = {"step": np.array(self.taken), "error": np.array(self.error)}
-        return {f"array_{i}": array for i, array in enumerate(self.arrays)} | counted
+        """Return the fields, their moments, and what is counted."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        named |= {f"running_{i}": array for i, array in enumerate(self.running)}
+        return named | {"step": np.array(self.taken), "error": np.array(self.error)}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.taken, self.error = int(saved["step"]), float(saved["error"])
 
     @abstractmethod
@@ -132,10 +155,6 @@ class OnHost(ABC):
     ) -> None:
         """Take one step from a picture and the slope of the loss by it, (h, w, 4); others as of `State.step`."""
 
-    @abstractmethod
-    def gaussians(self) -> Gaussians:
-        """Return the current Gaussians, as a file has them."""
-
 
 class OwnAxes(OnHost):
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
@@ -143,7 +162,7 @@ class OwnAxes(OnHost):
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
     run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), or only
     some are free, of however many, rates count `OWN` times, and slopes that are small beside the others' count less.
-    Harmonics up to a degree that the start has change by `GIVEN` of the rate of those that begin at zero.
+    Harmonics up to a degree that the start has go by `KNOWN_HARMONICS_RATE` of the rate of those that begin at zero.
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
@@ -159,16 +178,15 @@ class OwnAxes(OnHost):
     ) -> None:  # fmt: skip
         """Keep only ``free`` (K,) bool moving; None: all."""
         super().__init__(options)
-        scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
         self.arrays = (
             gaussians.means.copy(),
-            np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
+            np.ascontiguousarray(axes_of(gaussians), np.float32),
             gaussians.opacity_logits.copy(),
             np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
             *([] if harmonics is None else [harmonics.copy()]),
         )
-        self.harmonic_rate = float(self.RATES[5]) * (GIVEN if _has_harmonics(harmonics) else 1.0)
+        self.harmonic_rate = float(self.RATES[5]) * (KNOWN_HARMONICS_RATE if _has_harmonics(harmonics) else 1.0)
         self.running = [np.zeros_like(array) for array in self.arrays[4:] for _ in range(2)]
         self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
         self.first, self.second = (np.zeros((steps.COUNT, len(gaussians)), np.float32) for _ in range(2))
@@ -176,8 +194,8 @@ class OwnAxes(OnHost):
         self.spread = options.rule.dilation * pixel**2
         # what has been descended on before is not wrong alike any more
         self.shared = shared_steps(*self.arrays[:4]) if free is None else None
-        self.weakest = 0.0 if free is None and self.shared is None else WEAKEST if free is None else GOING_ON
-        self.own_rates = self.RATES * self.OWN if self.weakest else self.RATES
+        self.damping = DAMPING_OF_SOME if free is not None else DAMPING if self.shared is not None else 0.0
+        self.own_rates = self.RATES * self.OWN if self.damping else self.RATES
         self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
@@ -197,17 +215,17 @@ class OwnAxes(OnHost):
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
-        slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
+        rows, by_harmonics = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         rates, pace = self.rates(share, speed)
         steps.own_axes(
-            slopes.rows, rates, self.CLIPS, self.spread,
+            rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.taken, means, factors, logits, colors, self.darkest, self.first, self.second,
-            *self.common(slopes.rows),
+            *self.common(rows),
         )  # fmt: skip
-        if harmonics is not None and slopes.harmonics is not None:
+        if harmonics is not None and by_harmonics is not None:
             rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
             first, second = (array.reshape(-1) for array in self.running)
-            values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
+            values, slope = harmonics.reshape(-1), by_harmonics.reshape(-1)
             steps.adam(values, slope, rate, *self.BETAS, self.taken, first, second)
         if len(self.fixed):
             for array, there in zip(self.arrays, self.there, strict=True):
@@ -225,30 +243,28 @@ class OwnAxes(OnHost):
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what is added to Adam's divisors, features and shared weights; from slopes ``rows`` (COUNT, K)."""
-        if not self.weakest:
+        if not self.damping:
             return np.full(len(rows), EPSILON, np.float32), *NONE
         every, count = sample_of(rows.shape[1])
         directions, sizes = np.empty((2, len(rows), count), np.float32)
         steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.taken, every, directions, sizes)
         few = sizes[:, :: max(count // MEDIAN, 1)]
         medians = [np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few]
-        most = np.array([OUTLIER * median for median in medians], np.float64)
+        most = np.array([SLOPE_CAP * median for median in medians], np.float64)
         floors = np.empty(len(rows), np.float32)
-        steps.adam_directions(sizes, most, self.weakest, directions, floors)
+        steps.adam_directions(sizes, most, self.damping, directions, floors)
         if self.shared is None:
             return floors, *NONE
         return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Return all that the next steps depend on and that the start does not give again."""
-        named = super().saved() | {f"running_{i}": array for i, array in enumerate(self.running)}
-        named |= self.shared.saved() if self.shared is not None else {}
-        return named | {"first": self.first.T, "second": self.second.T}
+        """Implement `State.saved`."""
+        shared = {} if self.shared is None else self.shared.saved()
+        return super().saved() | shared | {"first": self.first.T, "second": self.second.T}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         super().restore(saved)
-        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
         if self.shared is not None:
             self.shared.restore(saved)
@@ -279,7 +295,7 @@ class Fields(OnHost):
         """Begin at ``gaussians``, with moments of 0; all of them move."""
         super().__init__(options)
         self.arrays = tuple(array.copy() for array in gaussians.arrays().values())
-        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
+        self.running = [np.zeros_like(array) for array in self.arrays for _ in range(2)]
 
     def colors_from(self, camera: Camera) -> np.ndarray:
         """Return (K, 3) colours as the camera sees them, which may be negative."""
@@ -303,24 +319,131 @@ class Fields(OnHost):
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.taken += 1
-        found = [getattr(slopes, field) for field in gaussians.arrays()]
-        used = rates[: len(found)]
-        for array, slope, rate, (first, second) in zip(self.arrays, found, used, self.running, strict=True):
-            values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
-            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.taken, moment, square)
-
-    def saved(self) -> dict[str, np.ndarray]:
-        """Return all that the next steps depend on."""
-        named = super().saved()
-        for i, (first, second) in enumerate(self.running):
-            named |= {f"first_{i}": first, f"second_{i}": second}
-        return named
-
-    def restore(self, saved: dict[str, np.ndarray]) -> None:
-        """Put back what `saved` gave."""
-        super().restore(saved)
-        self.running = [(saved[f"first_{i}"], saved[f"second_{i}"]) for i in range(len(self.arrays))]
+        for i, field in enumerate(gaussians.arrays()):
+            columns = self.arrays[i], getattr(slopes, field), *self.running[2 * i : 2 * i + 2]
+            values, slope, moment, square = (array.reshape(-1) for array in columns)
+            steps.adam(values, slope, rates[i], *self.BETAS, self.taken, moment, square)
 
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians."""
         return Gaussians(*self.arrays)
+
+
+FIRST, LAST, EVERY, RESET = 500 / 30_000, 0.5, 100 / 30_000, 3_000 / 30_000  # shares of the run
+FEWEST, RECOVERY = 10, 300  # steps
+SLOPE = 2e-4  # mean gradient of the loss a pixel, in half pictures, above which a Gaussian is cloned or split
+DENSE = 0.01  # of the cameras' extent: larger ones are split, smaller ones cloned
+FAINTEST = 0.005  # opacity below which a Gaussian is removed
+RESET_TO = 0.01  # opacity
+SHRINK = 1.6  # of the scales of the two that a split makes
+FINAL_RATE = 0.01  # of positions, at the end of the run
+
+
+class Densified(Fields):
+    """`Fields` with 3DGS' density control and decaying rate of positions."""
+
+    STEADY = False
+
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
+    ) -> None:
+        """Take the limit of Gaussians, or their number, and the random seed from ``options``."""
+        super().__init__(gaussians, cameras, options, free)
+        self.limit = max(options.max_gaussians or len(gaussians), 1)
+        self.rng = np.random.default_rng(options.seed)
+        eyes = np.array([camera.position for camera in cameras])
+        self.extent = 1.1 * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max()) or 1.0
+        self.last = self.last_reset = 0
+        self.share = self.share_reset = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        self.slopes, self.seen = np.zeros(len(self.arrays[0])), np.zeros(len(self.arrays[0]), np.int64)
+
+    def descend(
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, share: float, speed: float
+    ) -> None:
+        """Take one step, with density control where it is due."""
+        seen = self.colors_from(camera)
+        pairs = moments(projection, seen, image, grad)
+        size = 3 * camera.width * camera.height  # their loss is a mean, ours a sum
+        self.slopes += screen_slopes(projection, pairs) * (0.5 * max(camera.width, camera.height) / size)
+        self.seen += projection.extent[:, 2] > projection.extent[:, 0]
+        self.update(camera, projection, pairs, seen, (self.RATES[0] * FINAL_RATE**share, *self.RATES[1:]))
+        if FIRST <= share <= LAST and share >= self.share + EVERY and self.taken >= self.last + FEWEST:
+            self._densify()
+            self.last, self.share = self.taken, share
+        if share <= LAST and share >= self.share_reset + RESET:
+            if self.taken >= self.last_reset + RECOVERY:
+                self._reset()
+            self.last_reset, self.share_reset = self.taken, share
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Return all that the next steps depend on."""
+        last = np.array([self.last, self.last_reset, self.share, self.share_reset], np.float64)
+        drawn = np.array(json.dumps(self.rng.bit_generator.state))
+        return super().saved() | {"slopes": self.slopes, "seen": self.seen, "last": last, "drawn": drawn}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        super().restore(saved)
+        self.slopes, self.seen = saved["slopes"], saved["seen"]
+        last, last_reset, self.share, self.share_reset = map(float, saved["last"])
+        self.last, self.last_reset = int(last), int(last_reset)
+        self.rng.bit_generator.state = json.loads(str(saved["drawn"]))
+
+    def _densify(self) -> None:
+        score = self.slopes / np.maximum(self.seen, 1)
+        denser, origin = densify(self.gaussians(), score, self.limit, self.extent, self.rng)
+        self.arrays = tuple(denser.arrays().values())
+        self.running = [np.where(_wide(origin >= 0, moment), moment[origin], 0) for moment in self.running]
+        self._forget()
+
+    def _reset(self) -> None:
+        logits, most = self.arrays[3], math.log(RESET_TO / (1 - RESET_TO))
+        np.minimum(logits, most, out=logits)
+        for moment in self.running[6:8]:
+            moment[:] = 0
+
+
+def densify(
+    gaussians: Gaussians, score: np.ndarray, limit: int, extent: float, rng: np.random.Generator
+) -> tuple[Gaussians, np.ndarray]:
+    """Remove faint, clone small and split large Gaussians of large score, until there are ``limit``.
+
+    Args:
+        gaussians: K of them.
+        score: (K,) mean length of the gradient with respect to the projected centre.
+        limit: most Gaussians; of those worth splitting the ones with the largest scores come first.
+        extent: of the cameras, a length.
+        rng: draws where the halves of a split go.
+
+    Returns:
+        (Gaussians, origin): ``origin`` (K',) is the index that each had before, -1 for new ones.
+    """
+    g = gaussians
+    opacity = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
+    keep = np.flatnonzero(opacity >= FAINTEST) if (opacity >= FAINTEST).any() else np.array([int(opacity.argmax())])
+    keep = keep[np.argsort(-opacity[keep], kind="stable")[:limit]]
+    keep.sort()
+    order = keep[np.argsort(-score[keep], kind="stable")]
+    chosen = order[score[order] > SLOPE][: max(limit - len(keep), 0)]
+    scales = np.exp(g.log_scales[chosen].astype(np.float64))
+    large = scales.max(axis=1) > DENSE * extent
+    index = np.concatenate([keep, chosen])  # one of the two in its place, the other at the end
+    origin = np.concatenate([keep, np.full(len(chosen), -1)])
+    place = np.searchsorted(keep, chosen)
+    origin[place[large]] = -1
+    means, logs, logits = g.means[index].copy(), g.log_scales[index].copy(), g.opacity_logits[index].copy()
+    turns = rotations(g.quaternions[chosen[large]])
+    for rows in (place, len(keep) + np.arange(len(chosen))):
+        moved = np.einsum("kij,kj->ki", turns, scales[large] * rng.normal(size=(int(large.sum()), 3)))
+        means[rows[large]] += moved.astype(np.float32)
+        logs[rows[large]] -= np.float32(math.log(SHRINK))
+        shared = -np.expm1(0.5 * np.log1p(-np.minimum(opacity[chosen[~large]], 1 - 1e-6)))
+        logits[rows[~large]] = np.log(shared / (1 - shared))
+    return replace(g.take(index), means=means, log_scales=logs, opacity_logits=logits), origin
+
+
+def _wide(mask: np.ndarray, like: np.ndarray) -> np.ndarray:
+    return mask.reshape(-1, *(1,) * (like.ndim - 1))

@@ -156,7 +156,7 @@ def own_axes(
 ) -> None:  # fmt: skip
     """Step mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
-    Gradients ``slopes`` (COUNT, K) as `AxesGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
+    Gradients ``slopes`` (COUNT, K) of `own_axes_backward` and what they are of, ``means`` (K, 3), ``factors``
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
     (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
     logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the
@@ -210,18 +210,18 @@ def adam_sizes(
 
 @parallel_kernel("f4:2 f8:1 f8 f4:2 f4:1", error_model="numpy")
 def adam_directions(
-    thread: ThreadSlice, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
+    thread: ThreadSlice, sizes: np.ndarray, most: np.ndarray, damping: float, towards: np.ndarray, floors: np.ndarray
 ) -> None:
     """Divide ``towards`` by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
 
-    ``floors`` (COUNT,): ``weakest`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
+    ``floors`` (COUNT,): ``damping`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
     """
     for row in iterations(thread, COUNT):
         bound, total = f32(most[row]), 0.0
         for i in range(sizes.shape[1]):
             size = sizes[row, i]
             total += np.float64(size if size < bound else bound)
-        floors[row] = weakest * total / sizes.shape[1] + EPSILON
+        floors[row] = damping * total / sizes.shape[1] + EPSILON
         for i in range(sizes.shape[1]):
             way = towards[row, i] / (sizes[row, i] + floors[row])
             towards[row, i] = way if abs(way) < f32(math.inf) else f32(0)

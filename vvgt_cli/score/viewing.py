@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views, look_at
-from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
+from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
@@ -34,7 +34,7 @@ Axes = tuple[tuple[float, ...], ...]
 UPRIGHT: Axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 UP, APART = 0.3, 0.063  # metres: eyes 1.6 m up, and between both
 DISTANCES = (6.0, 1.2, 0.6)  # unit frame, beside that of the test views, 3: about a level farther, nearer and inside
-PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of scores without a report: above, side, below
+PREVIEW_VIEWS = VIEWS  # of previews, and of scores without a report
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def condition_views(
 
     for done, (place, camera, blocks) in enumerate(pictures, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
-        yield ConditionView(place, camera, blocks, image if blocks is None else blocks.pick(image))
+        yield ConditionView(place, camera, blocks, picked(image, blocks))
         if progress:
             progress(done, len(pictures))
 
@@ -235,9 +235,8 @@ def score_conditions(
     errors: dict[tuple[str, ViewingPlace], list[float]] = {}
     for view in seen:
         for rule in (headset,) if view.place.where else rules:
-            ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
-            shown = ours if view.blocks is None else view.blocks.pick(ours)
-            errors.setdefault((rule, view.place), []).append(psnr(view.reference, shown))
+            ours = picked(render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3], view.blocks)
+            errors.setdefault((rule, view.place), []).append(psnr(view.reference, ours))
     found = [
         ViewingCondition(rule, *place[:2], float(np.mean(dbs)), place.where) for (rule, place), dbs in errors.items()
     ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import FEW, Blocks, spread_blocks
+from vvgt_cli.cameras.blocks import FEW, Blocks, drawn_pixels, picked, spread_blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.progress import ProgressCallback
@@ -38,8 +38,7 @@ def scored_views(
 
 def test_view_pixels(size: int) -> int:
     """Return the number of pixels by which the errors of a test view of ``size`` px are measured."""
-    blocks = spread_blocks(size, size)
-    return size**2 if blocks is None else int(blocks.mask().sum())
+    return drawn_pixels(size)
 
 
 def score_test_views(
@@ -150,8 +149,7 @@ class Views:
 
         for i, camera in enumerate(self.cameras):
             blocks = None if self.blocks is None else self.blocks[i]
-            image = render(gaussians, camera, rule, blocks=blocks)
-            yield image if blocks is None else blocks.pick(image)
+            yield picked(render(gaussians, camera, rule, blocks=blocks), blocks)
 
     def psnr(self, gaussians: Gaussians, rule: Rule = INRIA) -> float:
         """Return the mean PSNR (dB) of RGB over black, of the views that show something, or of all if none does.
@@ -182,7 +180,6 @@ def render_check_views(scene: Scene | Viewed, cameras: Sequence[Camera], setting
 
     images, known = [], []
     for camera, blocks in check_blocks(cameras):
-        image = render_view(scene, camera, settings, blocks)
-        images.append(image if blocks is None else blocks.pick(image))
+        images.append(picked(render_view(scene, camera, settings, blocks), blocks))
         known += [] if blocks is None else [blocks]
     return Views(list(cameras), np.stack(images), known or None)

@@ -17,6 +17,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import DILATION, TILE
+from vvgt_cli.gaussians.frames import axes_of
 from vvgt_cli.gaussians.live import LENGTH, SPREAD, TAU, VALUE, Table, apply_look, directions
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.jit.decorators import parallel_kernel
@@ -35,7 +36,7 @@ def mip(gaussians: Gaussians, camera: Camera, lo: float, hi: float) -> np.ndarra
     live, width = gaussians.live.astype(np.float64), (hi - lo) or 1.0
     projection = _projected(gaussians, camera)
     along, explained = directions(gaussians)
-    joint = np.einsum("kij,kj->ki", _axes(gaussians), along)  # covariance of place and value, per deviation of value
+    joint = np.einsum("kij,kj->ki", axes_of(gaussians), along)  # covariance of place and value, per deviation of value
     spread = live[:, SPREAD] / width * explained
     x, y, z = _in_camera(gaussians, camera)
     right, down, ahead = camera.rotation @ (joint * spread[:, None]).T
@@ -69,14 +70,6 @@ def xray(gaussians: Gaussians, table: Table, camera: Camera) -> np.ndarray:
 def _projected(gaussians: Gaussians, camera: Camera) -> Projection:
     """Project Gaussians of any opacity, out to `REACH`."""
     return project(replace(gaussians, opacity_logits=np.full(len(gaussians), 9.0)), camera, GREY)
-
-
-def _axes(gaussians: Gaussians) -> np.ndarray:
-    """Return the principal axes as columns as long as their deviations, (K, 3, 3) float64."""
-    from vvgt_cli.gaussians.frames import rotations
-
-    axes: np.ndarray = rotations(gaussians.quaternions.astype(np.float64))
-    return axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
 
 
 def _in_camera(gaussians: Gaussians, camera: Camera) -> np.ndarray:

@@ -9,14 +9,14 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import NEAR
+from vvgt_cli.gaussians.frames import axes_of, view_colors
 from vvgt_cli.gaussians.frames import rotations as rotations
-from vvgt_cli.gaussians.frames import view_colors
 from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
     """Return ``R diag(s^2) R^T``, (K, 3, 3) float64, unit-frame lengths squared."""
-    factors = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    factors = axes_of(gaussians)
     result: np.ndarray = factors @ factors.transpose(0, 2, 1)
     return result
 

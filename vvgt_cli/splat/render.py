@@ -241,33 +241,24 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
     return pairs
 
 
-@dataclass(frozen=True)
-class AxesGradients:
-    """Gradients for steps along each Gaussian's own axes, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
-
-    Attributes:
-        rows: (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz, one off the diagonal for both
-            entries, opacity logit, colour (3).
-        harmonics: (K, M, 3) float32, None where there are none.
-    """
-
-    rows: np.ndarray
-    harmonics: np.ndarray | None = None
-
-
 def own_axes_backward(
-    means: np.ndarray,
-    factors: np.ndarray,
-    colors: np.ndarray,
-    camera: Camera,
-    projection: Projection,
-    pairs: np.ndarray,
-    harmonics: np.ndarray | None = None,
-) -> AxesGradients:
-    """Return the gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, all float32.
+    means: np.ndarray, factors: np.ndarray, colors: np.ndarray, camera: Camera, projection: Projection,
+    pairs: np.ndarray, harmonics: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
+    """Return gradients for steps along each Gaussian's own axes, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
 
-    ``projection`` from `project_factors`, ``pairs`` from `moments` with ``colors`` (K, 3): those of `seen_colors` where
-    there are ``harmonics`` (K, M, 3).
+    Args:
+        means: (K, 3) float32.
+        factors: (K, 3, 3) float32 M of covariances ``M M^T``.
+        colors: (K, 3) float32, those of `seen_colors` where there are harmonics.
+        camera: of the picture.
+        projection: of `project_factors`.
+        pairs: of `moments` with ``colors``.
+        harmonics: (K, M, 3) float32; None: none.
+
+    Returns:
+        (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz, one off the diagonal for both entries,
+        opacity logit, colour (3); and (K, M, 3) float32 by the harmonics, None without them.
     """
     from vvgt_cli.splat import backward
 
@@ -276,7 +267,7 @@ def own_axes_backward(
         p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera), p.rule.projecting(), rows
     )
     if harmonics is None:
-        return AxesGradients(rows)
+        return rows, None
     by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, np.ascontiguousarray(rows[10:].T))
     rows[:3] += np.einsum("kji,kj->ik", factors, by_means)
-    return AxesGradients(rows, by_harmonics)
+    return rows, by_harmonics

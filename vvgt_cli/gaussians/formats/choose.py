@@ -52,14 +52,19 @@ class Format:
     write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
 
+def _one_of(write_nodes: Callable[[Sequence[Node], str], bytes]) -> Callable[[Splats, str], bytes]:
+    """Return the `Format.write` of a format with nodes: of one, which is the root."""
+    return lambda splats, name: write_nodes([Node("", splats)], name)
+
+
 FORMATS = (  # the first whose ending fits is taken: a longer ending stands before a shorter one
     Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
     Format(".v4.spz", gsply_files.spz_4, gsply_files.read_spz, gsply_files.zstandard),
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
     Format(".sog", sog.sog, sog.read_sog, lambda name: None),
-    Format(".glb", gltf.glb, gltf.read_glb, lambda name: None, write_nodes=gltf.glb_of_nodes),
-    Format(".usdc", usd.usdc, usd.read_usdc, usd.library, write_nodes=usd.usdc_of_nodes),
-    Format(".usdz", usd.usdz, usd.read_usdz, usd.library, write_nodes=usd.usdz_of_nodes),
+    Format(".glb", _one_of(gltf.glb), gltf.read_glb, lambda name: None, write_nodes=gltf.glb),
+    Format(".usdc", _one_of(usd.usdc), usd.read_usdc, usd.library, write_nodes=usd.usdc),
+    Format(".usdz", _one_of(usd.usdz), usd.read_usdz, usd.library, write_nodes=usd.usdz),
     Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import offset_in, placed
-from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, report_off
-from vvgt_cli.gaussians.formats.splats import Splats, joined, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, offset_in, placed, report_off
+from vvgt_cli.gaussians.formats.splats import Splats, joined, log_scales_of, logits_of, opacities_of
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.version import VERSION
 
@@ -32,18 +31,9 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, (x, y, z, w)
 
 
-def glb(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.glb` with one node."""
-    return _file([Node("", splats)], {}, splats.comments, name)
-
-
-def glb_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
-    """Encode several clouds as a `.glb` with a node each, in groups, below one that places them."""
-    return _file(nodes, group_names(nodes), common_comments(nodes), name)
-
-
-def _file(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments: tuple[str, ...], name: str) -> bytes:
-    """Encode nodes; one without a name is the root itself."""
+def glb(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode clouds as a `.glb` with a node each, in groups, below the root, which is a cloud without a name itself."""
+    comments = common_comments(nodes)
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(comments)}},
         "extensionsUsed": [EXTENSION, *([] if all(node.visible for node in nodes) else [VISIBILITY])],
@@ -52,7 +42,7 @@ def _file(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments
     }  # fmt: skip
     arrays: list[np.ndarray] = []
     number: dict[tuple[str, ...], int] = {(): 0}
-    for path, group in groups.items():
+    for path, group in group_names(nodes).items():
         number[path] = _child(document, number[path[:-1]], {"name": group})
     for node in nodes:
         if not node.name:
@@ -124,7 +114,7 @@ def _harmonic(m: int) -> str:
 
 
 def read_glb(content: bytes, name: str) -> Splats:
-    """Read the columns of a `.glb` that `glb` or `glb_of_nodes` wrote, all nodes together, or raise DataError."""
+    """Read the columns of a `.glb` that `glb` wrote, all nodes together, or raise DataError."""
     try:
         return _read(content, name)
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error) as error:
@@ -183,11 +173,9 @@ def _columns(document: dict[str, Any], binary: bytes, mesh: int, comments: tuple
     known = [m for m in range(15) if _harmonic(m) in attributes]
     means, count = column("POSITION", 3), len(column("POSITION", 3))
     f_rest = [column(_harmonic(m), 3) for m in known]
-    with np.errstate(divide="ignore"):
-        log_scales = np.log(column(f"{EXTENSION}:SCALE", 3).astype(np.float64))
     return Splats(
         means,
-        np.maximum(log_scales, -80).astype(np.float32),
+        log_scales_of(column(f"{EXTENSION}:SCALE", 3)),
         column(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
         logits_of(column(f"{EXTENSION}:OPACITY", 1)),
         column(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3),

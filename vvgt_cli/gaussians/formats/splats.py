@@ -125,12 +125,28 @@ def logits_of(opacities: np.ndarray) -> np.ndarray:
     return result
 
 
+def log_scales_of(scales: np.ndarray) -> np.ndarray:
+    """Return the natural logarithms (K, 3) float32 of standard deviations, -80 and above so that they are finite."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(scales.astype(np.float64)), -80).astype(np.float32)
+
+
 def morton_order(means: np.ndarray) -> np.ndarray:
     """Return the order (K,) along the Morton curve, which keeps neighbours in space close together."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = ((means - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint32)
-    code = np.zeros(len(means), np.uint32)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << np.uint32(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return np.argsort(interleave(cells[:, ::-1]), kind="stable")
+
+
+_SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+           (2, 0x1249249249249249))  # fmt: skip
+
+
+def interleave(cells: np.ndarray) -> np.ndarray:
+    """Return the Z-order codes (n,) int64 of ``cells`` (n, 3) non-negative integers below 2^21, first axis first."""
+    bits = cells.astype(np.uint64)
+    for shift, mask in _SPREAD:  # bit i moves to bit 3 i
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    first, second, third = bits.T.astype(np.int64)
+    code: np.ndarray = first << 2 | second << 1 | third
+    return code

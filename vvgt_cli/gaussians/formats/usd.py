@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.metres import offset_in, placed
-from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, report_off
-from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.nodes import ROOT, Node, common_comments, group_names, offset_in, placed, report_off
+from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, joined, log_scales_of, logits_of, opacities_of
 from vvgt_cli.volume.libraries import library_errors, need
 
 KIND = "ParticleField3DGaussianSplat"
@@ -38,39 +37,19 @@ def library(source: str) -> Any:
     return usd
 
 
-def usdc(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.usdc` with one prim, /Splats."""
-    return _stage([Node("", splats)], {}, splats.comments, name)
-
-
-def usdc_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
-    """Encode several clouds as a `.usdc` with a prim each, in groups, below /Splats, which places them."""
-    return _stage(nodes, group_names(nodes), common_comments(nodes), name)
-
-
-def usdz(splats: Splats, name: str) -> bytes:
-    """Encode columns as a `.usdz`: the `.usdc` in a package."""
-    return _package(usdc(splats, name))
-
-
-def usdz_of_nodes(nodes: Sequence[Node], name: str) -> bytes:
-    """Encode several clouds as a `.usdz`: see `usdc_of_nodes`."""
-    return _package(usdc_of_nodes(nodes, name))
-
-
-def _package(content: bytes) -> bytes:
-    """Return a zip of one file, stored at a multiple of 64 bytes (usdz specification 1.3), without a date."""
+def usdz(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode clouds as a `.usdz`, a zip of the `.usdc`, stored at a multiple of 64 bytes (specification 1.3)."""
     stream, entry = io.BytesIO(), zipfile.ZipInfo("splats.usdc")
     size = -(_ZIP_HEADER + len(entry.filename) + 4) % _ALIGNED
     entry.extra = struct.pack("<2H", _PADDING, size) + bytes(size)
     with zipfile.ZipFile(stream, "w") as package:
-        package.writestr(entry, content)
+        package.writestr(entry, usdc(nodes, name))
     return stream.getvalue()
 
 
-def _stage(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comments: tuple[str, ...], name: str) -> bytes:
-    """Encode nodes; one without a name is the root itself."""
-    usd = library(name)
+def usdc(nodes: Sequence[Node], name: str) -> bytes:
+    """Encode clouds as a `.usdc` with a prim each, in groups, below /Splats, which is a cloud without a name itself."""
+    usd, comments = library(name), common_comments(nodes)
     from pxr import Gf, Sdf, UsdGeom
 
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +62,7 @@ def _stage(nodes: Sequence[Node], groups: Mapping[tuple[str, ...], str], comment
         prims: dict[tuple[str, ...], Any] = {(): stage.DefinePrim(Sdf.Path(f"/{ROOT}"), kind)}
         stage.SetDefaultPrim(prims[()])
         _place(prims[()], comments, name)
-        for group, shown in groups.items():
+        for group, shown in group_names(nodes).items():
             prims[group] = _below(prims[group[:-1]], shown, "Xform")
         for node in nodes:
             prim, splats = prims[()], node.splats
@@ -165,7 +144,7 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def read_usdc(content: bytes, name: str, ending: str = ".usdc") -> Splats:
-    """Read the columns of a `.usdc` as `usdc` or `usdc_of_nodes` writes, all prims together, or raise DataError."""
+    """Read the columns of a `.usdc` as `usdc` writes, all prims together, or raise DataError."""
     usd = library(name)
     from pxr import UsdGeom
 
@@ -198,13 +177,11 @@ def _columns(prim: Any, comments: tuple[str, ...], name: str) -> Splats:
     def values(attribute: str) -> np.ndarray:
         return np.array(prim.GetAttribute(attribute).Get(), np.float32)
 
-    means, scales = values("positions"), values("scales")
+    means = values("positions")
     harmonics = values("radiance:sphericalHarmonicsCoefficients").reshape(len(means), -1, 3)
-    with np.errstate(divide="ignore"):
-        log_scales = np.maximum(np.log(scales.astype(np.float64)), -80)
     return Splats(
         means,
-        log_scales.astype(np.float32),
+        log_scales_of(values("scales")),
         values("orientations")[:, [3, 0, 1, 2]],
         logits_of(values("opacities")),
         np.ascontiguousarray(harmonics[:, 0]),

@@ -16,11 +16,13 @@ from torch.nn import functional
 
 from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA, psnr
+from vvgt_cli.gaussians.constants import DILATION, MAX_ALPHA, NEAR, TILE
+from vvgt_cli.images import metrics
+from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
+from vvgt_cli.network.checkpoint import tensors_of
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.prepare import Prepared, prepare, unpack
 from vvgt_cli.network.runtime import views_of_round
-from vvgt_cli.network.training.by_gsplat import picture
 from vvgt_cli.network.training.config import LossConfig, TrainConfig
 from vvgt_cli.network.training.lpips import Lpips
 from vvgt_cli.network.training.scenes import TrainingScene, as_float
@@ -34,11 +36,6 @@ class SceneTally:
     loss: float = 0.0
     gain: float = 0.0
     bad: int = 0
-
-
-def tensors(prepared: Prepared) -> dict[str, Tensor]:
-    """Return the network's input as tensors."""
-    return {name: torch.from_numpy(np.array(array)) for name, array in prepared.arrays().items()}
 
 
 def run_network(network: Vvgt, inputs: dict[str, Tensor], device: torch.device) -> Tensor:
@@ -67,7 +64,7 @@ class Feeder:
         key = (scene, views, number)
         if key not in self.kept:
             prepared = self._make(*key)
-            self.kept[key] = prepared, tensors(prepared)
+            self.kept[key] = prepared, tensors_of(prepared.arrays())
             if len(self.kept) > self.config.keep:
                 self.kept.popitem(last=False)
         self.kept.move_to_end(key)
@@ -121,7 +118,7 @@ def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device
         shown = views_of_round(few, number, config.network.rounds)
         cameras, images = [scene.cameras[i] for i in shown], as_float(scene.images[shown])
         prepared = prepare(gaussians, cameras, images, config.network)
-        rows = run_network(network, tensors(prepared), device).cpu().numpy()
+        rows = run_network(network, tensors_of(prepared.arrays()), device).cpu().numpy()
         gaussians = prepared.accept(rows, cameras, images)
         found.append(mean_psnr(gaussians, scene.targets, scene.target_images))
     return found
@@ -129,8 +126,7 @@ def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device
 
 def mean_psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> float:
     """Return the mean PSNR over views; images uint16."""
-    pairs = zip(cameras, images, strict=True)
-    return float(np.mean([psnr(as_float(view)[..., :3], render(gaussians, c)[..., :3]) for c, view in pairs]))
+    return metrics.mean_psnr(map(as_float, images), (render(gaussians, camera) for camera in cameras))
 
 
 TINY = 1e-10  # squared error of 100 dB
@@ -210,7 +206,28 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
 
 
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
-    """`splat` by gsplat, differentiable; see `picture` for where pictures differ."""
-    means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
-    drawn = picture(means, logits[:, 0].sigmoid(), colors.clamp(min=0), quaternions, log_scales.exp(), camera)
-    return torch.cat(drawn, dim=-1)
+    """`splat` by gsplat (Ye et al. 2024), differentiable.
+
+    gsplat's alpha ends at 0.999, where that of the rules ends at `MAX_ALPHA`: opacities are made to end there. And it
+    takes the Jacobian of what lies beside the frustum at the frustum's edge: pictures differ there.
+    """
+    from gsplat.cuda import _wrapper as gsplat
+
+    means, log_scales, quats, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3], pose[:3, 3] = camera.rotation, camera.translation
+    lens = [[camera.fx, 0, camera.cx, 0], [0, camera.fy, camera.cy, 0], [0, 0, 1, 0], [0, 0, 0, 0]]
+    view, lens = torch.from_numpy(np.stack([pose, np.array(lens, np.float32)])).to(rows.device)
+    size = camera.width, camera.height
+    across, down = (-(-edge // TILE) for edge in size)
+    opacities = logits[:, 0].sigmoid().clamp(max=MAX_ALPHA)
+    radii, centres, depths, conics, _ = gsplat.fully_fused_projection(
+        means, None, quats, log_scales.exp(), view[None], lens[None, :3, :3], *size, eps2d=DILATION, near_plane=NEAR,
+        opacities=opacities,
+    )  # fmt: skip
+    _, pairs, members = gsplat.isect_tiles(centres, radii, depths, TILE, across, down)
+    begin = gsplat.isect_offset_encode(pairs, 1, across, down)
+    rgb, alpha = gsplat.rasterize_to_pixels(
+        centres, conics, colors.clamp(min=0)[None], opacities[None], *size, TILE, begin, members
+    )  # fmt: skip
+    return torch.cat([rgb[0], alpha[0]], dim=-1)
