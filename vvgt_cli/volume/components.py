@@ -139,7 +139,7 @@ def select_component(
         text = f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
         raise SeveralComponents(text, n, color and n in (3, 4)) if component is None else UsageError(text)
     if component == "magnitude":
-        return magnitude(values, *scaling), (1.0, 0.0)
+        return magnitude(np.moveaxis(values, -1, 0), *scaling), (1.0, 0.0)
     return contiguous(values[..., int(component)]), scaling
 
 
@@ -186,12 +186,12 @@ def contiguous(field: np.ndarray) -> np.ndarray:
     return field if field.flags.c_contiguous else np.ascontiguousarray(field)
 
 
-def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Return norms (nz, ny, nx) float32 of values (nz, ny, nx, c), ``slope * stored + intercept``, slice by slice."""
-    out = np.empty(values.shape[:3], np.float32)
-    for z, plane in enumerate(values):
-        total = np.zeros(plane.shape[:2])
-        for c in range(plane.shape[2]):
-            total += (plane[..., c].astype(np.float64) * slope + intercept) ** 2
-        out[z] = np.sqrt(total)
+def magnitude(bands: Sequence[np.ndarray] | np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
+    """Return norms (nz, ny, nx) float32 of bands (nz, ny, nx) of values ``slope * stored + intercept``, by slices."""
+    out = np.empty(bands[0].shape, np.float32)
+    for z, row in enumerate(out):
+        total = np.zeros(row.shape)
+        for band in bands:
+            total += (band[z].astype(np.float64) * slope + intercept) ** 2
+        row[...] = np.sqrt(total)
     return out

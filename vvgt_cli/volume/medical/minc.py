@@ -150,7 +150,7 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
     read = [_scaled(image, spatial, fixed | dict.fromkeys(parts, k), path) for k in chosen]
 
     def norm(slices: Slices) -> np.ndarray:
-        return magnitude(np.stack([part(slices) for part in read], -1))
+        return magnitude([part(slices) for part in read])
 
     one = norm if len(read) > 1 else read[0]
     field = stored_or_loaded(one, np.dtype(np.float32), shape, (1, *shape[1:]), str(path), options.stored)

@@ -180,7 +180,7 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
     parts = [loaded(_view(bdv, time, one, options)) for one in setups]
     for part in parts[1:]:
         part.check_grid(part.name, parts[0], parts[0].name, "choose one channel (--channel), not their magnitude")
-    return replace(parts[0], data=magnitude(np.stack([part.data for part in parts], axis=-1)))
+    return replace(parts[0], data=magnitude([part.data for part in parts]))
 
 
 def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volume:
