@@ -17,11 +17,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, select_component
-from vvgt_cli.volume.headers import printable, text_of
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Stored, Volume, float_dtype, printable, text_of, triple
 from vvgt_cli.volume.space import metres, unit_name
-from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume, float_dtype, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")

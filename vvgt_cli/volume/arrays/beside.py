@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.components import choose, listed
-from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.labelled import Axis, axis, even
-from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.reading import choose, listed, metres, text_of
 
 GROUPS = re.compile(r"coord(inate)?s?|grid|axes|mesh|dim(ension)?s?", re.I)  # that hold coordinates
 _LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*)[)\]]*", re.I)

@@ -16,9 +16,7 @@ from typing import Any, NamedTuple, cast
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
 from vvgt_cli.volume.arrays.zarr import level_shapes as zarr_levels
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
 
 SCHEMES = ("http", "https")
 

@@ -11,9 +11,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.remote import Remote
 from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
 
 
 class _Zipped(Remote):

@@ -23,14 +23,12 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom import is_dicom
 from vvgt_cli.volume.dicom.pet import TAGS as PET
 from vvgt_cli.volume.dicom.segmentation import is_segmentation
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.microscopy.image import Bounded
+from vvgt_cli.volume.reading import check_memory, listed, printable
 
 Source = Path | zipfile.Path
 

@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, listed, printable
 
 FEW = 2  # slices: fewer than make a volume, beside one that has more
 NEAR = 0.01  # share of the largest distance of neighbouring slices within which two are in one place

@@ -18,16 +18,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.components import magnitude
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.libraries import need
 from vvgt_cli.volume.microscopy import imaris
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import lazy
+from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
 from vvgt_cli.volume.space import metres, placed, unit_name
 from vvgt_cli.volume.stored import loaded
-from vvgt_cli.volume.types import Volume
 
 READ = {  # by the XML element that names the data: reader, and the array of time t, setup s and level l
     "hdf5": (lazy("arrays.hdf5.read_dataset"), "t{t:05d}/s{s:02d}/{l}/cells"),

@@ -19,9 +19,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, magnitude
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Volume
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
-from vvgt_cli.volume.types import Volume
 
 EXTRA = "microscopy"
 MAX_XML = 64 << 20

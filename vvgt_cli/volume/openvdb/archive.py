@@ -11,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP, Cursor
-from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.types import FLAT
+from vvgt_cli.volume.reading import FLAT, printable, unit_rows
 
 VERSIONS = range(222, 225)
 _UUID = 36

@@ -19,15 +19,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import choose, listed, select_component
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, printable, volume_name
 
 LOOKS = dict.fromkeys(("density", "smoke"), "smoke") | dict.fromkeys(("flame", "flames", "temperature", "heat"), "fire")
 

@@ -27,17 +27,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import size_text
-from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import metres
-from vvgt_cli.volume.stored import Slices
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, metres, size_text, triple, volume_name
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
 from vvgt_cli.volume.tiff.pages import check_pages
-from vvgt_cli.volume.types import Volume, triple
 
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 

@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed, select_component
 from vvgt_cli.volume.headers import fields_of_sections
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, listed, select_component, volume_name
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
 from vvgt_cli.volume.tiff.pages import lazy_files
 from vvgt_cli.volume.tiff.reader import read_tiff
-from vvgt_cli.volume.types import Volume
 
 MAX_FILES = 100_000  # files
 

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.types import Volume, float_dtype, triple
+from vvgt_cli.volume.reading import Volume, check_memory, count, float_dtype, triple
 
 MAX_EDGE = 512  # voxels along an axis, where nobody said how many
 
