@@ -26,15 +26,8 @@ def choose(
 ) -> int:  # fmt: skip
     """Return the index of the array (dataset, grid, ...) that is asked for, or of the only one.
 
-    Args:
-        names: values of the option, one an array.
-        rows: description of each, for messages.
-        wanted: one of the names; None for the only array.
-        source: for messages.
-        what: word for an array, in the singular, for messages.
-        how: how to choose one, for messages.
-        option: flag that chooses one.
-        note: why none of several is chosen without the option, for messages.
+    ``names`` are values of the ``option`` that chooses, ``rows`` describe them. ``what`` is the word for one, ``how``
+    says how to choose, and ``note`` why none of several is taken without the option.
 
     Raises:
         DataError: there are none.
@@ -157,11 +150,7 @@ def selected_dtype(info: ArrayInfo, component: int | str | None, source: str) ->
 def channel_numbers(wanted: Sequence[str], count: int, names: Sequence[str], source: str) -> list[int]:
     """Return the numbers of the channels that are asked for, each once.
 
-    Args:
-        wanted: what stands between the commas of ``A,B``: numbers, names, and pieces of names that have commas.
-        count: how many channels there are.
-        names: their names, where they have any.
-        source: for messages.
+    ``wanted`` is what stands between the commas of ``A,B``: numbers, names, and pieces of names that have commas.
 
     Raises:
         UsageError: no channel of that name or number, or several of that name.

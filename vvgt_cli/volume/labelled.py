@@ -131,16 +131,10 @@ def labelled_volume(
 ) -> Volume:  # fmt: skip
     """Make a volume of an array with named axes.
 
-    Args:
-        stored: stored values (mapped, perhaps), or a function that reads a part, by a slice or a number for each axis.
-        dtype: of the stored values.
-        axes: slowest first.
-        attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
-        options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
-            a single such axis, either.
-        source: for messages.
-        name: of the volume.
-        chunks: of the array in its file, one an axis; with ``options.stored`` it stays there and is read in blocks.
+    ``stored`` holds the values (mapped, perhaps), or is a function that reads a part by a slice or a number for each
+    axis; ``axes`` come slowest first. ``options.time`` is the index along the axis of time, ``component`` that along
+    another that is not of space; of a single such axis, either. With ``options.stored`` an array with ``chunks`` stays
+    in its file and is read in blocks.
 
     Returns:
         Axes in the order z, y, x and ascending; values that the attributes call missing are NaN.

@@ -137,13 +137,8 @@ def choose_grid(
 ) -> str:  # fmt: skip
     """Return the name of the array asked for, else of the only one with three axes (with two, if none has three).
 
-    Args:
-        arrays: shape and type of each, by name.
-        wanted: one of the names, or None.
-        source: for messages.
-        what: word for an array, in the singular, for messages.
-        how: how to choose one, for messages.
-        rows: description of each, for messages; by default shape and type.
+    ``arrays`` has the shape and the type of each by name; ``rows`` describe them otherwise. ``what`` and ``how`` are
+    those of `choose`.
 
     Raises:
         DataError: there are none, or places and vectors of particles in place of any.

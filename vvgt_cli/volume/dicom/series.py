@@ -142,11 +142,8 @@ Files = list[tuple[Source, Any]]
 def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, path: Path) -> tuple[str, Files, str]:
     """Choose the series asked for, or the only one.
 
-    Args:
-        headers: files and their headers.
-        wanted: number, UID or description of a series; after it, or alone where there is one series, ``/K``, the number
-            of a stack in it from 1, and the name of one of its volumes.
-        path: for messages.
+    ``wanted`` is number, UID or description of a series; after it, or alone where there is one series, ``/K``, the
+    number of a stack in it from 1, and the name of one of its volumes.
 
     Returns:
         The suffix of the volume's name, the files of the series, and the part of ``wanted`` that names a stack or a

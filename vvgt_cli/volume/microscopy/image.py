@@ -105,15 +105,8 @@ def choose_channel(
 ) -> int | None:  # fmt: skip
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
 
-    Args:
-        n: how many there are.
-        names: of the channels, where they have any.
-        dtype: of their values.
-        wanted: number, name, ``magnitude``, or None.
-        source: for messages.
-        colors: RGB in [0, 1] of the channels, where they have any.
-        rgb: they are red, green, blue and perhaps opacity.
-        separate: they are channels of their own, not samples of pixels.
+    The channels may have names and ``colors``, RGB in [0, 1]. ``rgb``: they are red, green, blue and perhaps opacity;
+    ``separate``: they are channels of their own, not samples of pixels.
 
     Raises:
         SeveralComponents: several and none chosen.
@@ -146,16 +139,9 @@ def choose_image(
 ) -> int:  # fmt: skip
     """Return the index of the image, scene or position asked for by number or name, or of the only one.
 
-    The only one of several slices is taken where none is asked for, with a warning.
-
-    Args:
-        names: of all of them.
-        facts: description of each, for messages.
-        wanted: number or name; None for the only one.
-        what: word for them, in the plural, for messages.
-        source: for messages.
-        deep: which ones have several slices, where they differ.
-        keys: their numbers; from 0 on where they are not given.
+    The only one of several slices (``deep``, where they differ) is taken with a warning where none is asked for.
+    ``facts`` describe them, ``what`` is the word for them in the plural, and ``keys`` are their numbers, by default
+    from 0 on.
 
     Raises:
         DataError: there are none.

@@ -61,8 +61,7 @@ def guess_dims(data: np.ndarray) -> tuple[int, int, int] | None:
 
     Neighbouring rows and slices of a volume are alike; read in another order than they were written they are not.
 
-    Args:
-        data: (nz, ny, nx), contiguous; memory-mapped data are read in a few places only.
+    ``data`` are (nz, ny, nx), contiguous; mapped ones are read in a few places only.
 
     Returns:
         The order in which neighbours differ least, or None where that given is no worse, or nothing can be inferred.

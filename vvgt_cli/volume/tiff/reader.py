@@ -88,10 +88,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
 
     Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
 
-    Args:
-        path: the file.
-        options: see `ReadOptions`.
-        slices: how many slices a volume has, if the file is one of them.
+    A volume has so many ``slices`` if the file is one of them.
     """
     check_pages(path)
     with library_errors(str(path), "TIFF"), _silent(), open_tiff(path) as file, Pages(path) as pages:

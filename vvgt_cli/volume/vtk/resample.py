@@ -35,13 +35,8 @@ def resample(
     Point data are interpolated as the cells do, cell data are constant in a cell. Samples are voxel centres: the first
     lies half a voxel inside the box. The volume's name says how many there are.
 
-    Args:
-        mesh: a vtkDataSet.
-        values: (n,) scalars of its points or cells.
-        where: ``point`` or ``cell``.
-        dims: voxels along (x, y, z); None: cubic ones, about as many as the mesh has cells, `MAX_EDGE` along an axis.
-        source: for messages.
-        name: of the volume.
+    ``values`` (n,) are scalars of the points or cells (``where``) of the mesh. Without ``dims`` (x, y, z) voxels are
+    cubes, about as many as the mesh has cells, and at most `MAX_EDGE` along an axis.
 
     Raises:
         DataError: an empty mesh, or memory that does not suffice.

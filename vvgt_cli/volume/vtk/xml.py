@@ -349,16 +349,9 @@ def packed_array(
 ) -> Stored:  # fmt: skip
     """Wrap a component of an array that stays in its file.
 
-    Args:
-        path: the file.
-        compressor: as VTKFile names it.
-        word: type of the words before the blocks.
-        coded: in base64.
-        start: byte of the first word.
-        dtype: of the values, as stored.
-        shape: (nz, ny, nx, components).
-        component: of them.
-        info: the array.
+    ``compressor`` is as VTKFile names it, ``word`` the type of the words before the blocks, ``coded`` whether they are
+    in base64, ``start`` the byte of the first word, ``dtype`` that of the values as stored; ``shape`` is (nz, ny, nx,
+    components).
 
     Raises:
         DataError: no whole table of blocks, or one of other sizes.
