@@ -68,10 +68,8 @@ class SeriesAxes:
 
     def index(self, time: int, channel: int, box: Slices) -> tuple[int | slice, ...]:
         """Return the index of a box (z, y, x) along every axis; samples of a pixel count faster than channels."""
-        index: list[int | slice] = [0] * len(self.shape)
-        for letter, at in zip("TZYX", (time, *box), strict=True):
-            for k in self.of(letter):
-                index[k] = at
+        places: dict[str, int | slice] = {"T": time, **dict(zip("ZYX", box, strict=True))}
+        index = [places.get(a, 0) if n > 1 else 0 for a, n in zip(self.axes, self.shape, strict=True)]
         for k in reversed(self.of("CS")):
             channel, index[k] = divmod(channel, self.shape[k])
         return tuple(index)
@@ -98,7 +96,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         facts = _facts(file, root, series, number, path)
         layout = _layout(series, path)
         mapped = _mapped(file, series, layout, path) if _mappable(series) else None
-        stored = options.stored and (mapped is not None or (layout.paged and options.component != "magnitude"))
+        stored = options.stored and options.component != "magnitude" and (mapped is not None or layout.paged)
         again = partial(_opened, path, number) if stored else lambda: (series, pages)
         sizes = triple(map(layout.count, "ZYX"))
         picture = Micrograph(
