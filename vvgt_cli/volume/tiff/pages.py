@@ -1,18 +1,14 @@
-"""Checks of the directories of a TIFF file, before a library reads them, and slices that stay in TIFF files."""
+"""Checks of the directories of a TIFF file, before a library reads them."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import size_text
-from vvgt_cli.volume.stored import Stored, slice_by_slice
 
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _DEPTH = 256, 257, 258, 277, 32997
 _FIELD = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q"}
@@ -90,19 +86,3 @@ def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
             f"{layout.path}: page {page} of {width} x {height} pixels with {samples} samples; expected at least 1"
         )
     return width * height * samples * max(tags.get(_DEPTH, 1), 1) * max(bits, 1) // 8
-
-
-def lazy_files(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Return slices that stay in their files; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
-
-    def read(k: int) -> np.ndarray:
-        values = load(files[k])
-        if values.shape != plane.shape or values.dtype != plane.dtype:
-            raise DataError(
-                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
-                f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
-            )
-        only: np.ndarray = values[0]
-        return only
-
-    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)
