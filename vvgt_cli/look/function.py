@@ -175,11 +175,8 @@ class ColorMap:
 def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
     """Check the arrays of a function and sort them as VTK does (equal positions keep their order), float64.
 
-    Args:
-        nodes: empty midpoints and sharpness become 0.5 and 0.
-        what: the function, for messages.
-        column: name of the attribute with the values.
-        called: name of the values in messages.
+    Empty midpoints and sharpness become 0.5 and 0; ``column`` is the attribute with the values, ``called`` so in
+    messages.
 
     Raises:
         DataError: no node, lengths that differ, a value that is not finite, or one outside [0, 1] (positions aside).

@@ -34,9 +34,7 @@ PREVIEWS = 10  # pictures for each volume beside them, up to which they do not m
 def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     """Read a volume from a file, from standard input (``-``, raw bytes) or from a registered scheme.
 
-    Args:
-        source: a path, ``PATH:/inner/path`` for formats that hold several arrays, ``-`` or ``scheme:rest``.
-        options: see `ReadOptions`.
+    The ``source`` is a path, ``PATH:/inner/path`` for formats that hold several arrays, ``-`` or ``scheme:rest``.
 
     Returns:
         The volume, cropped and masked; memory-mapped where the format stores plain values. Where its file states an
