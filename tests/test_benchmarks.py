@@ -196,15 +196,6 @@ def test_grey(bench, scenes, tmp_path, monkeypatch):
     assert "| mip |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
-def test_live_page(bench, scenes, tmp_path):
-    module = bench("live_page")
-    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--scene", "blob", "--gaussians", 200, "--rounds", 1)
-    rows = rows_of(tmp_path / "a.csv")
-    assert [row["light"] for row in rows] == ["none", "headlight"]
-    assert all(0.5 < float(row["MB"]) < 2 and 0 < float(row["first page"]) < 60 for row in rows)
-    assert "| headlight |" in call(module.main, "--table", tmp_path / "a.csv")
-
-
 def test_network(bench, tmp_path):
     from vvgt_cli.network.card import find_model
 

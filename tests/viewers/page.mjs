@@ -70,6 +70,12 @@ const shoot = async ({ camera, frame }) => {
     entity.camera.projectionOffset = { x: 0, y: 0 };
     entity.translateLocal(shift, 0, 0);
   });
+  const { look } = window.vvgt.live ?? {};
+  if (look?.wanted && !look.said) {  // the volume itself, in a canvas of its own
+    lens.middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+    for (let still = 0; still < 3; still = look.rested ? still + 1 : 0) await new Promise((done) => setTimeout(done, 300));
+    return look.canvas.toDataURL('image/png');
+  }
   if (frame !== null) await show(frame);
   document.querySelectorAll('#series, #live').forEach((element) => { element.style.display = 'none'; });
   return settled((by) => { shift = by; }, () => new Promise((done) => {

@@ -6,13 +6,12 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 
 from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.file_layout import degree_of, harmonics_warning, ply_options
 from vvgt_cli.conversion.gaussian_files import is_page, report_format_cost, write_gaussians
-from vvgt_cli.conversion.live import check_live, convert_live, editor_form
+from vvgt_cli.conversion.live import check_live, convert_live
 from vvgt_cli.conversion.place import headset_axes, placement_warnings, to_unit_frame
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory, report_target
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
@@ -32,7 +31,6 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
 from vvgt_cli.look.suggest import fitting
@@ -267,7 +265,6 @@ def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Co
     source = work.field.source
     return Conversion(
         to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field,
-        partial(editor_form, request),
     )  # fmt: skip
 
 
@@ -293,8 +290,7 @@ def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CON
             field = Resident.of(source, request.fit.device, run.console.message)
         yield field
         return
-    values = request.live or request.editor
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, by_regions(request), values)
+    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, by_regions(request), request.live)
     with store_beside(request.output) as store, blocked(run, request.source, options, store, needs) as found:
         _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
@@ -348,10 +344,10 @@ def _write_file(run: Run, request: ConvertRequest, conversion: Conversion, again
     assert request.output is not None
     page = is_page(request.output) and request.ply.comments
     limit = None if request.megabytes is None else 1e6 * request.megabytes
-    extras = conversion.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
+    values = conversion.values(run, limit) if page and request.values else None
     write_gaussians(
         run, request.output, conversion.gaussians, conversion.ply, request.overwrite or again, conversion.normals(),
-        "certificate" if again else "write", more, extras,
+        "certificate" if again else "write", more, values,
     )  # fmt: skip
 
 

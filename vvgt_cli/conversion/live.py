@@ -15,25 +15,23 @@ from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.certify import with_certificate
-from vvgt_cli.conversion.file_layout import degree_of, ply_options
+from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, to_frame_of, to_unit_frame
 from vvgt_cli.conversion.plan import report_target
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Stage, Work
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.refinement import SMALLEST
-from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
+from vvgt_cli.errors import NoLiveForm, NothingVisible
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.formats.page_live import LiveForm
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
 from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate
-from vvgt_cli.jit.ahead import LIVE
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
 from vvgt_cli.look.labels import Label, LabelTable
@@ -83,26 +81,6 @@ def live_refusal(request: ConvertRequest, source: Source) -> str | None:
         check_layers(source)
     except NoLiveForm as error:
         return str(error)
-    return None
-
-
-def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions) -> LiveForm | None:
-    """Return the live form of a converted volume under the same look, for the function editor of its page.
-
-    None, with a message, if the volume has no live form or the run a time limit.
-    """
-    source = field.source
-    fit = FitOptions(request.budget(degree_of(request, source)), request.fit.size, rule=request.fit.rule)
-    plain = ConvertRequest(request.source, fit=fit, ply=replace(request.ply, sh_degree=None), live=True)
-    why = "--time-budget" if request.limits.time_budget is not None else live_refusal(plain, source)
-    try:
-        if why is None:
-            run.compile(source.kernels(LIVE), source.kernel_type())
-            found = convert_live(run, plain, field, ply, scored=False)
-            return found.gaussians, replace(found.ply, sh_degree=None)
-    except (UsageError, NothingVisible) as error:
-        why = str(error)
-    run.console.message(f"the page has no function editor: {why}")
     return None
 
 
