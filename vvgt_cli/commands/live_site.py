@@ -216,7 +216,7 @@ class PageController:
                 look = parse_labels(asked["labels"], known.labels)
                 check_labels([look])
             elif not known.others:
-                look = parse_function(asked.get("function"))
+                look = parse_function(asked)
             job = look, None if light is None else LightOptions.of(light[0])
         with self.converter.lock:
             self.resources.pop(f"{self.state['number']}.ply", None)

@@ -216,7 +216,8 @@ class Conversion(Result):
             with (run or Run(Console(quiet=True), ConversionReport("init"))).stage("values") as stage:
                 page = format_of("x.html")
                 assert page is not None
-                taken = limit and len(encoded(page, self.gaussians, self.ply, "")) + CERTIFICATES
+                bare = replace(self.gaussians, live=None), replace(self.ply, live=None)
+                taken = limit and len(encoded(page, *bare, "")) + CERTIFICATES
                 room = None if limit is None else limit - taken
                 found = self._values[limit] = self.field.source.values(room)
                 colours = all(layer.colors for layer in self.field.source.layers)

@@ -7,7 +7,6 @@ precision highp sampler3D;
 precision highp usampler3D;
 uniform vec3 origin[3], direction[3], voxel[3], jitter;  // at the lower left corner, and what they gain across and up; the edges of a voxel; of the pixel, and of the first sample
 uniform vec4 cuts[6], light, toward, face;  // dot(xyz, place) <= w of each stays; ambient (< 0: unlit), diffuse, specular, power; with w = 1 the light is at the eye; w > 0: the values from x on, as 1 / y greys, are shown on the cut
-uniform vec3 grey;  // of a MIP: x is black, y times more is white
 uniform vec2 size;
 uniform float ds, again;
 uniform int kind, faced;  // 0 the look, 1 MIP, 2 X-ray; the layer on the cut
@@ -79,7 +78,7 @@ vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
     t += ds;
     then = now;
   }
-  return kind == 0 ? vec4(C, A) : vec4(vec3(kind == 2 ? A : clamp((best - grey.x) * grey.y, 0.0, 1.0)), 1.0);
+  return kind == 0 ? vec4(C, A) : vec4(vec3(kind == 2 ? A : clamp(best, 0.0, 1.0)), 1.0);
 }
 
 void main() {

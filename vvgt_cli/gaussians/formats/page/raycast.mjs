@@ -155,12 +155,12 @@ function uploaded(gl, grid, layer, k) {
   };
 }
 
-// {layers, nodes, rows, planes: what is shown; apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), draw(kind), window([from, to]) of a MIP in the range of values, face({layer, from, to} or null): values on the cut; show(now);
+// {layers, nodes, rows, planes: what is shown; apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), draw(kind), face({layer, from, to} or null): values on the cut; show(now);
 // picture(size), sketch(k, nodes, light, edge): canvases; pick(ray): a place; at(place): its value; rested: nothing changes any more; said: why it cannot}; begin(lens, world, covering(now)) comes first
 export function raycaster(facts, gridsOf, { app }) {
   const canvas = Object.assign(document.createElement('canvas'), { id: 'volume', hidden: true });
   let gl = null, ray = null, put = null, looks = null, drawn = [], grids = [], lens = null, world = null, covering = null, starting = null, deep = 0;
-  let wanted = false, covers = false, version = 0, kind = 0, lamp = facts.light, face = null, grey = [0, 1];
+  let wanted = false, covers = false, version = 0, kind = 0, lamp = facts.light, face = null;
   let key = '', since = 0, frame = 0, quiet = 0, row = 0, rows = 64, pair = [], fence = null, begun = 0, query = null, busy = Promise.resolve(), still = 0;
 
   const distance = (k, nodes) => (kind === 2 ? exposed(nodes, look.layers[k]) : look.layers[k].unit_distance);
@@ -264,7 +264,6 @@ export function raycaster(facts, gridsOf, { app }) {
     ray('4f', 'toward', ...light.from, light.kind === 'headlight' ? 1 : 0);
     ray('4f', 'face', ...(face ? [face.from, 1 / Math.max(face.to - face.from, 1e-6), 0, 1] : [0, 0, 0, 0]));
     ray('1i', 'faced', face ? grids.findIndex(({ layer }) => layer === face.layer) : 0);
-    ray('3f', 'grey', grey[0], 1 / Math.max(grey[1] - grey[0], 1e-6), 0);
     bound(0, looks);
     bound(1, from.sums);
     onto(to, size);
@@ -379,7 +378,6 @@ export function raycaster(facts, gridsOf, { app }) {
     cut(planes) { look.planes = planes; version++; },
     light(now) { lamp = now; version++; },
     draw(now) { kind = now; if (look.nodes[0]) tabulate(0); },
-    window(now) { grey = now; version++; },
     face(now) { face = now; version++; },
     begin(...given) { [lens, world, covering] = given; app.on('update', tick); },
     show(now) { wanted = now; },
