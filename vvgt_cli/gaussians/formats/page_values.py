@@ -140,8 +140,8 @@ def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> 
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
-    look = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
-    return Values(tuple(facts), tuple(contents), look, limited) if facts else None
+    begun = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
+    return Values(tuple(facts), tuple(contents), begun, limited) if facts else None
 
 
 def _values(
