@@ -127,7 +127,7 @@ class LoadedVolume:
 def hidden(half: Sequence[float]) -> Gaussians:
     """Return two invisible Gaussians (unit frame) at the ends of a box, for a page that has no others yet."""
     ends = np.array([half, half], np.float32) * [[-1], [1]]
-    turned = np.tile(np.float32([1, 0, 0, 0]), (2, 1))
+    turned = np.tile(np.array([1, 0, 0, 0], np.float32), (2, 1))
     return Gaussians(
         ends.astype(np.float32), np.full((2, 3), -9, np.float32), turned, np.full(2, -20, np.float32),
         np.zeros((2, 3), np.float32),

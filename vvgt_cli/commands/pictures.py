@@ -173,7 +173,7 @@ def draw_files(run: Run, request: Drawing) -> int:
             return _render(run, replace(request, facts=frame_facts([file or None])), [given])
         except SeveralSteps:  # which are the frames
             pass
-    series = FrameSeries(ConvertRequest(given, request.output, blocks=request.blocks), Shard(), page=False)
+    series = FrameSeries(ConvertRequest(given, request.output, blocks=request.blocks), Shard())
     facts = [series.places(stem) for stem in series.stems]
     return _render(run, replace(request, facts=facts), series.sources(), series)
 

@@ -220,8 +220,7 @@ class Conversion(Result):
                 page = format_of("x.html")
                 assert page is not None
                 bare = replace(self.gaussians, live=None), replace(self.ply, live=None)
-                taken = limit and len(encoded(page, *bare, "")) + CERTIFICATES
-                room = None if limit is None else limit - taken
+                room = None if limit is None else limit - CERTIFICATES - len(encoded(page, *bare, ""))
                 found = self._values[limit] = self.field.source.values(room)
                 colours = all(layer.colors for layer in self.field.source.layers)
                 why = "the volume has colours" if colours else f"--max-size leaves {max(room or 0, 0) / 1e6:.2f} MB"

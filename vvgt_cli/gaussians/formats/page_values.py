@@ -140,8 +140,8 @@ def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> 
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
-    look = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
-    return Values(tuple(facts), tuple(contents), look, limited) if facts else None
+    begun = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
+    return Values(tuple(facts), tuple(contents), begun, limited) if facts else None
 
 
 def _values(
@@ -152,7 +152,9 @@ def _values(
     known = values[np.isfinite(values)]
     lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     edges = edges_of(lo, hi)
-    statistics = Statistics(lo, hi, 0, 0, np.histogram(known, edges)[0] if lo < hi else np.zeros(BINS, np.int64), edges)
+    wide = bool((np.diff(edges) > 0).all())  # or all values are one, but for rounding
+    counts = np.histogram(known, edges)[0] if wide else np.zeros(BINS, np.int64)
+    statistics = Statistics(lo, hi, 0, 0, counts, edges)
     a, b = map(float, np.percentile(known, MOST_VALUES)) if len(known) else (0.0, 0.0)
     missing = int(len(known) < values.size)
     step = max(((b - a) or (hi - lo)) / LEVELS, (hi - lo) / (CODES - 3)) or 1.0
