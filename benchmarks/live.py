@@ -20,9 +20,10 @@ from dvr_scenes import print_table, read_scenes, write_rows
 
 from tests.live_stream import from_bytes
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.conversion.convert import fit_gaussians
 from vvgt_cli.conversion.file_layout import degree_of
+from vvgt_cli.conversion.fitting import fit, work_of
 from vvgt_cli.conversion.live import box_lighting, fog, fog_start, function_table, widen_narrow, with_values
+from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.recolored import visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
@@ -75,17 +76,20 @@ def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
     source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
     request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
-    return fit_gaussians(Run(Console(quiet=True), ConversionReport("convert")), request)
+    run = Run(Console(quiet=True), ConversionReport("convert"))
+    with open_field(run, request) as opened:
+        work = work_of(run, request, opened)
+        fit(work, request)
+    return work.current()
 
 
 def placed(field: Resident, gaussians: int) -> Gaussians:
     """Of a live file, box frame."""
     source = field.source
     run = Run(Console(quiet=True), ConversionReport("convert"))
-    request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
     assert isinstance(source.tf, TransferFunction)
     foggy = field.with_look(source.with_function(fog(source.statistics, source.tf)))
-    return widen_narrow(with_values(run, foggy, fog_start(run, foggy, request)), SIZE)
+    return widen_narrow(with_values(run, foggy, fog_start(run, foggy, FitOptions(gaussians, SIZE))), SIZE)
 
 
 def score(field: Resident, gaussians: Gaussians) -> float:

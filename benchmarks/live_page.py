@@ -22,15 +22,12 @@ from closed_form import read_options, scene_rows
 from dvr_scenes import print_table, write_rows
 
 from vvgt_cli.commands.converter_process import LoadedVolume, MessageConsole
-from vvgt_cli.conversion.convert import convert, initialise_only, open_field
-from vvgt_cli.conversion.file_layout import ply_options
-from vvgt_cli.conversion.live import convert_live
+from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
 
 FROG = SourceRequest("example:frog", labels="auto")
 QUIET = Console(quiet=True)
@@ -39,9 +36,7 @@ UNHEARD = MessageConsole(lambda message: None)
 
 def megabytes(source: SourceRequest, gaussians: int) -> float:
     """Of the page of a source."""
-    run, request = Run(QUIET, ConversionReport("init")), ConvertRequest(source, fit=FitOptions(gaussians), live=True)
-    with open_field(run, request) as field:
-        made = convert_live(run, request, field, ply_options(request, field.source), scored=False)
+    made = convert(ConvertRequest(source, fit=FitOptions(gaussians), live=True, scored=False), QUIET)
     known = format_of("page.html")
     assert known is not None
     return len(encoded(known, made.gaussians, made.ply, "page.html")) / 1e6
@@ -73,7 +68,7 @@ def measured(
         if rounds:
             times |= seconds(
                 {
-                    "closed form": lambda: initialise_only(file, QUIET),
+                    "closed form": lambda: convert(replace(file, scored=False), QUIET),
                     "first page": lambda: LoadedVolume(source, name, UNHEARD).send_live(UNHEARD),
                 },
                 rounds,

@@ -129,7 +129,7 @@ def test_nothing_is_overwritten_unasked(option, folder, vvgt):
 
 @pytest.mark.parametrize("command", ["convert", "init"])
 def test_what_is_there_is_noticed_before_anything_is_read(command, folder, vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.convert.load", lambda *_: pytest.fail("read before the check"))
+    monkeypatch.setattr("vvgt_cli.field.open.load", lambda *_: pytest.fail("read before the check"))
     Path("a.ply").write_bytes(b"mine")
     result = vvgt(command, "v.raw", *RAW, "-o", "a.ply")
     assert (result.code, Path("a.ply").read_bytes()) == (2, b"mine")
@@ -139,14 +139,14 @@ def test_what_is_there_is_noticed_before_anything_is_read(command, folder, vvgt,
 @pytest.mark.parametrize("late", ["a.ply", "a.json", "a.png"])
 def test_what_appears_during_the_work_is_not_replaced(late, folder, vvgt, monkeypatch):
     """Outputs are checked twice: before the work, and when they are written."""
-    from vvgt_cli.conversion import convert
+    from vvgt_cli.field import open as opening
 
     def load_and_be_late(*args):
         Path(late).write_bytes(b"theirs")
         return load(*args)
 
-    load = convert.load
-    monkeypatch.setattr(convert, "load", load_and_be_late)
+    load = opening.load
+    monkeypatch.setattr(opening, "load", load_and_be_late)
     outputs = ("-o", "a.ply", "--report", "a.json", "--preview", "a.png")
     few = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--tf", "good.json")
     assert f"{late} exists; give --overwrite" in vvgt.fails(2, "convert", "v.raw", *RAW, *few, *outputs)

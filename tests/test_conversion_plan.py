@@ -10,7 +10,8 @@ from test_cli_infer import DARKER
 
 from tests.refused import refused
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.plan import Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
@@ -68,7 +69,7 @@ def drawn(size, enough):
 
 
 def done(tmp_path, fit=SMALL, **options):
-    return convert(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True))
+    return convert(ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options), Console(quiet=True)).report
 
 
 def chosen(report):
@@ -143,7 +144,7 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
 
 
 def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.convert.suits_small_views", lambda *_: False)
+    monkeypatch.setattr("vvgt_cli.conversion.fitting.suits_small_views", lambda *_: False)
     report = done(tmp_path, FitOptions(600, 128, steps=30))
     assert chosen(report)["small"]  # what was foreseen
     assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
@@ -183,7 +184,7 @@ def test_no_steps_leave_back_projection():
 
 def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
     fit = FitOptions(200, 48, steps=0)
-    initialise_only(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit), Console(quiet=True))
+    convert(ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit, scored=False), Console(quiet=True))
     alone = read_ply(tmp_path / "init.ply")[0]
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "back-projection")
     assert stage.kept
@@ -290,7 +291,7 @@ def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatc
         return plan_of(self, workload, *rest, **begun)
 
     monkeypatch.setattr(Planner, "plan", note)
-    monkeypatch.setattr("vvgt_cli.conversion.convert.improve", lambda work, plan: made.append(len(work.current())))
+    monkeypatch.setattr("vvgt_cli.conversion.fitting._improve", lambda work, plan: made.append(len(work.current())))
     done(tmp_path, FitOptions(1000, 48))
     assert made[0] < 300
     assert seen == [1000, made[0]]
@@ -358,7 +359,7 @@ def test_no_time_leaves_the_closed_form(tmp_path):
 
 def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
-    found = plan_conversion(request, Console(quiet=True))
+    found = plan_of(request, Console(quiet=True))
     assert not list(tmp_path.iterdir())
     assert found.seconds > 0
     assert found.memory > 1e8
@@ -366,7 +367,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
     assert "120 views of 48 px" in found.text()
     done(tmp_path)
-    refused(UsageError, "exists", plan_conversion, request, Console(quiet=True))
+    refused(UsageError, "exists", plan_of, request, Console(quiet=True))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.processes import replaced
-from vvgt_cli.conversion import convert as conversion
+from vvgt_cli.conversion import fitting, writing
 from vvgt_cli.conversion.stages import scores, views
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.refine import loop
@@ -27,7 +27,7 @@ def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
 def ended(monkeypatch, target: str, calls: int) -> None:
     """Let the function end the run at its call number ``calls`` (from 0)."""
     module, _, name = target.rpartition(".")
-    owner = {"loop": loop, "convert": conversion, "scores": scores, "states": OwnAxes}[module]
+    owner = {"loop": loop, "fitting": fitting, "writing": writing, "scores": scores, "states": OwnAxes}[module]
     own, count = getattr(owner, name), [0]
 
     def call(*args, **kwargs):
@@ -47,11 +47,11 @@ def by_start(scene, start, *_):
 @pytest.mark.parametrize(
     ("target", "calls", "left"),
     [
-        ("convert.improve", 0, {"closed-form.npz"}),  # its pyramid is needed again: cells are still to be cut by error
+        ("fitting._improve", 0, {"closed-form.npz"}),  # its pyramid is needed again: cells are still to be cut by error
         ("states.step", 0, {"closed-form.npz", "cells.npz"}),
         ("states.step", 4, {"closed-form.npz", "cells.npz", "refinement.npz"}),
         ("scores.score_test_views", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
-        ("convert.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
+        ("writing.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
     ],
 )
 def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
@@ -63,7 +63,7 @@ def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vv
     assert {path.name for path in (folder / "kept").glob("*")} == left
     with monkeypatch.context() as patch:  # nothing is done twice
         if "fitted.npz" in left:
-            ended(patch, "convert.improve", 0)
+            ended(patch, "fitting._improve", 0)
         ended(patch, "states.step", 20 if "refinement.npz" in left else 24)
         if "cells.npz" in left:
             patch.setattr("vvgt_cli.closed_form.initialise", None)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vvgt_cli.conversion.convert import plan_conversion
+from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.plan import WRITE
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.field.source import SourceRequest
@@ -14,7 +14,7 @@ from vvgt_cli.progress import Console
 )
 def test_the_plan_counts_how_often_the_file_is_written(tmp_path, output, options, times):
     output = output if output in (None, "-") else str(tmp_path / output)
-    found = plan_conversion(
+    found = plan_of(
         ConvertRequest(SourceRequest("example:marschner-lobb:24"), output, FitOptions(400, 48), **options),
         Console(quiet=True),
     )

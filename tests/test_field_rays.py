@@ -11,7 +11,7 @@ from tests.test_scale import FIT, bodies
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.conversion.shards.run import scored_views
+from vvgt_cli.conversion.stages.parts import scored_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, BoxFrame, camera_arrays
 from vvgt_cli.field.block_store import BlockStore
@@ -200,7 +200,7 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     vvgt.ok("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
-    monkeypatch.setattr("vvgt_cli.conversion.shards.run.A_GAUSSIAN", 1 << 40)
+    monkeypatch.setattr("vvgt_cli.conversion.stages.parts.A_GAUSSIAN", 1 << 40)
     assert "skipped: test views" in vvgt.ok("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64").err
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 

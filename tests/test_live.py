@@ -368,7 +368,7 @@ def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
 
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     """Of Gaussians that lie across blocks, and beyond the volume; and a conversion in blocks is as near the volume."""
-    from vvgt_cli.conversion.convert import open_field
+    from vvgt_cli.conversion.opened import open_field
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions
     from vvgt_cli.field.settings import BlockOptions
     from vvgt_cli.field.source import SourceRequest

@@ -269,7 +269,7 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
         if beside is not None:  # not after the closed form
             asked.append(pictures + beside(plan.workload))
 
-    monkeypatch.setattr("vvgt_cli.conversion.convert.check_memory", check)
+    monkeypatch.setattr("vvgt_cli.conversion.fitting.check_memory", check)
     start = PreviousFrame(96)
     for k in (0, 1, 2, 0):
         source = SourceRequest(str(beat / f"v_{k}.npy"), tf=str(beat / "tf.json"))

@@ -11,11 +11,12 @@ import pytest
 import vvgt_cli
 from tests.test_scale import bodies
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.conversion.parts import PartTask, Refiner, refine_part
 from vvgt_cli.conversion.request import FitOptions, Limits
-from vvgt_cli.conversion.shards.regions import Refiner, RegionNodes, VolumePart, refine_part
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.dvr.scene import Scene, kernel_rule
+from vvgt_cli.field.part import VolumePart
 from vvgt_cli.field.reader import Scalars, VolumeOrigin
 from vvgt_cli.field.settings import BlockOptions, worker_count
 from vvgt_cli.field.source import SourceRequest, load
@@ -218,19 +219,19 @@ def test_bytes_depend_on_neither_blocks_nor_workers(vvgt, volume, folder, tmp_pa
 
 def test_an_interrupted_refinement_goes_on_where_it_ended(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
     line = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "out" / "lod-meta.json", "--blocks", "64")
-    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)  # the tiles are regions
+    monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1)  # the tiles are regions
     whole = ("convert", volume, *FIT, *STEPS, "-o", tmp_path / "whole" / "lod-meta.json", "--blocks", "64")
     vvgt.ok(*whole)
-    call, seen = RegionNodes.__call__, list[int]()
+    call, seen = PartTask.__call__, list[int]()
 
-    def stopped(task: RegionNodes, number: int) -> None:
+    def stopped(task: PartTask, number: int) -> None:
         if task.refiner is not None:
             seen.append(number)
             if len(seen) == 2:
                 raise KeyboardInterrupt
         call(task, number)
 
-    monkeypatch.setattr(RegionNodes, "__call__", stopped)
+    monkeypatch.setattr(PartTask, "__call__", stopped)
     assert vvgt(*line).code == 130
     assert not (tmp_path / "out" / "lod-meta.json").exists()
     vvgt.ok(*line)
@@ -255,7 +256,7 @@ def test_no_time_for_steps_is_said(vvgt, volume: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [(), ("--light", "headlight")])
 def test_large_clouds_are_refined_by_regions_in_every_format(vvgt, volume, tmp_path, monkeypatch, options) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.convert.MANY", 5000)
+    monkeypatch.setattr("vvgt_cli.conversion.request.MANY", 5000)
     light = options if "--light" in options else ()
     vvgt.ok("init", volume, *FIT, *light, "-o", tmp_path / "closed.ply")
     found = vvgt.ok("convert", volume, *FIT[:-1], *STEPS, "--blocks", "32", *options, "-o", tmp_path / "a.ply")
@@ -298,7 +299,7 @@ def test_a_single_level_of_one_gaussian_is_refined(vvgt, volume: Path, tmp_path:
 
 
 def test_regions_without_gaussians_are_written_lit_and_not(vvgt, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.LARGEST", 1)
+    monkeypatch.setattr("vvgt_cli.conversion.cut.LARGEST", 1)
     z, y, x = np.mgrid[:160, :60, :60]
     balls = sum((np.hypot(np.hypot(x - 30, y - 30), z - at) < 14) * 200 for at in (24, 80, 136))
     np.save(tmp_path / "v.npy", balls.astype(np.uint8))

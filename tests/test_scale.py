@@ -79,7 +79,7 @@ def test_surfaces_of_labels_lie_where_they_do_in_memory(vvgt, tmp_path):
 
 
 def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1)
+    monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1)
     both = []
     for path in in_memory_and_in_blocks(vvgt, raw, tmp_path, "--max-gaussians", "100000", "--size", "100", "-q"):
         found = read_ply(path)[0]

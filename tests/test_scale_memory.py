@@ -209,13 +209,13 @@ def test_a_converted_volume_is_released_at_once(monkeypatch, blocks, live):
     """In a batch, volumes that wait for Python's search for cycles are in memory together."""
     from matplotlib import colormaps  # whose first import keeps exceptions, with the frames of its callers
 
-    from vvgt_cli.conversion import convert_batch
+    from vvgt_cli.conversion import convert, convert_batch
     from vvgt_cli.conversion.batch import Functions
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions
     from vvgt_cli.field.source import SourceRequest
     from vvgt_cli.progress import Console
 
-    opened, fields, alive = convert_batch.open_field, [], []
+    opened, fields, alive = convert.open_field, [], []
 
     @contextmanager
     def open_field(run, request):
@@ -224,7 +224,7 @@ def test_a_converted_volume_is_released_at_once(monkeypatch, blocks, live):
             fields.append(weakref.ref(field))
             yield field
 
-    monkeypatch.setattr(convert_batch, "open_field", open_field)
+    monkeypatch.setattr(convert, "open_field", open_field)
     fit = FitOptions(200, size=64, steps=None if live else 2)
     source = SourceRequest("example:marschner-lobb:16", tf=colormaps["viridis"].name)
     one = ConvertRequest(source, fit=fit, blocks=blocks, live=live)

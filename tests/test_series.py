@@ -4,6 +4,7 @@ import json
 import re
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import nibabel as nib
 import numpy as np
@@ -48,13 +49,13 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
     """Write what a frame's function and values come to in place of converting it; returns the calls."""
     calls: list = []
 
-    def write(request, console, finished=None, start=None) -> ConversionReport:
+    def write(request, console, finished=None, start=None) -> SimpleNamespace:
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
         for name in filter(None, (request.output, request.report)):
             Path(name).write_text(text)
-        return ConversionReport("convert")
+        return SimpleNamespace(report=ConversionReport("convert"))
 
     monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", write)
     return calls
@@ -146,7 +147,7 @@ def test_frames_as_folders_of_levels(vvgt, series: Path, monkeypatch: pytest.Mon
         return images_of(splats)
 
     with monkeypatch.context() as patch:
-        patch.setattr("vvgt_cli.conversion.shards.streamed.images_of", stopped)
+        patch.setattr("vvgt_cli.conversion.levels.images_of", stopped)
         assert vvgt(*line, *out).code == 130
     first = (series / "steps" / "01" / "lod-meta.json").stat().st_mtime_ns
     told = vvgt.ok(*line, *out).err
@@ -198,9 +199,9 @@ def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, serie
 
 
 def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(request, console, finished=None, start=None) -> ConversionReport:
+    def interrupted(request, console, finished=None, start=None) -> SimpleNamespace:
         Path(request.output).write_text("short")
-        return ConversionReport("convert", refinement={"reason": "interrupted"})
+        return SimpleNamespace(report=ConversionReport("convert", refinement={"reason": "interrupted"}))
 
     monkeypatch.setattr("vvgt_cli.conversion.convert_batch.convert", interrupted)
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)

@@ -47,8 +47,8 @@ def rows(gaussians: Gaussians) -> list[bytes]:
 
 def test_the_files_hold_the_gaussians_of_the_whole(vvgt, tmp_path: Path, monkeypatch) -> None:
     made = []
-    fitted = split.fit_gaussians
-    monkeypatch.setattr(split, "fit_gaussians", lambda run, request: made.append(fitted(run, request)) or made[-1])
+    fitted = split._fit
+    monkeypatch.setattr(split, "_fit", lambda request, console: made.append(fitted(request, console)) or made[-1])
     files = converted(vvgt, tmp_path, nested(cut=True), "--light", "none")
     whole, together = rows(made[-1]), [row for part in files.values() for row in rows(part)]
     assert sorted(files) == [1, 3]

@@ -15,18 +15,14 @@ from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.viewer import streamed_resources
-from vvgt_cli.conversion.convert_batch import convert_files
+from vvgt_cli.conversion.cut import TileGaussians
 from vvgt_cli.conversion.index import named_files
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions
-from vvgt_cli.conversion.shards.cut import CutNode
-from vvgt_cli.conversion.shards.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
-from vvgt_cli.conversion.shards.regions import StoredGaussians, save
-from vvgt_cli.conversion.shards.streamed import FilePart, WrittenFiles, divide
+from vvgt_cli.conversion.levels import SEEN_FROM, VIEW_PIXELS, CutErrors, FilePart, WrittenFiles, divide, level_errors
+from vvgt_cli.conversion.parts import StoredGaussians, save
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import Runner
-from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.sog import images_of, splats_in
@@ -195,14 +191,9 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     [
         (("--init", "wavelet"), "cuts of moments"),
         (("--frame", "world"), "choose levels by distances"),
-        (("--for", "phone"), "are not scored"),
-        (("--max-size", "5"), "known only once they are written"),
+        (("--max-size", "5"), "--max-size needs .ply or .html output"),
         (("--live",), "no place for values"),
         (("--labels", "auto", "--split-labels"), "share the Gaussians of one finished cloud"),
-        (("--checkpoint", "c"), "resume by the blocks beside them"),
-        (("--preview", "p.png"), "'vvgt render' them"),
-        (("--dry-run",), "without a plan"),
-        (("--model", "small"), "made region by region"),
         (("--shard", "1/2"), "'vvgt init --shard' and 'vvgt merge'"),
         (("--tf", "a.json", "--tf", "b.json"), "one place for the function's name, as out_{}/lod-meta.json"),
     ],
@@ -214,15 +205,41 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_levels_are_not_refined_on_a_gpu(volume: Path, tmp_path: Path) -> None:
-    out, fit = tmp_path / "lod-meta.json", FitOptions(device="cuda")
-    with pytest.raises(UsageError, match="steps on a GPU do not"):
-        convert_files(ConvertRequest(SourceRequest(str(volume)), str(out), fit))
+def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_path: Path) -> None:
+    out, picture = tmp_path / "out", tmp_path / "p.png"
+    line = ("convert", volume, *FIT, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
+    vvgt.ok(*line, "--device", "cpu", "-o", out / "lod-meta.json")
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "p.png"}
+    assert read_png(picture).shape[:2] == (450, 450)
+    made = json.loads(vvgt.ok("info", out, "--json").out)["certificate"]
+    assert {"from 6", "from 1.2", "from 0.6"} < set(made["conditions"])
+    finest = json.loads(vvgt.ok("evaluate", f"{out}#0", "--volume", volume, "-q", "--json", "--no-conditions").out)
+    shown = json.loads(vvgt.ok("evaluate", out, "--volume", volume, "-q", "--json").out)
+    assert shown["certificate"]["holds"]
+    assert not finest["certificate"]["holds"]  # the test views show other levels
+    assert shown["certificate"]["psnr"] == pytest.approx(made["psnr"], abs=0.1)
+    assert {"from 6", "from 1.2", "from 0.6"} < {one["where"] for one in shown["conditions"]}
+
+
+def test_a_dry_run_of_levels_prints_their_plan_and_writes_nothing(vvgt, volume: Path, tmp_path: Path) -> None:
+    plan = vvgt.ok("convert", volume, *FIT, "--dry-run", "--for", "phone", "-o", tmp_path / "out" / "lod-meta.json").out
+    assert "levels, 152 steps" in plan
+    assert "with 9000 Gaussians" in plan
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_network_runs_on_the_parts_of_levels(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    line = ("convert", volume, *FIT, "--steps", "0", "--model", "vvgt-small", "-o", tmp_path / "out" / "lod-meta.json")
+    vvgt.ok(*line)
+    assert (
+        read_manifest(tmp_path / "out" / "lod-meta.json")["counts"] == read_manifest(folder / "lod-meta.json")["counts"]
+    )
+    assert contents(tmp_path / "out")["0_0/means_l.webp"] != contents(folder)["0_0/means_l.webp"]
 
 
 def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.ENOUGH", 1000)
-    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 2500)
+    monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1000)
+    monkeypatch.setattr("vvgt_cli.conversion.levels.A_FILE", 2500)
     monkeypatch.setattr(
         "vvgt_cli.closed_form.closed_form.most_cells", lambda budget, **_: 256 * budget
     )  # for many nodes
@@ -230,7 +247,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
     vvgt.ok(*line, whole / "lod-meta.json")
     calls = {"level_errors": 0, "images_of": 0}
-    real = {"level_selection.level_errors": level_errors, "streamed.images_of": images_of}
+    real = {"level_errors": level_errors, "images_of": images_of}
     stop = {"level_errors": 20, "images_of": 0}
 
     def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -242,9 +259,8 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
 
         return call
 
-    for place, function in real.items():
-        name = place.partition(".")[2]
-        monkeypatch.setattr(f"vvgt_cli.conversion.shards.{place}", counted(name, function))
+    for name, function in real.items():
+        monkeypatch.setattr(f"vvgt_cli.conversion.levels.{name}", counted(name, function))
     assert vvgt(*line, out / "lod-meta.json").code == 130
     nodes, files = len(nodes_of(read_manifest(whole / "lod-meta.json"), "")), len(list(whole.glob("*/meta.json")))
     assert nodes > 20
@@ -262,7 +278,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
 
 
 def test_files_hold_neighbouring_nodes_of_one_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed.A_FILE", 10)
+    monkeypatch.setattr("vvgt_cli.conversion.levels.A_FILE", 10)
     parts, places = divide(np.array([[6, 1], [5, 2], [12, 4], [1, 3]]))
     assert parts == (FilePart(0, 0, 0, 2), FilePart(1, 0, 0, 4), FilePart(0, 1, 2, 3), FilePart(0, 2, 3, 4))
     assert [lods[0]["offset"] for lods in places] == [0, 6, 0, 0]
@@ -276,7 +292,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
         columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 1, 3)]
         gaussians = Gaussians(*columns[:3], columns[3][:, 0], columns[4])
         store.prepare("closed")
-        save(store, "closed", 0, [CutNode([gaussians], [np.ones(2)], None)], {})
+        save(store, "closed", 0, [TileGaussians([gaussians], [np.ones(2)], None)], {})
         parts, places = divide(np.array([[50]]))
         assert places == [[{"file": 0, "offset": 0, "count": 50}]]
         task = WrittenFiles(StoredGaussians(store, "closed", (1,)), parts, tmp_path, np.eye(3), 1.0, PlyOptions())

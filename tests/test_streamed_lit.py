@@ -8,7 +8,7 @@ import pytest
 from tests.test_scale import bodies
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
 from vvgt_cli.closed_form.lit import base_rows
-from vvgt_cli.conversion.shards.cut import cut_of
+from vvgt_cli.conversion.cut import cut_of
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
 from vvgt_cli.field.runners import Runner

@@ -26,12 +26,12 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
         assert live_refusal(ConvertRequest(other, live=True), load(other)) is None
     asked = []
 
-    def conversion(request: ConvertRequest, console: Console, after: Any, unscored: Any) -> Any:
+    def conversion(request: ConvertRequest, console: Console, start: Any, unscored: Any) -> Any:
         asked.append(request.live)
         unscored("conversion")
         return SimpleNamespace(scores={"psnr": 40.0})
 
-    monkeypatch.setattr(converter_process, "convert_in_memory", conversion)
+    monkeypatch.setattr(converter_process, "convert", conversion)
     monkeypatch.setattr(converter_process, "_file", lambda found: b"scored")
     monkeypatch.setattr(converter_process.LoadedVolume, "_with_page", lambda volume, found: Converted(b"", {}))
     messages: list[Message] = []

@@ -21,7 +21,7 @@ from vvgt_cli.checks.splats import (
     row_cases,
     value_cases,
 )
-from vvgt_cli.commands.evaluation import opened, shown
+from vvgt_cli.commands.evaluation import opened_as_recorded, shown
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.errors import DataError
@@ -74,7 +74,7 @@ def check_splats(file: str, source: SourceRequest | None, tolerance: float | Non
         cases += [*value_cases(gaussians, None, size), *_order(gaussians, size)]
         return CheckReport(run_cases(cases, console), splats=about)
     run = Run(console, ConversionReport("evaluate"))
-    with opened(run, source, gaussians, header, size) as field:
+    with opened_as_recorded(run, source, gaussians, header, size) as field:
         current = shown(gaussians, header, field.source, source)
         cases += [*value_cases(gaussians, 2.0, size), *_against(field, current, header, size, tolerance or TOLERANCE)]
         function = tf_record(field.source, source)

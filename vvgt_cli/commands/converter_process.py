@@ -15,9 +15,9 @@ from typing import IO, Any, NoReturn
 
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
 from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
-from vvgt_cli.conversion.convert import convert_in_memory, open_field
-from vvgt_cli.conversion.file_layout import ply_options
-from vvgt_cli.conversion.live import convert_live, live_refusal
+from vvgt_cli.conversion.convert import convert, convert_field
+from vvgt_cli.conversion.live import live_refusal
+from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -80,15 +80,15 @@ class LoadedVolume:
     def send_live(self, console: MessageConsole) -> None:
         """Send the live form, or an ordinary conversion if the volume has none."""
         run = Run(console, ConversionReport("init"))
-        request = ConvertRequest(self.source, live=True)
+        request = ConvertRequest(self.source, live=True, scored=False)
         with open_field(run, request, INIT) as field:
             why = live_refusal(request, field.source) or _missing()
             if why is None:
-                ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
-                console.send(self._with_page(convert_live(run, request, field, ply, scored=False)))
+                self.lighting = field.source.tf.lighting
+                console.send(self._with_page(convert_field(run, request, field)))
                 return
         console.message(f"converted without a live form: {why}")
-        self._converted(replace(request, live=False), console, self._with_page)
+        self._converted(ConvertRequest(self.source), console, self._with_page)
 
     def convert(self, job: Job, console: MessageConsole) -> None:
         """Send a conversion for labels, or for a function on data values with an opacity unit distance."""
@@ -106,7 +106,9 @@ class LoadedVolume:
         self, request: ConvertRequest, console: MessageConsole, message: Callable[[Conversion], Converted]
     ) -> Conversion:
         """Convert; send ``message(conversion)`` before the scores are known, then the scores."""
-        conversion = convert_in_memory(request, console, self.last, lambda unscored: console.send(message(unscored)))
+        conversion = convert(
+            request, console, start=self.last, unscored=lambda unscored: console.send(message(unscored))
+        )
         assert conversion.scores is not None
         console.send(Scored(_file(conversion), conversion.scores["psnr"]))
         return conversion

@@ -84,7 +84,7 @@ def evaluate(
 def command(as_json: bool, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
-    OUT.ply may be a FOLDER of streamed levels, scored at the finest level; FOLDER#1 is level 1.
+    OUT.ply may be a FOLDER of streamed levels, scored as viewers show them; FOLDER#0 is the finest.
 
     Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
     (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures

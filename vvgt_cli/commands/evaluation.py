@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, BinaryIO
 
@@ -12,22 +12,23 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import verify
-from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
+from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, levels_in_box, open_gaussians
 from vvgt_cli.conversion.place import headset_axes, to_box_frame, upright_axes
 from vvgt_cli.conversion.place import preview as side_by_side
 from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.field import Field, Picture, Resident
-from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
+from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.field.open import FieldNeeds, opened
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.field.source import Source, SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
+from vvgt_cli.gaussians.formats.levels import VIEW, split_name
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.images import write_png
 from vvgt_cli.images.metrics import Texture
-from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
+from vvgt_cli.jit.ahead import EVALUATE, for_degree
 from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
@@ -39,6 +40,7 @@ from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_pictures,
     condition_views,
+    distance_pictures,
     eye_pictures,
     near_cameras,
     score_conditions,
@@ -48,6 +50,7 @@ from vvgt_cli.score.viewing import (
     zoomed,
 )
 from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
+from vvgt_cli.splat.render import Shown
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -99,12 +102,11 @@ def _cell(value: Any) -> str:
     return f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-@contextmanager
-def opened(
+def opened_as_recorded(
     run: Run, request: SourceRequest, gaussians: Gaussians, header: PlyHeader, size: int,
     options: BlockOptions | None = None,
-) -> Iterator[Field]:  # fmt: skip
-    """Open the volume, by default in the file's own anatomical space, light and unit distance."""
+) -> AbstractContextManager[Field]:  # fmt: skip
+    """Return a context with the volume, by default in the file's own anatomical space, light and unit distance."""
     dark = replace(request, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
@@ -124,20 +126,10 @@ def opened(
             first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
         return replace(source, layers=(first, *others), lighting=request.light.lighting(preset, source.volume.space))
 
-    kernels, options = for_degree(EVALUATE, gaussians.degree), options or automatic(dark, run.console)
-    if options is None:
-        with run.stage("read") as stage:
-            source = lit(load(dark))
-            stage.note = describe_source(source)
-        run.compile(source.kernels(kernels), source.kernel_type())
-        with run.stage("scene"):
-            resident = Resident.of(source)
-        yield resident
-        return
-    with store_beside(None) as store, blocked(run, dark, options, store, FieldNeeds(len(gaussians), size)) as found:
-        found.source = lit(found.source)
-        run.compile(for_blocks(found.source.kernels(kernels)), found.source.kernel_type())
-        yield found
+    def kernels(source: Source, in_blocks: bool) -> tuple[str, ...]:
+        return source.kernels(for_degree(EVALUATE, gaussians.degree))
+
+    return opened(run, dark, options, FieldNeeds(len(gaussians), size), kernels, look=lit)
 
 
 @contextmanager
@@ -187,21 +179,27 @@ def score(
     inputs = [*request.paths(), *([ply] if isinstance(ply, str) else [])]
     check_outputs(Output.of("--preview", preview, (".png",)), inputs, overwrite)
     gaussians, header = open_gaussians(ply)
+    place = split_name(ply) if isinstance(ply, str) else None
     size, drawn = size or header.screen_size or SIZE, file_rule(header, rule)
-    with opened(run, request, gaussians, header, size, options) as field:
+    with opened_as_recorded(run, request, gaussians, header, size, options) as field:
         volume = field.source.volume
-        gaussians = to_box_frame(shown(gaussians, header, field.source, request), volume)
+        inside: Shown = to_box_frame(shown(gaussians, header, field.source, request), volume)
+        if place is not None and place[1] in (None, VIEW):
+            inside = levels_in_box(place[0], volume)
         for remark in _doubts(header, field.source):
             run.console.message(f"{ply}: {remark}")
-        evaluation = _scored(run, field, gaussians, header, drawn, tf_record(field.source, request), size, step)
+        evaluation = _scored(
+            run, field, len(gaussians), inside, header, drawn, tf_record(field.source, request), size, step
+        )
         if preview is not None:
             camera, axes = default_views("test", size=size)[PICTURED], upright_axes(volume, header.up)
             with run.stage("preview"):
-                sheet = side_by_side(field.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, drawn)
+                sheet = side_by_side(field.views, inside, [camera, zoomed(camera, CLOSE)], axes, drawn)
                 write_png(preview, sheet, overwrite)
         if conditions:
-            eyes = eye_pictures(target, headset_axes(volume, header.up))
-            _look_around(run, evaluation, field, gaussians, drawn, eyes)
+            more = eye_pictures(target, headset_axes(volume, header.up))
+            more += [] if isinstance(inside, Gaussians) else distance_pictures(size)
+            _look_around(run, evaluation, field, inside, drawn, more)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
@@ -219,16 +217,19 @@ def _doubts(header: PlyHeader, source: Source) -> Iterator[str]:
 
 
 def _scored(
-    run: Run, volume: Field, gaussians: Gaussians, header: PlyHeader, rule: Rule, function: dict[str, Any], size: int,
-    step: float,
+    run: Run, volume: Field, count: int, gaussians: Shown, header: PlyHeader, rule: Rule, function: dict[str, Any],
+    size: int, step: float,
 ) -> Evaluation:  # fmt: skip
-    """Score Gaussians (box frame) on the test views, and check their certificate; ``function`` is its record."""
+    """Score ``count`` Gaussians (box frame) on the test views, and check their certificate.
+
+    ``function`` is the record of the volume's.
+    """
     from vvgt_cli.dvr import REFERENCE
 
     with run.stage("reference") as stage:
         own = _reference_psnr(volume, size, step)
         stage.note = f"its own error {own:.1f} dB"
-    count, views, record = len(gaussians), len(default_views("test")), volume_record(volume.source)
+    views, record = len(default_views("test")), volume_record(volume.source)
     evaluation = Evaluation(count, size, rule.name, step, views, record, function, own)
     settings = replace(REFERENCE, step=step)
     wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
@@ -238,21 +239,22 @@ def _scored(
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
+        looked_up = header.live is not None and isinstance(gaussians, Gaussians) and gaussians.live is None
         with run.stage("certificate") as stage:
-            verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
+            verdict = verify(header.certificate, volume, gaussians, looked_up)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     return evaluation
 
 
 def _look_around(
-    run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule, eyes: list[ConditionPicture]
+    run: Run, evaluation: Evaluation, volume: Field, gaussians: Shown, rule: Rule, more: list[ConditionPicture]
 ) -> None:
-    """Score the viewing conditions, those of a headset, too, and texture seen from near."""
+    """Score the viewing conditions, ``more`` of a headset or of levels, and texture seen from near."""
     from vvgt_cli.dvr import RenderSettings
 
     size, settings = evaluation.size, RenderSettings()
-    places = condition_pictures(viewing_conditions(size)) + eyes
+    places = condition_pictures(viewing_conditions(size)) + more
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in places]
     with run.stage("conditions") as stage, _together(volume, wanted):
         seen = condition_views(volume.views, places, settings, run.console.bar("conditions"))

@@ -35,14 +35,8 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
       vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G
     """
-    from vvgt_cli.conversion.convert import initialise_only
-    from vvgt_cli.conversion.shards.run import convert_in_batches, writes_streaming
-    from vvgt_cli.field.open import automatic
+    from vvgt_cli.conversion.convert_batch import convert_files
 
     request = shared.convert_request(volume, **options)
-    found = shared.block_options_of(blocks) or automatic(request.source, console)
-    request = replace(request, blocks=found, fit=replace(request.fit, steps=0))
-    if writes_streaming(request):
-        convert_in_batches(request, console)
-    else:
-        initialise_only(request, console)
+    fit = replace(request.fit, steps=0)
+    convert_files(replace(request, blocks=shared.block_options_of(blocks), fit=fit, scored=False), console=console)

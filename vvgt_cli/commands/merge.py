@@ -25,6 +25,6 @@ def command(folder: str, output: str, overwrite: bool, console: Console) -> None
       vvgt merge huge.blocks -o huge.ply
       vvgt merge huge.blocks -o huge/lod-meta.json
     """
-    from vvgt_cli.conversion.shards.run import merge
+    from vvgt_cli.conversion.merge import merge
 
     merge(folder, output, overwrite, console)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -19,7 +18,7 @@ from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.commands.view_sets import draw_in_blocks
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
-from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
+from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians, shown_levels
 from vvgt_cli.conversion.grey import MIP, NAMES, XRAY, Draw, draw_gaussians, grey
 from vvgt_cli.conversion.index import FRAMES, frame_facts, is_pattern, put_name
 from vvgt_cli.conversion.manifest import Shard
@@ -34,11 +33,10 @@ from vvgt_cli.field.reader import Scalars, VoxelBox
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
-from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
+from vvgt_cli.gaussians import Gaussians, PlyHeader
+from vvgt_cli.gaussians.formats.levels import by_view
 from vvgt_cli.gaussians.formats.page_live import shared_facts
-from vvgt_cli.gaussians.formats.splats import gaussians_of
-from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
+from vvgt_cli.gaussians.frames import upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_folder, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree
@@ -324,14 +322,7 @@ def _opened(request: Drawing, name: str, first: PlyHeader | None) -> tuple[Seen,
             header = _in_range(name, header, first)
         gaussians = recolored(name, gaussians, header, function, empty=several)
         return lambda camera: gaussians, gaussians, header
-    levels = StreamedLevels(manifest)
-    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
-    turned = up_matrix(header.up)
-
-    def seen(camera: Camera) -> Gaussians:
-        field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
-        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), name))
-
+    seen, coarsest, header = shown_levels(manifest)
     return seen, recolored(name, coarsest, header, function), header
 
 

@@ -18,8 +18,9 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
-from vvgt_cli.conversion.convert import convert, open_field
+from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.live import live_refusal
+from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
@@ -278,7 +279,7 @@ def _run(
     with tempfile.TemporaryDirectory() as folder:
         path, live = str(Path(folder) / "run.ply"), planned.kind == "live"
         request = ConvertRequest(source, path, planned.fit, up="none", blocks=blocks, live=live)
-        report = convert(request, Console(quiet=True))
+        report = convert(request, Console(quiet=True)).report
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
 

@@ -154,14 +154,14 @@ def _only_gaussians(files: Sequence[str]) -> None:
 
 def _opened(run: Run, name: str, request: ConvertRequest, slices: bool) -> tuple[Gaussians, PlyOptions, Extras]:
     """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
-    from vvgt_cli.conversion.convert import convert_in_memory
+    from vvgt_cli.conversion.convert import convert
 
     if name == STDIN or is_splats(name):
         _refuse_reading(request.source, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
         return gaussians, replace(options, title=request.title or options.title), NO_EXTRAS
-    conversion = convert_in_memory(request, run.console)
+    conversion = convert(request, run.console)
     extras = conversion.extras(request.editor, slices, run)
     return conversion.gaussians, conversion.ply, extras
 
@@ -217,7 +217,7 @@ def _series(clouds: Clouds) -> dict[str, Resource]:
 
 def slices_in(request: SourceRequest) -> Slices | None:
     """Return the slices of a volume, which is read again, in blocks if it is large; None if it has colours."""
-    from vvgt_cli.conversion.convert import open_field
+    from vvgt_cli.conversion.opened import open_field
     from vvgt_cli.conversion.request import ConvertRequest
 
     with open_field(Run(Console(quiet=True), ConversionReport("view")), ConvertRequest(request), ()) as field:

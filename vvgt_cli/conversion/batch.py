@@ -63,15 +63,8 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
     LEVELS: {
         "--init": "levels are cuts of moments, which other methods do not make; remove it",
         "--frame world": "viewers choose levels by distances in the unit frame; remove it",
-        "--for": "levels are not scored; give --max-gaussians and --size",
-        "--max-size": "the bytes of levels are known only once they are written; try --max-gaussians",
         "--live": "their format has no place for values; write another, as -o out.ply",
         "--split-labels": "labels share the Gaussians of one finished cloud; write another format, as -o out_{}.ply",
-        "--checkpoint": "levels resume by the blocks beside them; remove it",
-        "--preview": "no views of levels are drawn; remove it, and 'vvgt render' them",
-        "--dry-run": "each region is refined by itself, without a plan; remove it",
-        "--model": "a network takes a whole cloud and its views, and levels are made region by region; remove it",
-        "--device": "regions weight the pixels of their views, which steps on a GPU do not; remove it",
     },
     NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
     ONE_FILE: {

@@ -15,6 +15,7 @@ from vvgt_cli.gaussians.header import Certificate
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views, test_view_pixels
+from vvgt_cli.splat.render import Shown
 
 WITHIN = 0.1  # dB that the file format may cost
 
@@ -115,13 +116,13 @@ class Verdict:
         return f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
 
 
-def verify(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
+def verify(certificate: Certificate, field: Field, gaussians: Shown, looked_up: bool = False) -> Verdict:
     """Verify a certificate against the volume: compare digests, and score its views again.
 
     Args:
         certificate: certificate of the file.
         field: the volume under its look.
-        gaussians: Gaussians of the file, box frame.
+        gaussians: Gaussians of the file, box frame, or what is shown of its levels to a camera.
         looked_up: the Gaussians of a live file are as `vvgt recolor` shows them, not as stored.
     """
     from vvgt_cli.dvr import RenderSettings

@@ -24,7 +24,8 @@ from vvgt_cli.conversion.batch import (
     options_in,
 )
 from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
 from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
@@ -42,9 +43,9 @@ from vvgt_cli.conversion.index import (
 )
 from vvgt_cli.conversion.labels import Labels
 from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
+from vvgt_cli.conversion.merge import write_shard
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.shards.run import convert_in_batches
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
@@ -57,8 +58,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion
-    from vvgt_cli.conversion.warm_start import WarmStart
-    from vvgt_cli.gaussians import Gaussians, PlyOptions
+    from vvgt_cli.gaussians import PlyOptions
     from vvgt_cli.volume import UnitFrame
 
 WHOLE_RUN = Shard()
@@ -168,7 +168,7 @@ class Files:
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item to its files, and return the report."""
         request = self._named(item.request, self.names(batch, item.stem))
-        return _to_file(request, console, item.gaussians, batch.previous)
+        return convert(request, console, start=batch.previous, finished=item.gaussians).report
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
         """Record a complete item."""
@@ -221,12 +221,8 @@ class Memory:
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item, release its volume, and return the report."""
-        run = Run(console, ConversionReport("convert"))
-        with open_field(run, item.request) as volume:
-            found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
-            normals = found.normals()
-            own = volume.source.volume.unit_frame()
-        run.finish()
+        found = convert(item.request, console, start=batch.previous, finished=item.gaussians)
+        normals, own = found.normals(), found.field.source.volume.unit_frame()
         gaussians, ply, self._first = found.gaussians, found.ply, self._first or (own, found.ply)
         if own != self._first[0]:  # another layer's
             gaussians = to_frame_of(gaussians, own, self._first[0])
@@ -294,7 +290,7 @@ def convert_files(
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "a file each": numbered}
-    if is_page(output):
+    if is_page(output) and request.scored:
         flags |= {"--no-slices": not request.slices, "--no-live": not (request.editor or request.live)}
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
@@ -305,13 +301,16 @@ def convert_files(
     for one in [*kinds, *([ONE_FILE] if together else []), *([NODES] if nodes else [])]:
         check_options(one, used)
     check_opened(output, request.fit.target)
+    if request.blocks is not None and request.blocks.shard is not None:
+        write_shard(request, console)
+        return None
     if is_streamed(output):
         request = replace(request, blocks=request.blocks or BlockOptions())
     if dry_run:
-        return plan_conversion(request, console).text()
+        return plan_of(request, console).text()
     if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source)):
         try:
-            _to_file(request, console)
+            convert(request, console)
             return None
         except SeveralSteps:
             if not is_page(output):
@@ -328,15 +327,6 @@ def convert_files(
     else:
         _run(batch, Files(request, share), console)
     return None
-
-
-def _to_file(
-    request: ConvertRequest, console: Console, finished: Gaussians | None = None, start: WarmStart | None = None
-) -> ConversionReport:  # fmt: skip
-    """Convert a volume to a file, see `convert`, or to streamed levels, which start from the closed form."""
-    if is_streamed(request.output):
-        return convert_in_batches(request, console)
-    return convert(request, console, finished, start)
 
 
 def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
@@ -379,7 +369,7 @@ def convert_to_memory(
         check_options(one, used)
     if kind == ONE and not is_glob_of_volumes(request.source):
         try:
-            return convert_in_memory(request, console, None if after is None else PreviousLook(after))
+            return convert(request, console, start=None if after is None else PreviousLook(after))
         except SeveralSteps:
             if not isinstance(request.source.volume, str):
                 raise

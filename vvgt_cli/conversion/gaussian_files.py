@@ -2,33 +2,42 @@
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
+import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import IO, TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.place import to_box_frame
+from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.errors import DataError, VvgtError
-from vvgt_cli.files import atomic_write, is_stream
+from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
 from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
+from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.page_live import Extras, contents, page_of_several
+from vvgt_cli.gaussians.formats.splats import gaussians_of
+from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.gaussians.outputs import STDOUT
+from vvgt_cli.gaussians.ply import ply_header, ply_rows
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
 
 if TYPE_CHECKING:
+    from vvgt_cli.conversion.parts import FinishedParts
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.volume import Volume
@@ -55,6 +64,29 @@ def open_gaussians(source: str | BinaryIO, empty: bool = False) -> tuple[Gaussia
     if not (len(gaussians) or empty):
         raise DataError(f"{source}: holds no Gaussians; expected at least one")
     return in_unit_frame(gaussians, header), header
+
+
+def shown_levels(manifest: Path) -> tuple[Callable[..., Gaussians], Gaussians, PlyHeader]:
+    """Return what the engine shows of levels to a camera, the coarsest level (unit frame), and its header.
+
+    The camera is in the unit frame, or in one that ``axes`` (3, 3) turn into it.
+    """
+    levels, name = StreamedLevels(manifest), str(manifest)
+    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), name)
+    turned = up_matrix(header.up)
+
+    def seen(camera: Camera, axes: np.ndarray | None = None) -> Gaussians:
+        field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
+        eye = camera.position if axes is None else axes @ camera.position
+        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ eye, field), name))
+
+    return seen, coarsest, header
+
+
+def levels_in_box(manifest: str | Path, volume: Volume) -> Callable[[Camera], Gaussians]:
+    """Return what the engine shows of a volume's levels to a camera in its box frame, in that frame."""
+    seen, _, _ = shown_levels(Path(manifest))
+    return lambda camera: to_box_frame(seen(camera, volume.axes), volume)
 
 
 def layout_of(header: PlyHeader) -> PlyOptions:
@@ -97,6 +129,45 @@ def write_gaussians(
         record.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB{more}"
     if is_page(output) and not more:
         run.console.message(contents(extras.live[1] if extras.live else options, output, slices=extras.slices))
+
+
+def write_parts(run: Run, output: str, parts: FinishedParts, overwrite: bool) -> None:
+    """Write Gaussians that are on disk as a `.ply`, part by part, and record their number and bytes.
+
+    Args:
+        run: gets the stage.
+        output: file, or "-".
+        parts: Gaussians, box frame.
+        overwrite: replace an existing file.
+    """
+    from vvgt_cli.closed_form.lit import directions
+
+    plan, count = parts.cut.plan, len(parts)
+    axes, degree = np.array(plan.axes).reshape(3, 3), plan.written_degree
+    turned = np.linalg.inv(axes)
+    if output != STDOUT:
+        check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
+    with run.stage("write") as stage, _sink(output, overwrite) as sink:
+        written = sink.write(ply_header(count, degree, plan.ply))
+        for gaussians, normals in parts:
+            normals = None if normals is None else directions(normals @ turned)
+            written += sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
+        stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB{parts.why_fewer()}"
+    run.report.gaussians, run.report.bytes = count, written
+
+
+@contextmanager
+def _sink(output: str, overwrite: bool) -> Iterator[IO[bytes]]:
+    """Yield a file to write to; once it is complete, it replaces the output or is copied to standard output."""
+    if output == STDOUT:
+        with tempfile.TemporaryFile() as sink:
+            yield sink
+            sink.seek(0)
+            shutil.copyfileobj(sink, sys.stdout.buffer)
+            sys.stdout.buffer.flush()
+        return
+    with atomic_write(output, overwrite) as temporary, open(temporary, "wb") as sink:
+        yield sink
 
 
 def is_page(output: str | None) -> bool:

@@ -16,9 +16,10 @@ import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.conversion.batch import UNSAFE, Batch, Item
-from vvgt_cli.conversion.convert import fit_gaussians, open_field
+from vvgt_cli.conversion.fitting import fit, work_of
 from vvgt_cli.conversion.index import LABELS
 from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
+from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content, told_apart
@@ -240,10 +241,12 @@ def _alone(part: LabelItem, console: Console) -> Gaussians | None:
 def _fit(request: ConvertRequest, console: Console) -> Gaussians:
     """Return the fitted Gaussians of a request, box frame; Ctrl-C ends the batch."""
     run = Run(console, ConversionReport("convert"))
-    found = fit_gaussians(run, request)
+    with open_field(run, request) as field:
+        work = work_of(run, request, field)
+        fit(work, request)
     if run.report.interrupted:
         raise KeyboardInterrupt
-    return found
+    return work.current()
 
 
 def shares(voxels: Sequence[int], budget: int) -> list[int]:

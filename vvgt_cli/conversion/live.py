@@ -6,31 +6,29 @@ look is baked in, for programs that ignore the values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
-from vvgt_cli.conversion.certify import with_certificate
-from vvgt_cli.conversion.file_layout import degree_of, ply_options
+from vvgt_cli.conversion.file_layout import degree_of
 from vvgt_cli.conversion.gaussian_files import is_page
-from vvgt_cli.conversion.place import headset_axes, to_box_frame, to_frame_of, to_unit_frame
-from vvgt_cli.conversion.plan import report_target
+from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
-from vvgt_cli.conversion.result import Conversion
-from vvgt_cli.conversion.stage import Stage, Work
-from vvgt_cli.conversion.stages import TestViews, ViewingConditions
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.conversion.stages import ClosedFormStage, TestViews
 from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.formats.page_live import LiveForm
-from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
+from vvgt_cli.gaussians.live import LENGTH, Looks, Table, baked, lengths
 from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.jit.ahead import LIVE
@@ -46,6 +44,9 @@ from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import triple
+
+if TYPE_CHECKING:
+    from vvgt_cli.gaussians.formats import page_live
 
 FOG_NAME = "fog"
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
@@ -86,7 +87,7 @@ def live_refusal(request: ConvertRequest, source: Source) -> str | None:
     return None
 
 
-def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions) -> LiveForm | None:
+def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions) -> page_live.LiveForm | None:
     """Return the live form of a converted volume under the same look, for the function editor of its page.
 
     None, with a message, if the volume has no live form or the run a time limit.
@@ -98,69 +99,94 @@ def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions
     try:
         if why is None:
             run.compile(source.kernels(LIVE), source.kernel_type())
-            found = convert_live(run, plain, field, ply, scored=False)
-            return found.gaussians, replace(found.ply, sh_degree=None)
+            work = Work(run, field, fit, ply=ply)
+            LiveForm().run(work)
+            return to_unit_frame(as_stored(work.current()), source.volume), replace(work.ply, sh_degree=None)
     except (UsageError, NothingVisible) as error:
         why = str(error)
     run.console.message(f"the page has no function editor: {why}")
     return None
 
 
-def convert_live(
-    run: Run, request: ConvertRequest, field: Field, ply: PlyOptions, scored: bool = True,
-    unscored: Callable[[Conversion], None] | None = None,
-) -> Conversion:  # fmt: skip
-    """Convert a field to live Gaussians with a baked look, and score them if ``scored``.
+@dataclass(frozen=True)
+class LiveForm(Stage):
+    """Gaussians with values, and their look baked in, in place of those that are fitted to views."""
 
-    Raises:
-        NoLiveForm: the volume has colours.
-        DataError: nothing is visible.
-    """
-    source, fit = field.source, replace(request.fit, max_gaussians=request.budget())
-    request = replace(request, fit=fit)
-    if scored:
-        report_target(run, fit, request.megabytes)
-    lighting, pixel = box_lighting(source), pixel_width(fit.size)
-    check_layers(source)
-    axes = headset_axes(source.volume, ply_options(request, source).up)
-    scores = [TestViews(request.scored_whole), ViewingConditions(fit.target, axes)] if scored else []
-    field.views.expect([picture for stage in scores for picture in stage.views(fit)])
+    name: ClassVar[str] = "live form"
+
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost of the closed form, which is most of it."""
+        return ClosedFormStage().cost(workload)
+
+    def run(self, work: Work) -> None:
+        """Make the Gaussians; raise NoLiveForm for colours, and NothingVisible if nothing is visible."""
+        source, fit = work.field.source, work.fit
+        check_layers(source)
+        if len(source.layers) > 1:
+            gaussians, facts = _several_layers(work.run, fit, work.field)
+        else:
+            facts = LiveFacts.of(source.volume, source.overall, source.tf)
+            gaussians = _one_layer(work.run, fit, work.field)
+        table, lighting = _baked_look(source, facts), box_lighting(source)
+        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.size)), lighting)
+        work.ply = replace(work.ply, live=facts)
+
+
+@dataclass(frozen=True)
+class LiveLook(Stage):
+    """The score of live Gaussians as `vvgt recolor` shows them; other viewers show what is baked in."""
+
+    name: ClassVar[str] = "live look"
+    scores: ClassVar[bool] = True
+
+    def cost(self, workload: Workload) -> Cost:
+        """Return the cost of the test views."""
+        return TestViews().cost(workload)
+
+    def run(self, work: Work) -> None:
+        """Score the Gaussians."""
+        from vvgt_cli.dvr import RenderSettings
+
+        fit, source = work.fit, work.field.source
+        assert work.ply.live is not None
+        table, lighting = _baked_look(source, work.ply.live), box_lighting(source)
+        shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.size))
+        name = source.name if len(source.layers) > 1 else source.tf.name
+        with work.run.stage(self.name) as stage:
+            live = score_test_views(
+                work.field.views, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
+            )
+            stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as others show it"
+        work.live_psnr = live.psnr
+
+
+def _baked_look(source: Source, facts: LiveFacts) -> Looks:
+    """Return the lookup table of a source's functions, for live Gaussians with these facts."""
+    look: Look = source.tf
     if len(source.layers) > 1:
-        gaussians, facts = _several_layers(run, request, field)
-        look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
-    else:
-        facts, look = LiveFacts.of(source.volume, source.overall, source.tf), source.tf
-        gaussians = _one_layer(run, request, field)
-    table = lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
-    gaussians = as_stored(apply_light(baked(gaussians, table, pixel), lighting))
-    found = Conversion(to_unit_frame(gaussians, source.volume), run.report, replace(ply, live=facts), field)
-    if unscored is not None:
-        unscored(found)
-    if scored:
-        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel), scores)
-        found.ply = with_certificate(found.ply, run, field, fit, found.gaussians, request.command, psnr)
-    return found
+        look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
+    return lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
 
 
-def _one_layer(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
+def _one_layer(run: Run, fit: FitOptions, field: Field) -> Gaussians:
     """Return the live Gaussians of one layer, box frame."""
     source = field.source
     if isinstance(source.tf, LabelTable):
         labels = source.tf.structures
         foggy = label_fog_field(field, labels)
-        found = with_labels(run, foggy, fog_start(run, foggy, request), labels)
+        found = with_labels(run, foggy, fog_start(run, foggy, fit), labels)
     else:
         foggy = field.with_look(source.with_function(fog(source.overall, source.tf)))
-        found = with_values(run, foggy, fog_start(run, foggy, request))
-    return widen_narrow(found, request.fit.size)
+        found = with_values(run, foggy, fog_start(run, foggy, fit))
+    return widen_narrow(found, fit.size)
 
 
-def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussians, LiveFacts]:
+def _several_layers(run: Run, fit: FitOptions, field: Field) -> tuple[Gaussians, LiveFacts]:
     """Return the live Gaussians of all layers, which share the budget evenly, in the box frame of the first."""
     source, found, facts = field.source, [], []
-    count, left, half = len(source.layers), request.fit.max_gaussians, np.array(source.volume.unit_frame().half)
+    count, left, half = len(source.layers), fit.max_gaussians, np.array(source.volume.unit_frame().half)
     for number, layer in enumerate(source.layers):
-        share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
+        share = replace(fit, max_gaussians=max(left // (count - number), 1))
         run.console.message(f"layer {number} of {count}: {layer.name}")
         alone = field.with_look(source.single_layer(number))
         layer_facts = LiveFacts.of(layer.volume, alone.source.overall, layer.tf, count)
@@ -195,25 +221,6 @@ def check_layers(source: Source) -> None:
         )
 
 
-def _score(
-    run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians, scores: Sequence[Stage]
-) -> float:
-    """Return the PSNR (dB) of Gaussians as `vvgt recolor` shows them; ``scores`` are those of other viewers."""
-    from vvgt_cli.dvr import RenderSettings
-
-    fit, source = request.fit, field.source
-    name = source.name if len(source.layers) > 1 else source.tf.name
-    with run.stage("live look") as stage:
-        live = score_test_views(
-            field.views, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
-        )
-        stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as other viewers show it"
-    work = Work(run, field, fit, gaussians=gaussians)
-    for stage_of_scores in scores:
-        stage_of_scores.run(work)
-    return live.psnr
-
-
 def box_lighting(source: Source) -> Lighting | None:
     """Return the light of a source, with directions in the box frame."""
     if source.lighting is None:
@@ -239,12 +246,12 @@ def function_table(source: Source) -> Table:
     return Table.of_function(tf, stats.lo, stats.hi, distance, grain_of(volume.dims))
 
 
-def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:
+def fog_start(run: Run, field: Field, fit: FitOptions) -> Start:
     """Return the closed form of a fog; raise NothingVisible if the volume is only background."""
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
-        options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size, values=True)
+        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, values=True)
         start = field.pyramid(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.score.viewing import Axes
+    from vvgt_cli.splat.render import Shown
 
 AUTO, NONE = "auto", "none"
 
@@ -105,7 +106,7 @@ def headset_axes(volume: Volume, up: str) -> Axes:
 
 
 def preview(
-    scene: Scene | Viewed, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
+    scene: Scene | Viewed, gaussians: Shown, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
 ) -> np.ndarray:
     """Draw reference, splats and their difference, one row per camera in the frame of ``axes`` (`upright_axes`)."""
     from vvgt_cli.dvr import RenderSettings, render_view

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -20,8 +19,9 @@ from vvgt_cli.conversion.stages import (
     TrainingViews,
     ViewingConditions,
 )
+from vvgt_cli.conversion.stages.parts import OutOfCore
+from vvgt_cli.conversion.stages.refinement import most_steps, steps_in_time
 from vvgt_cli.conversion.stages.views import view_count
-from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
@@ -29,7 +29,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import UPRIGHT, Axes
 
 ENOUGH_STEPS = 24  # as good as back-projection, which precedes fewer steps
-FINISHING = 20  # steps on whole views after those on regions: few enough that cells by error are left out
+FINISHING = 20  # steps on whole views after those on parts: few enough that cells by error are left out
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
 WRITE = 0.1  # seconds of writing the file once
 SURE = 0.8  # share of the estimated memory that is certainly needed
@@ -85,11 +85,11 @@ class Plan:
         """Return the expected seconds after a stage."""
         return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
 
-    def for_finished(self, count: int, degree: int, finish: list[Stage]) -> Plan:
-        """Return the plan for ``count`` finished Gaussians with harmonics of ``degree``: few stages, then scores."""
+    def for_finished(self, count: int, degree: int) -> Plan:
+        """Return the plan for ``count`` finished Gaussians with harmonics of ``degree``: only scores."""
         return replace(
             self, gaussians=count, workload=replace(self.workload, gaussians=count), bytes=file_bytes(count, degree),
-            stages=[*finish, *(stage for stage in self.stages if stage.scores)], skipped=[],
+            stages=[stage for stage in self.stages if stage.scores], skipped=[],
         )  # fmt: skip
 
     def costs(self) -> list[tuple[str, float]]:
@@ -135,6 +135,7 @@ class Planner:
         whole: whether all ten test views are scored.
         writes: number of times that the file is written.
         axes: those of a headset, `vvgt_cli.conversion.place.headset_axes`.
+        parts: the stage that makes all Gaussians out of core; None: they are made in memory.
     """
 
     limits: Limits
@@ -144,6 +145,7 @@ class Planner:
     whole: bool = False
     writes: int = 1
     axes: Axes = UPRIGHT
+    parts: OutOfCore | None = None
 
     @property
     def vbm(self) -> bool:
@@ -155,7 +157,11 @@ class Planner:
         count = self.fit.max_gaussians
         plan = Plan(workload, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
-        last: list[Stage] = [TestViews(self.whole), ViewingConditions(self.fit.target, self.axes)]
+        levels = self.parts is not None and self.parts.levels
+        last: list[Stage] = [TestViews(self.whole), ViewingConditions(self.fit.target, self.axes, levels)]
+        if self.parts is not None:
+            plan.stages = [self.parts, *([] if levels else self._finish()), *last]
+            return plan
         left = None
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
@@ -186,10 +192,10 @@ class Planner:
         *before, descent = self._descent(steps, small, wanted)
         return [*before, *([BackProjection()] if few else []), *network, descent]
 
-    def finish(self, untimed: bool) -> list[Stage]:
-        """Return the few steps on whole views that follow those on regions; none where time is limited."""
+    def _finish(self) -> list[Stage]:
+        """Return the few steps on whole views that follow those on parts; none where time is limited."""
         steps = min(FINISHING, self.fit.steps or FINISHING)
-        return self._descent(steps, self.wide, steps) if untimed else []
+        return self._descent(steps, self.wide, steps) if self.limits.time_budget is None else []
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
@@ -233,19 +239,6 @@ class Planner:
             plan.skipped.append(("network", f"about {seconds:.1f} s, {_time_left(left)}"))
             return [], left
         return [stage], None if left is None else left - seconds
-
-
-def most_steps(fit: FitOptions, limits: Limits) -> int:
-    """Return the requested number of steps, else `STEPS`, or `MAX_STEPS` if a target or a time budget ends them."""
-    if fit.steps is not None:
-        return fit.steps
-    return STEPS if limits.target_psnr is None and limits.time_budget is None else MAX_STEPS
-
-
-def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:
-    """Return the number of steps, at most ``steps``, that take the seconds ``left``; 0 if too few (`FEWEST_STEPS`)."""
-    affordable = steps if left is None else bisect_right(range(steps + 1), left, key=seconds) - 1
-    return affordable if affordable >= min(FEWEST_STEPS, steps) else 0
 
 
 def _time_left(left: float | None) -> str:

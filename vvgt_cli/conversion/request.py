@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from vvgt_cli.conversion.place import AUTO
 from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.settings import MANY, BlockOptions
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import PlyOptions
@@ -128,6 +128,7 @@ class ConvertRequest:
         slices: a page also holds slices of the volume.
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
+        scored: score the result, for which views are rendered; without, it is the closed form alone.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
         shares_output: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
     """
@@ -145,6 +146,7 @@ class ConvertRequest:
     live: bool = False
     editor: bool = False
     slices: bool = False
+    scored: bool = True
     all_views: bool = False
     shares_output: bool = False
     command: str | None = None
@@ -179,7 +181,7 @@ class ConvertRequest:
         if self.limits.max_megabytes is not None or target is None:
             return self.limits.max_megabytes
         limited = not self.live if known is None else known.suffix == ".html"
-        return target.megabytes if limited and not self.shares_output else None
+        return target.megabytes if limited and not (self.shares_output or is_streamed(self.output)) else None
 
     @property
     def scored_whole(self) -> bool:
@@ -191,7 +193,8 @@ class ConvertRequest:
         """Return how often the output is written: before and after scoring; once for pipes and with a checkpoint."""
         if self.output is None:
             return 0
-        return 1 if self.output == STDOUT or is_stream(self.output) or self.checkpoint is not None else 2
+        once = not self.scored or self.output == STDOUT or is_stream(self.output) or self.checkpoint is not None
+        return 1 if once else 2
 
     def outputs(self) -> list[Output]:
         """List the files that will be written."""
@@ -202,6 +205,18 @@ class ConvertRequest:
         if self.preview:
             outputs.append(Output("--preview", self.preview, (".png",)))
         return outputs
+
+    @property
+    def out_of_core(self) -> bool:
+        """Return whether Gaussians are made part by part where the volume is processed in blocks.
+
+        Levels are, the closed form alone, and more Gaussians than memory holds with their cells.
+        """
+        fit = self.fit
+        if is_streamed(self.output) or self.live or fit.init != INIT:
+            return is_streamed(self.output)
+        whole = fit.model or fit.device != "cpu" or self.checkpoint or fit.steps == 0
+        return not self.scored or (self.budget() > MANY and not whole)
 
     def inputs(self) -> list[str]:
         """List the files that are read."""

@@ -213,10 +213,12 @@ class Conversion(Result):
     Attributes:
         field: the volume under its function, labels, layers and light.
         make_live: makes the live form for a page's editor; None if the Gaussians carry values themselves.
+        seen: returns what viewers show of levels to a camera in the box frame; None where all Gaussians are shown.
     """
 
     field: Field
     make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
+    seen: Callable[[Camera], Gaussians] | None = None
 
     @cached_property
     def _extras(self) -> dict[str, Any]:
@@ -272,7 +274,7 @@ class Conversion(Result):
         """
         cameras = default_views("test", size=size or self.ply.screen_size or SIZE)
         volume = self.field.source.volume
-        axes, inside = upright_axes(volume, self.ply.up), to_box_frame(self.gaussians, volume)
+        axes, inside = upright_axes(volume, self.ply.up), self.seen or to_box_frame(self.gaussians, volume)
         return preview(self.field.views, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:

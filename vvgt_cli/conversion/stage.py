@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.rules import Rule, rule_of
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from vvgt_cli.cameras import Camera
     from vvgt_cli.closed_form import Start
+    from vvgt_cli.conversion.parts import FinishedParts, Levels
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
 
@@ -48,6 +49,10 @@ class Work:
         check, train: views to judge by, and to fit to, once rendered.
         train_rule, train_settings: drawing rule of the training views, and settings of their references.
         judged: the Gaussians and check views last compared, and their PSNR (dB).
+        ply: layout of the file.
+        parts, levels: Gaussians made out of core, on disk.
+        live_psnr: dB of a live file as `vvgt recolor` shows it, once scored.
+        seen: returns what a camera is shown of levels; None where all Gaussians are.
         weigh: returns factors (h, w) of errors in a camera's picture, where the field is a part of the volume whose
             Gaussians keep their number and order.
     """
@@ -67,6 +72,11 @@ class Work:
     train_settings: RenderSettings | None = None
     judged: tuple[Gaussians, Views, float] | None = None
     weigh: Callable[[Camera], np.ndarray] | None = None
+    ply: PlyOptions = dataclasses.field(default_factory=PlyOptions)
+    parts: FinishedParts | None = None
+    levels: Levels | None = None
+    live_psnr: float | None = None
+    seen: Callable[[Camera], Gaussians] | None = None
 
     @property
     def rule(self) -> Rule:
@@ -83,6 +93,11 @@ class Work:
         """Return the Gaussians of the latest stage."""
         assert self.gaussians is not None, "a stage that needs Gaussians stands before the one that makes them"
         return self.gaussians
+
+    @property
+    def shown(self) -> Gaussians | Callable[[Camera], Gaussians]:
+        """Return what viewers show: the current Gaussians, or those of the levels that a camera selects."""
+        return self.seen or self.current()
 
     def psnr(self, gaussians: Gaussians) -> float:
         """Return the PSNR (dB) on the check views; the last one is cached."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
+from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import TILE_VOXELS
 from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.runners import Processes, Runner
@@ -24,7 +25,7 @@ from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worke
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
-from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
+from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE, for_blocks
 from vvgt_cli.look.labels import NO_LABELS
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
@@ -145,6 +146,44 @@ def blocked(
             return other, *_reader(other, access)
 
         yield Blocked(source, reader, run_pass, edge, visible, key, look)
+
+
+@contextmanager
+def opened(
+    run: Run, request: SourceRequest, options: BlockOptions | None, needs: FieldNeeds,
+    kernels: Callable[[Source, bool], tuple[str, ...]], store: AbstractContextManager[BlockStore] | None = None,
+    device: str = "cpu", look: Callable[[Source], Source] = lambda source: source,
+) -> Iterator[Field]:  # fmt: skip
+    """Open a volume under its look as a field, in memory, or in blocks if it is large.
+
+    Args:
+        run: gets the stages.
+        request: volume and look.
+        options: block options; None: in blocks only if the volume is large (`automatic`).
+        needs: purpose of the field.
+        kernels: returns the kernels to compile for a source, which may be in blocks.
+        store: provides the store of blocks; None for a temporary one.
+        device: "cpu" or "cuda", which renders a volume in memory.
+        look: changes the source before kernels are compiled.
+
+    Raises:
+        DataError, UsageError: see `vvgt_cli.field.source.load`.
+        MissingBlocks: other shards' blocks are missing.
+    """
+    options = options or automatic(request, run.console)
+    if options is None:
+        with run.stage("read") as stage:
+            source = look(load(request))
+            stage.note = describe_source(source)
+        run.compile(kernels(source, False), source.kernel_type())
+        with run.stage("scene"):
+            field = Resident.of(source, device, run.console.message)
+        yield field
+        return
+    with store or store_beside(None) as blocks, blocked(run, request, options, blocks, needs) as found:
+        found.source = look(found.source)
+        run.compile(for_blocks(kernels(found.source, True)), found.source.kernel_type())
+        yield found
 
 
 def _measured(request: SourceRequest) -> tuple[Volume, int | None]:

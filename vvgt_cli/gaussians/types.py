@@ -90,6 +90,9 @@ class Gaussians:
         return replace(self, harmonics=terms if degree else None)
 
 
+NOTHING = Gaussians(*(np.zeros((0, width) if width else 0) for width in _WIDTHS.values()))
+
+
 def concatenate(parts: list[Gaussians]) -> Gaussians:
     """Concatenate sets of Gaussians of the same degree."""
     fields = parts[0].arrays()

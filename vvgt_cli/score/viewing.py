@@ -12,7 +12,6 @@ from vvgt_cli.cameras import Camera, default_views, look_at
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
 from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
 from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.progress import ProgressCallback
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.images.metrics import Texture
+    from vvgt_cli.splat.render import Shown
 
 SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
 CLOSE = 10.0  # degrees: a quarter of the default field of view
@@ -33,6 +33,7 @@ AWAY = (2.0, 1.5)  # metres from the middle to the eyes: at first, and half a me
 Axes = tuple[tuple[float, ...], ...]
 UPRIGHT: Axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 UP, APART = 0.3, 0.063  # metres: eyes 1.6 m up, and between both
+DISTANCES = (6.0, 1.2, 0.6)  # unit frame, beside that of the test views, 3: about a level farther, nearer and inside
 PREVIEW_VIEWS = VIEWS  # of previews, and of scores without a report
 
 
@@ -45,7 +46,7 @@ class ViewingCondition:
         size: pixels along the picture's edge.
         field_of_view: degrees.
         psnr: mean dB of the views, over black.
-        where: name of the place in a headset; "" for a screen.
+        where: name of the place in a headset, or of the distance from levels; "" for a screen.
     """
 
     rule: str
@@ -117,6 +118,16 @@ def condition_pictures(
     return found
 
 
+def distance_pictures(size: int, views: Collection[int] = SIDE, enough: int = ENOUGH) -> list[ConditionPicture]:
+    """List pictures of the middle from `DISTANCES`, as `condition_pictures`, for levels that distances select."""
+    found = []
+    for distance in DISTANCES:
+        place = ViewingPlace(size, FIELD_OF_VIEW, f"from {distance:g}")
+        cameras = default_views("test", size=size, radius=distance)
+        found += [(place, cameras[i], spread_blocks(size, size, i, enough)) for i in views]
+    return found
+
+
 def eye_pictures(
     target: str | None, axes: Axes = UPRIGHT, views: Collection[int] = VIEWS, enough: int = ENOUGH
 ) -> list[ConditionPicture]:
@@ -164,7 +175,7 @@ def condition_views(
 
 def score_texture(
     scene: Scene | Viewed,
-    gaussians: Gaussians,
+    gaussians: Shown,
     size: int,
     rule: str | Rule = INRIA,
     settings: RenderSettings | None = None,
@@ -214,7 +225,7 @@ def texture_note(texture: Texture) -> str:
 
 
 def score_conditions(
-    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES),
+    gaussians: Shown, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES),
     headset: str = INRIA.name,
 ) -> list[ViewingCondition]:  # fmt: skip
     """Score every rule at every place, on the blocks of `condition_views`; worst first; ``headset``: its rule."""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.images.metrics import Scores, ViewScore
+    from vvgt_cli.splat.render import Shown
 
 
 WHOLE = (0, 4, 9)  # test views drawn whole, for measures that blocks do not suffice for
@@ -42,7 +43,7 @@ def test_view_pixels(size: int) -> int:
 
 def score_test_views(
     scene: Scene | Viewed,
-    gaussians: Gaussians,
+    gaussians: Shown,
     size: int,
     settings: RenderSettings,
     *,
@@ -55,7 +56,7 @@ def score_test_views(
 
     Args:
         scene: the volume.
-        gaussians: Gaussians to compare with it.
+        gaussians: Gaussians to compare with it, or what is shown of them to a camera.
         size: pixels along an image's edge.
         settings: settings of the reference.
         rule: drawing rule of the Gaussians.

@@ -114,8 +114,11 @@ def blend(
     return image
 
 
+Shown = Gaussians | Callable[[Camera], Gaussians]  # all Gaussians, or those of the levels that a camera selects
+
+
 def render(
-    gaussians: Gaussians,
+    gaussians: Shown,
     camera: Camera,
     rule: str | Rule = INRIA,
     projection: Projection | None = None,
@@ -125,8 +128,8 @@ def render(
 
     ``projection``, where there is one, was made by a rule of its own; with ``blocks`` zero elsewhere.
     """
-    p = projection or project(gaussians, camera, rule)
-    g = gaussians
+    g = gaussians if isinstance(gaussians, Gaussians) else gaussians(camera)
+    p = projection or project(g, camera, rule)
     colors = seen_colors(g.means, g.colors, g.harmonics, camera.position)
     return blend(p, np.maximum(colors, 0), camera.height, camera.width, blocks)
 

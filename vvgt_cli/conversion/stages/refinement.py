@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -10,7 +12,9 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
@@ -35,6 +39,19 @@ def step_seconds(workload: Workload, small: bool) -> float:
     """Return the seconds of a step, with its share of the checks."""
     one = workload.pace * (STEP[0] * (view_edge(workload.size, small) / 400) ** 2 + STEP[1] * workload.gaussians / 1e5)
     return HARMONICS[workload.degree] * one
+
+
+def most_steps(fit: FitOptions, limits: Limits) -> int:
+    """Return the requested number of steps, else `STEPS`, or `MAX_STEPS` if a target or a time budget ends them."""
+    if fit.steps is not None:
+        return fit.steps
+    return STEPS if limits.target_psnr is None and limits.time_budget is None else MAX_STEPS
+
+
+def steps_in_time(steps: int, left: float | None, seconds: Callable[[int], float]) -> int:
+    """Return the number of steps, at most ``steps``, that take the seconds ``left``; 0 if too few (`FEWEST_STEPS`)."""
+    affordable = steps if left is None else bisect_right(range(steps + 1), left, key=seconds) - 1
+    return affordable if affordable >= min(FEWEST_STEPS, steps) else 0
 
 
 @dataclass(frozen=True)

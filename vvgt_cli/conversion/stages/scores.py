@@ -20,6 +20,7 @@ from vvgt_cli.score.viewing import (
     ConditionPicture,
     condition_pictures,
     condition_views,
+    distance_pictures,
     eye_pictures,
     score_conditions,
     score_texture,
@@ -69,7 +70,7 @@ class TestViews(Stage):
         with run.stage(self.name) as stage:
             scores = score_test_views(
                 work.field.views,
-                work.current(),
+                work.shown,
                 fit.size,
                 RenderSettings(),
                 rule=fit.rule,
@@ -96,25 +97,29 @@ class ViewingConditions(Stage):
     Attributes:
         target: name of the device that the file is made for; a headset's eyes are scored, too.
         axes: those of a headset (`vvgt_cli.conversion.place.headset_axes`).
+        levels: whether they are levels of detail, which are also scored from other distances.
     """
 
     name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
     target: str | None = None
     axes: Axes = UPRIGHT
+    levels: bool = False
 
     def cost(self, workload: Workload) -> Cost:
         """Return the cost by pixels and Gaussians."""
         near = (workload.size // TEXTURED) ** 2
         splats = CONDITIONS[0] + CONDITIONS[1] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
-        views = sum(enough == FEW for _, enough in _places(workload.size)) + len(
-            eye_pictures(self.target, self.axes, SIDE)
-        )
+        views = sum(enough == FEW for _, enough in _places(workload.size)) + len(self._others(workload.size))
         return Cost(views * workload.check_view_seconds + workload.reference_seconds(near) + workload.pace * splats)
 
     def _wanted(self, size: int) -> list[ConditionPicture]:
         around = [one for place, enough in _places(size) for one in condition_pictures([place], SIDE, enough)]
-        return around + eye_pictures(self.target, self.axes, SIDE, FEW)
+        return around + self._others(size)
+
+    def _others(self, size: int) -> list[ConditionPicture]:
+        """List the pictures for eyes in a headset, and from other distances."""
+        return eye_pictures(self.target, self.axes, SIDE, FEW) + self.levels * distance_pictures(size, SIDE, FEW)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """List the pictures that are scored."""
@@ -132,7 +137,7 @@ class ViewingConditions(Stage):
             run.skip(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            made, settings = work.current(), RenderSettings()
+            made, settings = work.shown, RenderSettings()
             seen = condition_views(work.field.views, self._wanted(fit.size), settings)
             conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)), fit.rule)
             run.report.conditions = [asdict(condition) for condition in conditions]

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.sog import IMAGES, META
-from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
 
 MANIFEST = "lod-meta.json"
 _LARGEST = 1 << 28  # bytes of a manifest
@@ -105,7 +105,7 @@ def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]
 
 
 def facts_of(path: str | Path) -> dict[str, Any]:
-    """Return the summary for `vvgt info`: Gaussians and nodes per level, and bytes and errors if vvgt wrote them."""
+    """Return the summary for `vvgt info`: Gaussians and nodes per level; bytes, errors, certificate of our own."""
     manifest = read_manifest(path)
     nodes, ours = nodes_of(manifest, path), manifest.get("vvgt")
     facts = ours.get("levels") if isinstance(ours, dict) else None
@@ -116,12 +116,13 @@ def facts_of(path: str | Path) -> dict[str, Any]:
         if isinstance(facts, list) and level < len(facts) and isinstance(facts[level], dict):
             row |= {key: facts[level].get(key) for key in ("files", "bytes", "rms", "spread")}
         levels.append(row)
-    asset = manifest.get("asset")
+    asset, (_, header) = manifest.get("asset"), gaussians_of(placed(manifest)[0], str(path))
     return {
         "written_by": asset.get("generator") if isinstance(asset, dict) else None,
         "files": len(manifest["filenames"]),
         "nodes": len(nodes),
         "levels": levels,
+        **({} if header.certificate is None else {"certificate": header.certificate.facts()}),
     }
 
 

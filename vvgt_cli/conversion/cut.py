@@ -1,4 +1,4 @@
-"""The plan of a conversion by blocks, and cuts of its tiled pyramid, as Gaussians region by region."""
+"""Cuts of a pyramid on disk, as Gaussians part by part, and the plan of the file that they are made for."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vvgt_cli.closed_form.columns import COLUMNS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.block_store import COARSE, ROW, RUN, TREES, BlockStore
+from vvgt_cli.field.block_store import CELLS, COARSE, ROW, RUN, TREES, BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, CellGrid
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.ply import as_stored
 from vvgt_cli.jit.ahead import MERGE, SHADE, for_degree
@@ -26,17 +26,18 @@ from vvgt_cli.score.record import plain
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.tree import Leaves
-    from vvgt_cli.field.blocked import Pass
+    from vvgt_cli.conversion.stage import Work
+    from vvgt_cli.field.blocked import Blocked, Pass
     from vvgt_cli.field.tiles import TiledPyramid
     from vvgt_cli.gaussians import Gaussians
     from vvgt_cli.score.record import Run
 
 
-ENOUGH = 1 << 14  # mean Gaussians of a region from which it is not widened
+ENOUGH = 1 << 14  # mean Gaussians of a part from which it is not widened
 LARGEST = 1 << 28  # bytes of its voxels while they are read
 
 
-class CutNode(NamedTuple):
+class TileGaussians(NamedTuple):
     """The Gaussians of a tile.
 
     Attributes:
@@ -50,7 +51,7 @@ class CutNode(NamedTuple):
     normals: np.ndarray | None
 
 
-class Regions(NamedTuple):
+class Parts(NamedTuple):
     """A division of the tiles into cubes, each of which is worked on by one worker.
 
     Attributes:
@@ -62,7 +63,7 @@ class Regions(NamedTuple):
     ends: tuple[int, ...]
 
     def rows(self, number: int) -> tuple[int, int]:
-        """Return the range of tiles of region ``number``."""
+        """Return the range of tiles of part ``number``."""
         return self.ends[number - 1] if number else 0, self.ends[number]
 
 
@@ -77,7 +78,7 @@ class Cut:
     """
 
     pyramid: TiledPyramid
-    plan: ShardPlan
+    plan: CutPlan
     key: str
 
     @property
@@ -89,7 +90,7 @@ class Cut:
         """Return what opens the same cut in another process, once for all tasks there."""
         return open_cut, (self.store, self.key)
 
-    def regions(self, threshold: float) -> Regions:
+    def parts(self, threshold: float) -> Parts:
         """Divide the tiles into cubes of enough Gaussians for a threshold, with voxels that fit in memory."""
         grid, width = self.plan.grid, 1
         places = self.pyramid.top.index[: len(self.pyramid)]
@@ -102,15 +103,19 @@ class Cut:
             width *= 2
         cubes = places // width
         first = np.flatnonzero(np.any(cubes[1:] != cubes[:-1], axis=1)) + 1
-        return Regions(width, (*first.tolist(), len(places)))
+        return Parts(width, (*first.tolist(), len(places)))
 
-    def box(self, regions: Regions, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first voxel of a region, and the end of its range, (3,) each."""
-        grid, edge = self.plan.grid, regions.width * self.plan.grid.tile
-        lo: np.ndarray = np.array(self.pyramid.top.index[regions.ends[number] - 1]) // regions.width * edge
+    def everywhere(self, threshold: float) -> np.ndarray:
+        """Return one threshold for every tile, (tiles, 1)."""
+        return np.full((len(self.pyramid), 1), threshold)
+
+    def box(self, parts: Parts, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first voxel of a part, and the end of its range, (3,) each."""
+        grid, edge = self.plan.grid, parts.width * self.plan.grid.tile
+        lo: np.ndarray = np.array(self.pyramid.top.index[parts.ends[number] - 1]) // parts.width * edge
         return lo, np.minimum(lo + edge, grid.dims)
 
-    def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[CutNode]:
+    def nodes(self, begin: int, end: int, thresholds: np.ndarray, least: bool = True) -> list[TileGaussians]:
         """Return the nodes of the tiles from ``begin`` to ``end``, with a level for each of their ``thresholds``.
 
         Tiles are made together, since the colours of neighbours depend on each other.
@@ -129,7 +134,7 @@ class Cut:
         made = []
         for node, size, last in zip(cuts, sizes, np.cumsum(sizes, axis=0), strict=True):
             gaussians = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, last, strict=True)]
-            made.append(CutNode(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
+            made.append(TileGaussians(gaussians, [spread_of(leaves) for leaves in node], self._normals(node[0])))
         return made
 
     def over_tiles(self, threshold: float) -> tuple[Gaussians, np.ndarray | None] | None:
@@ -176,7 +181,7 @@ def open_cut(store: BlockStore, key: str) -> Cut:
     """
     from vvgt_cli.field.tiles import TiledPyramid
 
-    plan = ShardPlan.load(store)
+    plan = CutPlan.load(store)
     light = load_light(store, plan)
     return Cut(TiledPyramid.load(store, plan.grid, plan.size, plan.labels, light, plan.degree), plan, key)
 
@@ -195,7 +200,7 @@ def cut_of(run: Run, run_pass: Pass) -> Cut:
     from vvgt_cli.field.tiles import gather
 
     store = run_pass.store
-    plan = ShardPlan.load(store)
+    plan = CutPlan.load(store)
     lit = SHADE if load_light(store, plan) else ()
     run.compile(for_degree((*MERGE, *lit), plan.degree))
     with run.stage("pyramid") as stage:
@@ -219,7 +224,7 @@ KEPT = 2.2  # Gaussians on disk a Gaussian of the file: with its coarser levels,
 
 
 @dataclass(frozen=True)
-class ShardPlan:
+class CutPlan:
     """The grid of cells, the budget and the layout of the output.
 
     Attributes:
@@ -260,7 +265,7 @@ class ShardPlan:
             temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
 
     @classmethod
-    def load(cls, store: BlockStore) -> ShardPlan:
+    def load(cls, store: BlockStore) -> CutPlan:
         """Read the plan beside blocks; raise DataError if it is missing or damaged."""
         path = store.folder / PLAN
         try:
@@ -281,7 +286,7 @@ class ShardPlan:
             raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
 
 
-def load_light(store: BlockStore, plan: ShardPlan) -> Light | None:
+def load_light(store: BlockStore, plan: CutPlan) -> Light | None:
     """Read the light beside a plan, None for none; raise DataError if the file is missing or damaged."""
     if plan.ply.light is None:
         return None
@@ -307,3 +312,32 @@ def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool,
     coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
     row, vertex = ROW + A_SCORE + A_NORMAL * lit, VERTEX_BYTES + HARMONIC_BYTES[degree]
     return int(cells * row + coarse + met * A_RAY + KEPT * min(budget, cells) * vertex)
+
+
+def make_blocks(work: Work, field: Blocked) -> None:
+    """Integrate the blocks of a field, or reuse them, and save the plan of the file beside them.
+
+    Raises:
+        MissingBlocks: blocks of other shards are missing.
+        DataError: the disk is too small.
+    """
+    from vvgt_cli.closed_form.closed_form import most_cells
+
+    run, fit, source, store = work.run, work.fit, field.source, field.run_pass.store
+    cells = field.cells(fit.size, most_cells(fit.max_gaussians, on_disk=True))
+    CutPlan(
+        cells.grid, fit.max_gaussians, fit.size, source.volume.direction, work.ply, run.report.volume,
+        run.report.transfer_function, "" if cells.rays is None else cells.rays.kind, source.labels_alone, work.degree,
+        field.reader.voxel_bytes,
+    ).save(store, cells.light)  # fmt: skip
+    rays = 0 if cells.rays is None else sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
+    need = disk_bytes(cells.grid, field.visible, fit.max_gaussians, rays, cells.light is not None, work.degree)
+    need -= store.bytes(CELLS)
+    if need > 0 and store.missing(CELLS, range(len(cells))):
+        run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
+        check_disk_space(store.folder, need)
+    with run.stage("integrate") as stage:
+        done = field.run_pass(cells, "integrate")
+        workers = field.run_pass.runner.workers
+        stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
+    field.grid = cells.grid

@@ -1,1 +1,0 @@
-"""The closed form of volumes larger than memory: block by block, in any order, by any number of workers."""
