@@ -1,8 +1,8 @@
-# make test | quick | lint | docs | long | mutants | viewers | page | model | ci
+# make test | quick | lint | formats | docs | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format docs long fuzz mutants viewers page model ci
+.PHONY: test quick lint format formats docs long fuzz mutants viewers page model ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -12,7 +12,7 @@ $(VENV)/bin/pytest: pyproject.toml constraints.txt
 test: $(VENV)/bin/pytest
 	$(VENV)/bin/pytest -n 2 --dist loadfile
 
-# While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
+# While working, for less than a minute once kernels are compiled: the order of subpackages, pages, cameras, pictures, metrics, the
 # splatter and the ray caster's scenes, transfer functions, most formats; ten examples a property, no conversions.
 QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images \
 	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene look_readers look_resolve volume_affines \
@@ -28,6 +28,10 @@ lint: $(VENV)/bin/pytest
 format: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
+
+# Endings of files in modules of other programs, which cannot read our table of formats.
+formats: $(VENV)/bin/pytest
+	$(VENV)/bin/python -m tests.endings
 
 # The documentation as a site that can be searched: out/docs/index.html.
 docs: $(VENV)/bin/pytest

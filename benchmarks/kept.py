@@ -27,11 +27,11 @@ from dvr_scenes import write_rows
 from vvgt_cli.conversion.place import with_place
 from vvgt_cli.errors import VvgtError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
+from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of, read_splats
 from vvgt_cli.gaussians.header import MIP, Certificate
 from vvgt_cli.volume import Volume
 
-ENDINGS = (".ply", ".compressed.ply", ".spz", ".v4.spz", ".sog", ".glb", ".usdc", ".html")
+ENDINGS = [suffix for suffix in SUFFIXES if suffix != ".usdz"]  # which is a .usdc in a zip
 NOT_RUN, YES, NO = "not run", "yes", "no"
 FACTS: dict[str, Callable[[PlyHeader], bool]] = {
     "certificate": lambda header: header.certificate is not None,

@@ -1,9 +1,11 @@
 """Shared fixtures: the command line in-process, the `long` marker, hypothesis profiles."""
 
+import contextlib
 import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +18,13 @@ from vvgt_cli.commands.main import run
 from vvgt_cli.resources import set_memory
 
 SLOWEST = (
-    *("matrix", "jit", "docs_run", "benchmarks", "scale_workers", "stiff", "stiff_equivalence", "volume_vtk_family"),
-    *("certificate", "report", "previous_frame", "cli_streams", "page_slices", "field_rays", "splat_backward", "fuzz"),
+    *("jit", "volume_vtk_family", "scale_workers", "matrix", "stiff", "certificate", "report", "previous_frame"),
+    *("cli_streams", "page_slices", "field_rays", "splat_backward", "fuzz"),
     *("nodes", "conversion_plan", "dask", "layers", "previous_look", "cli_convert", "volume_grib", "closed_form"),
 )  # files' names, a minute to ten seconds of processor
+
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+KERNELS = Path(os.environ.get("VVGT_TEST_KERNELS") or CACHE / "vvgt" / "kernels-of-tests")
 
 places = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH")]
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, places))  # of processes that tests start
@@ -51,16 +56,35 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes() -> None:
-    """The same before tests run in several processes (-n)."""
+    """Compile kernels before tests run in several processes (-n)."""
     compile_kernels()
 
 
 def compile_kernels() -> None:
-    """All of them, where they are not there yet."""
-    from vvgt_cli.jit.ahead import ALL
-    from vvgt_cli.jit.compile import compile_ahead
+    """Compile all that neither this clone's earlier runs have left nor those of other clones in `KERNELS`.
 
+    Names of their files hold digests of all that they are compiled from; what no run has used for a month goes.
+    """
+    from vvgt_cli.jit import store
+    from vvgt_cli.jit.ahead import ALL
+    from vvgt_cli.jit.compile import compile_ahead, missing, usual_jobs
+
+    jobs, folder = usual_jobs(ALL), store.folder_for_writing()
+    for job in missing(jobs):
+        if folder and (kept := store.read(KERNELS / job.file)):
+            store.write(folder / job.file, kept)
     compile_ahead(ALL)
+    if not folder or not store.writable(KERNELS):
+        return
+    for job in jobs:
+        if (folder / job.file).is_file():
+            part = KERNELS / f"{job.file}.{os.getpid()}.part"
+            shutil.copyfile(folder / job.file, part)  # with the time of this use
+            part.replace(KERNELS / job.file)
+    for path in KERNELS.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # of another run at once
+            if path.stat().st_mtime < time.time() - 30 * 86400:
+                path.unlink()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -23,13 +23,6 @@ def test_quaternions_give_their_rotation_back(q):
     np.testing.assert_allclose(rotations(back[None])[0], rotation, atol=1e-12)
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_half_turns(axis):
-    rotation = -np.eye(3)
-    rotation[axis, axis] = 1
-    np.testing.assert_allclose(np.abs(quaternion(rotation)), np.eye(4)[axis + 1], atol=1e-12)
-
-
 def test_pycolmap_writes_back_the_same_bytes(tmp_path):
     """Nothing is lost on the way through COLMAP; lenses that differ become cameras of their own."""
     wide = look_at((0.0, -3.0, 1.0), width=60, height=40, fov=50, name="wide")

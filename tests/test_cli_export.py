@@ -1,6 +1,5 @@
 """`vvgt export`: one real export of a tiny network, and what is refused."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -91,12 +90,6 @@ def test_a_head_that_is_zero_is_not_compared_as_it_is(made, traced, tmp_path):
     refused(DataError, "returns its input", ex.difference, fresh(), Model.open(made / "tiny"))
 
 
-def test_graphs_that_differ_are_not_written(traced, tmp_path):
-    save_checkpoint(tmp_path / "other.pt", NetworkCheckpoint(ex.randomised(ex.randomised(fresh()))))
-    refused(DataError, "differs from torch", ex.export_model, tmp_path / "other.pt", tmp_path / "other")
-    assert [path.name for path in tmp_path.iterdir()] == ["other.pt"]
-
-
 def test_a_model_is_replaced_only_when_told_and_nothing_else_ever(made, traced, tmp_path):
     ex.export_model(made / "tiny.pt", tmp_path / "a")
     refused(UsageError, "--overwrite", ex.export_model, made / "tiny.pt", tmp_path / "a")
@@ -129,15 +122,9 @@ def _other_state(change):
 
 BROKEN = {
     "code": (lambda: {"format": "vvgt-checkpoint", "state": _Pickled()}, "not a checkpoint"),
-    "other": (lambda: {"weights": torch.zeros(3)}, "not a checkpoint"),
-    "a tensor": (lambda: torch.zeros(3), "holds a Tensor"),
     "schema": (lambda: _changed(_document(), schema=9), "schema 9"),
-    "config": (lambda: _changed(_document(), config={}), "config"),
     "lost key": (lambda: {k: v for k, v in _document().items() if k != "state"}, "lacks 'state'"),
     "missing": (lambda: _other_state(lambda s: s.pop("geometry.head.norm.weight")), "1 weights missing"),
-    "unknown": (lambda: _other_state(lambda s: s.update(extra=torch.zeros(1))), "1 unknown"),
-    "shape": (lambda: _other_state(lambda s: s.update({"geometry.head.norm.weight": torch.zeros(3)})), "norm.weight"),
-    "nan": (lambda: _other_state(lambda s: s["geometry.head.norm.weight"].fill_(np.nan)), "not finite"),
     "no 3D side": (lambda: NetworkCheckpoint(fresh(replace(TINY, variant="wo_3dt"))).to_dict(), "wo_3dt"),
 }
 
@@ -158,7 +145,3 @@ def test_a_file_that_is_missing_or_truncated(made, tmp_path, vvgt):
     assert "no such file" in vvgt("export", tmp_path / "no.pt", "-o", tmp_path / "m").error
     (tmp_path / "cut.pt").write_bytes((made / "tiny.pt").read_bytes()[:2000])
     assert "damaged" in vvgt("export", tmp_path / "cut.pt", "-o", tmp_path / "m").error
-
-
-def test_the_card_is_json_without_nan(made):
-    assert json.loads((made / "tiny" / "card.json").read_text())["format"] == "vvgt-model"

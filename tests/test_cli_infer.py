@@ -109,28 +109,6 @@ def test_the_same_bytes_again_and_through_pipes(made, tmp_path, vvgt, monkeypatc
     assert piped.out == outputs[0]
 
 
-def test_threads_come_from_the_option_or_the_environment(made, tmp_path, vvgt, monkeypatch):
-    import numba
-
-    from vvgt_cli.network import runtime
-
-    asked = []
-    opened = runtime._session
-    monkeypatch.setattr(
-        runtime, "_session", lambda path, threads, provider: asked.append(threads) or opened(path, threads, provider)
-    )
-    limit = numba.config.NUMBA_NUM_THREADS
-    try:
-        vvgt(*call(made, "brighter", tmp_path / "a.ply", "--threads", 1))
-        monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
-        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-        monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
-        vvgt(*call(made, "brighter", tmp_path / "b.ply"))
-    finally:
-        numba.set_num_threads(limit)
-    assert asked == [1, 1, min(2, limit), min(2, limit)]
-
-
 def test_with_too_few_views_those_that_were_read_judge(made):
     from vvgt_cli.cameras import default_views
 
@@ -173,3 +151,25 @@ def test_nothing_is_overwritten_unasked(made, tmp_path, vvgt):
     (tmp_path / "out.ply").write_bytes(b"mine")
     assert "--overwrite" in vvgt.fails(2, *call(made, "brighter", tmp_path / "out.ply"))
     assert (tmp_path / "out.ply").read_bytes() == b"mine"
+
+
+def test_threads_come_from_the_option_or_the_environment(made, tmp_path, vvgt, monkeypatch):
+    import numba
+
+    from vvgt_cli.network import runtime
+
+    asked = []
+    opened = runtime._session
+    monkeypatch.setattr(
+        runtime, "_session", lambda path, threads, provider: asked.append(threads) or opened(path, threads, provider)
+    )
+    limit = numba.config.NUMBA_NUM_THREADS
+    try:
+        vvgt(*call(made, "brighter", tmp_path / "a.ply", "--threads", 1))
+        monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
+        vvgt(*call(made, "brighter", tmp_path / "b.ply"))
+    finally:
+        numba.set_num_threads(limit)
+    assert asked == [1, 1, min(2, limit), min(2, limit)]

@@ -116,8 +116,8 @@ def test_the_library_takes_names_directions_and_options():
     by_direction = vvgt_cli.convert(SOURCE, Look(function, light=(0, 0, 1)), few)
     assert by_direction.field.source.lighting == Lighting(False, ((0, 0, 1),))
     options = LightOptions(("above", "headlight"), shadows=True, specular=0)
-    _, images = vvgt_cli.render_views(SOURCE, Look(function, light=options), cameras=1, size=32)
-    _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
+    _, images = vvgt_cli.render_views(SOURCE, Look(function, light=options), views=1, size=32)
+    _, dark = vvgt_cli.render_views(SOURCE, function, views=1, size=32)
     assert np.abs(images - dark).max() > 0.05
     np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays
 

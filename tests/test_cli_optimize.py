@@ -103,14 +103,6 @@ def test_a_target_and_a_time_budget_end_a_run(call):
     assert (result.code, "time is up" in result.err) == (0, True)
 
 
-def test_the_same_command_gives_the_same_bytes(call):
-    files = []
-    for _ in range(2):
-        assert call("--steps", 8, "--overwrite", "-q").code == 0
-        files.append(Path("out.ply").read_bytes())
-    assert files[0] == files[1]
-
-
 CASES = {
     "no views": (("in.ply", "--views", "none", "--steps", 1, "-o", "o.ply"), 1, "none/transforms_train.json"),
     "no ply": (("no.ply", "--views", "views", "--steps", 1, "-o", "o.ply"), 1, "no.ply"),

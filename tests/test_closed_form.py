@@ -98,25 +98,6 @@ def test_origin_and_direction_do_not_matter() -> None:
     assert same_bytes(start(scene_of(volume, Tent())), start(scene_of(moved, Tent())))
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_same_bytes_twice(method: str) -> None:
-    cameras = default_views("train", 6, size=48)
-    results = []
-    for _ in range(2):
-        scene = scene_of(noise(), Above(1.0, 0.6))
-        begun = initialise(scene, VbmOptions(300, 48, method, seed=3))
-        results.append((begun.gaussians, *backproject(begun, cameras, render_views(scene, cameras))))
-    assert same_bytes(results[0][0], results[1][0])
-    assert same_bytes(results[0][1], results[1][1])
-    assert results[0][2] == results[1][2]
-
-
-def test_seeds() -> None:
-    scene = scene_of(noise(), Tent())
-    a, b = (initialise(scene, VbmOptions(100, 48, "uniform", seed)).gaussians for seed in (0, 1))
-    assert np.abs(a.means - b.means).max() > 0.01
-
-
 # ---- options and budgets
 
 
@@ -139,21 +120,6 @@ def test_budget(method: str, budget: int) -> None:
     fitted, note = backproject(begun, cameras, render_views(scene, cameras))
     assert 1 <= len(fitted) <= budget
     assert note
-
-
-def test_progress() -> None:
-    scene = scene_of(noise((12, 9, 10)), Tent())
-    seen: list[tuple[int, int]] = []
-    begun = initialise(scene, VbmOptions(50, 32), lambda done, total: seen.append((done, total)))
-    assert {total for _, total in seen} == {100}
-    shares = [done for done, _ in seen]
-    assert (shares, shares[-1]) == (sorted(shares), 100)
-    assert len({share for share in shares if 50 < share < 75}) > 10  # within the march, view by view
-    assert any(25 < share <= 75 for share in shares)
-    seen.clear()
-    cameras = default_views("train", 3, size=32)
-    backproject(begun, cameras, render_views(scene, cameras), lambda done, total: seen.append((done, total)))
-    assert seen == [(i + 1, seen[-1][1]) for i in range(seen[-1][1])]
 
 
 def test_base_level_keeps_the_memory_bound(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,3 +286,18 @@ def test_cells_are_split_down_to_the_finest_that_voxels_and_pixels_tell(size: in
     assert len(asked) == closed_form_module.REFINE_ROUNDS
     assert min(edges.min() for edges in asked if len(edges)) >= finest
     assert any(len(edges) for edges in asked)
+
+
+def test_progress() -> None:
+    scene = scene_of(noise((12, 9, 10)), Tent())
+    seen: list[tuple[int, int]] = []
+    begun = initialise(scene, VbmOptions(50, 32), lambda done, total: seen.append((done, total)))
+    assert {total for _, total in seen} == {100}
+    shares = [done for done, _ in seen]
+    assert (shares, shares[-1]) == (sorted(shares), 100)
+    assert len({share for share in shares if 50 < share < 75}) > 10  # within the march, view by view
+    assert any(25 < share <= 75 for share in shares)
+    seen.clear()
+    cameras = default_views("train", 3, size=32)
+    backproject(begun, cameras, render_views(scene, cameras), lambda done, total: seen.append((done, total)))
+    assert seen == [(i + 1, seen[-1][1]) for i in range(seen[-1][1])]

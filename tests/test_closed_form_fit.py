@@ -136,26 +136,11 @@ def test_few_gaussians(count: int) -> None:
     assert weights_and_errors(solved, CAMERAS, views)[1].shape == (count,)
 
 
-def test_nothing_to_mend() -> None:
-    truth = cloud(10)
-    same = solve_colors(truth, CAMERAS, pictures(truth), rounds=6)
-    np.testing.assert_allclose(same.colors, truth.colors, atol=1e-6)
-
-
 def test_colours_stay_in_range() -> None:
     truth = cloud(30)
     views = pictures(with_colors(truth, 9.0))
     assert solve_colors(truth, CAMERAS, views, rounds=8).colors.max() == BRIGHTEST
     assert solve_colors(truth, CAMERAS, -views, rounds=8).colors.min() == 0
-
-
-def test_repeats_to_the_byte_and_reports() -> None:
-    truth = cloud(300, seed=3)
-    start, views = with_colors(truth, 0.5), pictures(truth)
-    seen = []
-    first = solve_colors(start, CAMERAS, views, 3, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert first.colors.tobytes() == solve_colors(start, CAMERAS, views, 3).colors.tobytes()
 
 
 def test_rounds_end_where_they_gain_little() -> None:

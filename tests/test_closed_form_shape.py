@@ -12,7 +12,7 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form.cell_kernels import principal_axes
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.moments import base_cells
-from vvgt_cli.closed_form.shape import ROUND, make_gaussians, quaternions, widened
+from vvgt_cli.closed_form.shape import ROUND, make_gaussians, widened
 from vvgt_cli.closed_form.surface_offset import flattened, opaque_field, surface_offset
 from vvgt_cli.closed_form.wavelet import box_surrogate
 from vvgt_cli.dvr import render_view
@@ -22,24 +22,6 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume, shapes
-
-
-def test_dilogarithm_known_values() -> None:
-    golden = (math.sqrt(5) - 1) / 2
-    known = {
-        0.0: 0.0,
-        0.5: math.pi**2 / 12 - math.log(2) ** 2 / 2,
-        golden: math.pi**2 / 10 - math.log(golden) ** 2,
-        golden**2: math.pi**2 / 15 - math.log(golden) ** 2,
-    }
-    np.testing.assert_allclose(dilogarithm(np.array(list(known))), list(known.values()), atol=2e-6)
-
-
-def test_dilogarithm_reflection() -> None:
-    """Li2(x) + Li2(1 - x) = pi^2/6 - ln x ln(1 - x)."""
-    x = np.linspace(0.01, 0.99, 997)
-    expected = math.pi**2 / 6 - np.log(x) * np.log1p(-x)
-    np.testing.assert_allclose(dilogarithm(x) + dilogarithm(1 - x), expected, atol=1e-5)
 
 
 def test_dilogarithm_is_the_mass_of_a_splat() -> None:
@@ -92,49 +74,6 @@ def test_rendered_mass(sigma_px: float, peak_depth: float) -> None:
         alpha = render(splat, replace(camera, cx=48 + dx, cy=48 + dy))[..., 3].astype(np.float64)
         measured.append(-np.log1p(-alpha).sum() * pixel**2)
     assert np.mean(measured) == pytest.approx(mass, rel=0.01)
-
-
-def random_rotations(count: int) -> np.ndarray:
-    q, r = np.linalg.qr(np.random.default_rng(1).standard_normal((count, 3, 3)))
-    q *= np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None, :]
-    q[np.linalg.det(q) < 0, :, 0] *= -1
-    return q
-
-
-def half_turns() -> np.ndarray:
-    axes = np.random.default_rng(2).standard_normal((50, 3))
-    axes = np.concatenate([np.eye(3), axes / np.linalg.norm(axes, axis=1, keepdims=True)])
-    return 2 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
-
-
-@pytest.mark.parametrize(
-    "matrices",
-    [random_rotations(2000), half_turns(), np.eye(3)[None], half_turns() @ random_rotations(53) * 1.0],
-    ids=["random", "half turns", "identity", "products"],
-)
-def test_quaternions_round_trip(matrices: np.ndarray) -> None:
-    q = quaternions(matrices)
-    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, rtol=1e-12)
-    np.testing.assert_allclose(rotations(q), matrices, atol=1e-12)
-
-
-def test_quaternions_of_nearly_half_turns() -> None:
-    """Where the trace is -1 the usual formula divides by nothing."""
-    for angle in (math.pi - 1e-9, math.pi - 1e-5, math.pi, math.pi + 1e-7):
-        c, s = math.cos(angle), math.sin(angle)
-        turn = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]]])
-        np.testing.assert_allclose(rotations(quaternions(turn)), turn, atol=1e-12)
-
-
-def test_reflections_describe_the_same_ellipsoid() -> None:
-    axes = random_rotations(100)
-    mirrored = axes * np.random.default_rng(3).choice([-1.0, 1.0], (100, 1, 3))
-    variances = np.array([1.0, 4.0, 9.0])
-    r = rotations(quaternions(mirrored))
-    np.testing.assert_allclose(np.linalg.det(r), 1, rtol=1e-12)
-    np.testing.assert_allclose(
-        (r * variances) @ r.transpose(0, 2, 1), (axes * variances) @ axes.transpose(0, 2, 1), atol=1e-11
-    )
 
 
 def test_make_gaussians_refuses_what_is_not_finite() -> None:

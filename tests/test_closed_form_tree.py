@@ -10,7 +10,7 @@ from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form import visibility as visibility_module
-from vvgt_cli.closed_form.columns import COLOR, COLUMNS, MOMENTS, SEEN
+from vvgt_cli.closed_form.columns import COLOR, COLUMNS, SEEN
 from vvgt_cli.closed_form.moments import base_cells, morton
 from vvgt_cli.closed_form.tree import PLAIN, Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.closed_form.visibility import Visibility, march, visibility
@@ -139,22 +139,6 @@ def test_select_covers_once_within_any_budget(tf) -> None:
         before = len(ids)
     assert select(tree, 1).tolist() == [len(tree) - 1]
     assert before > 0.9 * cells
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_select_covers_once_whatever_the_scores_are(tree: Tree, seed: int) -> None:
-    """Scores of children above their parents': a cell is split only where all above it are."""
-    score = np.random.default_rng(seed).random(len(tree))
-    for budget in (1, 9, 100, 777, len(tree)):
-        ids = select(tree, budget, score)
-        assert 0 < len(ids) <= budget
-        assert (cover(tree, ids) == 1).all()
-    assert len(select(tree, len(tree), score)) == (tree.children == 0).sum()
-
-
-def test_select_uses_the_budget(tree: Tree) -> None:
-    for budget in (50, 500, 1500):
-        assert len(select(tree, budget)) > budget - 8
 
 
 def test_select_splits_where_the_score_is_large(tree: Tree) -> None:
@@ -359,16 +343,6 @@ def test_rays_against_their_twin() -> None:
         np.testing.assert_allclose(sums[0], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_visibility_lookup() -> None:
-    """The grid's cell that holds a cell's middle, or the nearest one."""
-    mean = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
-    seen = Visibility(mean, mean + 100, np.array([2.0, 2.0, 4.0]))
-    index = np.array([[0, 0, 0], [7, 5, 3], [2, 0, 0], [-1, 99, 0], [7, 1, 4]], np.int32)
-    expected = np.array([0, 11, 1, 8, 15], np.float32)
-    np.testing.assert_array_equal(seen.at(index, np.ones(3)), np.stack([expected, expected + 100], 1))
-    np.testing.assert_array_equal(seen.at(np.array([[1, 1, 0]]), np.full(3, 2.0)), [[5, 105]])
-
-
 @pytest.mark.parametrize("dims", [(512, 512, 1), (1024, 700, 1), (3, 256, 256), (96, 96, 96)])
 def test_no_cell_is_lost_between_the_rays(dims: tuple[int, int, int]) -> None:
     """A faint volume is seen everywhere by the default views, however fine its voxels are."""
@@ -389,7 +363,3 @@ def test_detail_energy_reaches_up(tree: Tree) -> None:
     cells = base_cells(scene, np.zeros(3, np.int64))
     blob = build_tree(cells, visibility(scene, cells, default_views("train", 6, size=48)), scene.step)
     assert len(select(blob, 500, detail_energy(blob))) > 200
-
-
-def test_columns() -> None:
-    assert (SEEN, COLUMNS) == (MOMENTS, MOMENTS + 5)

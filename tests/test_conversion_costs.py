@@ -34,7 +34,7 @@ def test_check_views_cost_what_their_blocks_do(scene, size, judged):
 
 
 def test_a_machine_is_as_slow_as_it_draws(scene, monkeypatch):
-    monkeypatch.setattr(case_module, "pace", case_module.pace.__wrapped__)  # without what tests keep of it
+    monkeypatch.setattr(case_module, "pace", case_module.pace.__wrapped__)  # not what this process has measured
     drawn_once = []
     monkeypatch.setattr("vvgt_cli.splat.render", lambda gaussians, camera: drawn_once.append(len(gaussians)))
     monkeypatch.setattr(case_module, "_quickest", lambda call, calls=3: (call(), 3 * case_module.SPLAT)[1])

@@ -14,26 +14,23 @@ from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.plan import Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
-from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.defaults import MAX_STEPS, STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.field.workload import Workload, expected_wide
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.progress import Console
 from vvgt_cli.refine.options import TEXTURE
-from vvgt_cli.score.record import ConversionReport, Run
 
 WORKLOAD = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, base_bytes=2e8)
 FORM = 0.4 + 0.62 + 0.03 * 10.2 + 0.28  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
-POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
 
 
 def plan(steps=None, spent=1.0, begun=False, workload=WORKLOAD, size=48, wide=True, **limits):
@@ -248,14 +245,6 @@ def test_a_network_runs_where_there_is_time_for_it():
     assert "network" in {name for name, _ in short.skipped}
 
 
-def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
-    limits = Limits(time_budget=16.0)
-    alone, after = (Planner(limits, FitOptions(1000, 48, model=model)).plan(WORKLOAD, 1.0) for model in (None, "some"))
-    assert of(after, Network).model == "some"
-    assert 0 < steps_of(after) < steps_of(alone)
-    assert after.seconds <= 16
-
-
 def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, monkeypatch):
     asked = []
 
@@ -370,11 +359,6 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     refused(UsageError, "exists", plan_of, request, Console(quiet=True))
 
 
-def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
-    with pytest.raises(AssertionError, match="before the one that makes them"):
-        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).current()
-
-
 def test_the_default_refines_and_reports_what_it_skipped(tmp_path):
     report = done(tmp_path)
     assert report.refinement["steps"] == STEPS
@@ -393,9 +377,3 @@ def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
     assert stage.psnr < stage.psnr_before
     assert worse.scores["psnr"] == plain.scores["psnr"]
     refused(UsageError, "no such folder", done, tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
-
-
-def test_without_gaussians_views_are_guessed_by_the_budget():
-    assert expected_wide(100_000, 1080)
-    assert not expected_wide(200_000, 1080)
-    assert not expected_wide(100_000, 300)

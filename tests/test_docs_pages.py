@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
-from tests.test_architecture import ROOMS
+from tests.test_architecture import SUBPACKAGES
 from vvgt_cli.commands.main import COMMANDS, cli
 from vvgt_cli.conversion.batch import CANNOT
 
@@ -99,7 +99,7 @@ def test_files_that_contributors_are_sent_to_are_there():
 def test_the_map_for_contributors_has_every_room_in_its_order_and_every_test_file():
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     table = text.partition("## Map of the package")[2].partition("\n\n| where")[0]
-    assert tuple(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?`) \| ", table, re.M)))) == ROOMS
+    assert tuple(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?`) \| ", table, re.M)))) == SUBPACKAGES
     named = {path for name in re.findall(r"`(test_[\w*]+\.py)`", table) for path in ROOT.glob(f"tests/{name}")}
     assert [path.name for path in ROOT.glob("tests/test_*.py") if path not in named] == []
 

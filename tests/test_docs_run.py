@@ -20,10 +20,23 @@ from tests.docs_commands import blocks, small
 from tests.headers import uncertified
 from tests.test_look_formats import mrml
 from tests.vdb_files import plume, vdb
+from vvgt_cli.commands.main import cli
+from vvgt_cli.commands.words import expand
 
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.parametrize("page", ["how-to.md", "tutorial.md"])
+def test_every_command_of_a_page_has_options_that_there_are(folder, page):
+    found = [line for _, block in blocks(ROOT / "docs" / page, "") for line in block.splitlines()]
+    assert len(found) > 6
+    for line in found:
+        with cli.make_context("vvgt", expand(shlex.split(line)[1:])) as context:
+            name, command, words = cli.resolve_command(context, [*context.protected_args, *context.args])
+            command.make_context(name, words, parent=context)
+
+
+@pytest.mark.long
 def test_the_python_page_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "page"}
@@ -37,6 +50,7 @@ def test_the_python_page_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "better.ply").stat().st_size > 68
 
 
+@pytest.mark.long
 def test_the_notebook_runs_and_is_kept_without_outputs(tmp_path):
     import nbformat
     from nbclient import NotebookClient
@@ -119,6 +133,7 @@ def run_blocks(page: str, vvgt) -> list[str]:
     return done
 
 
+@pytest.mark.long
 def test_every_command_of_the_how_to_runs(folder, vvgt):
     done = run_blocks("how-to.md", vvgt)
     assert len(done) > 30
@@ -129,5 +144,6 @@ def test_every_command_of_the_how_to_runs(folder, vvgt):
     assert uncertified(folder / "piped.ply") == uncertified(folder / "dump.ply")
 
 
+@pytest.mark.long
 def test_every_command_of_the_tutorial_runs(folder, vvgt):
     assert len(run_blocks("tutorial.md", vvgt)) > 6

@@ -9,11 +9,9 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layout import BRICK
-from vvgt_cli.dvr.reference import march
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
-from vvgt_cli.look.function import ColorMap, PiecewiseOpacity
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
@@ -107,45 +105,6 @@ def test_a_homogeneous_slab_is_exact_at_any_step(depth, step):
     image = render_view(scene, camera(1, 1, (5, 0, 0)), RenderSettings(step=step, samples=1))
     alpha = -math.expm1(-depth)
     np.testing.assert_allclose(image[0, 0], np.array([1, 0.5, 0.25, 1]) * alpha, rtol=2e-7)
-
-
-@pytest.mark.parametrize("step", [0.25, 0.5])
-def test_a_linear_ramp_of_extinction_is_exact_at_steps_that_meet_the_voxels(step):
-    n, peak = 9, 0.3
-    volume = Volume(np.broadcast_to(np.linspace(0, 1, n), (n, n, n)).copy())
-    scene = Scene.build(volume, LinearExtinction(peak), 1.0)
-    depth = peak * (0.5 * (n - 1) + 0.5)  # the ramp between the centres, and the rim of value 1; voxels of edge 1
-    image = render_view(scene, camera(1, 1, (-5, 0, 0)), RenderSettings(step=step, samples=1))
-    assert abs(image[0, 0, 3] + math.expm1(-depth)) < 1e-6
-    twin = march(scene, np.array([-5.0, 0, 0]), np.array([[1.0, 0, 0]]), step)[0]
-    assert twin[3] == pytest.approx(-math.expm1(-depth), abs=1e-12)
-    np.testing.assert_allclose(image[0, 0, :3], image[0, 0, 3] * np.array([1, 0.5, 0.25]), rtol=1e-6)
-
-
-def test_the_optical_depth_of_a_gaussian_blob_comes_with_the_square_of_the_voxel():
-    sigma, peak, errors, sizes = 0.25, 4.0, [], (16, 32, 64)
-    exact = peak * sigma * math.sqrt(2 * math.pi) * math.erf(1 / (sigma * math.sqrt(2)))
-    for n in sizes:
-        at = (np.arange(n) + 0.5) * 2 / n - 1
-        z, y, x = np.meshgrid(at, at, at, indexing="ij")
-        volume = Volume(np.exp(-(x * x + y * y + z * z) / (2 * sigma**2)), (2 / n, 2 / n, 2 / n))
-        scene = Scene.build(volume, LinearExtinction(peak), 1.0, bins=4096)
-        image = render_view(scene, camera(1, 1, (5, 0, 0)), RenderSettings(step=0.25, samples=1))
-        errors.append(abs(-math.log1p(-float(image[0, 0, 3])) - exact))
-    order = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
-    assert abs(order - 2) < 0.2  # of trilinear interpolation
-    # The ray passes half-way between four columns: h^2 / 8 of the second derivative -1 / sigma^2 across, twice.
-    assert errors[-1] == pytest.approx(exact * (2 / 64) ** 2 / 8 * 2 / sigma**2, rel=0.05)
-
-
-def test_the_order_of_convergence_in_the_step_is_two():
-    scene = Scene.build(Volume(smooth(12)), Function([0, 1], [0, 0.5], [[0, 0, 1], [1, 0, 0]]), 1.0)
-    exact = render_view(scene, camera(), RenderSettings(step=1 / 256, samples=1)).astype(float)
-    steps = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])
-    errors = [
-        np.sqrt(np.mean((render_view(scene, camera(), RenderSettings(step=s, samples=1)) - exact) ** 2)) for s in steps
-    ]
-    assert abs(np.polyfit(np.log(steps), np.log(errors), 1)[0] - 2) < 0.2
 
 
 def test_opacity_one_is_capped_so_that_it_has_a_limit():
@@ -248,15 +207,6 @@ def test_leaping_across_the_corner_of_a_visible_brick_keeps_the_segment_between(
         assert off.sum() <= 2  # finer samples on the very edge of what is not finite
 
 
-@pytest.mark.parametrize("value", [0.0, 0.5, 7.0])
-def test_a_constant_volume_takes_one_value_of_the_function(value):
-    scene = Scene.build(Volume(np.full((4, 4, 4), value)), RAINBOW, 1.0)
-    image = render_view(scene, camera(1, 1, (5, 0, 0)), ONE_RAY)
-    expected = 1 - (1 - RAINBOW.opacity(value)) ** 4
-    np.testing.assert_allclose(image[0, 0, 3], expected, atol=1e-6)
-    np.testing.assert_allclose(image[0, 0, :3], expected * RAINBOW.color(np.array([value]))[0], atol=1e-5)
-
-
 @pytest.mark.parametrize("samples", [2, 3])
 def test_grids_of_rays_average(samples):
     scene = Scene.build(Volume(smooth(10)), Function([0, 0.5, 0.51, 1], [0, 0, 0.5, 0.5]), 1.0)
@@ -343,13 +293,3 @@ def test_a_step_of_1_is_a_step_of_one_point_zero_to_the_compiler():
 def test_settings_are_checked(options):
     with pytest.raises(UsageError, match="expected"):
         RenderSettings(**options)
-
-
-def test_the_package_functions_render_too():
-    from vvgt_cli.look.function import TransferFunction
-
-    opacity = PiecewiseOpacity(np.array([0.0, 1.0]), np.array([0.0, 0.5]))
-    colors = ColorMap(np.array([0.0, 1.0]), np.array([[0.0, 0, 1], [1, 0, 0]]))
-    scene = Scene.build(Volume(smooth(8)), TransferFunction("t", opacity, colors), 1.0)
-    image = render_view(scene, camera(), FINE)
-    np.testing.assert_allclose(image, render_view_reference(scene, camera(), step=1 / 32), atol=1e-3)

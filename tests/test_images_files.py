@@ -8,7 +8,7 @@ import pytest
 
 from tests.refused import refused
 from vvgt_cli.cameras.sets import default_views
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_exr, read_png, write_exr, write_png
 
 
@@ -123,25 +123,6 @@ def _decode(path):
 def test_png_clips_and_survives_nan(tmp_path):
     write_png(tmp_path / "a.png", np.array([[[-1.0, 2.0, np.nan]]]))
     assert read_png(tmp_path / "a.png").tolist() == [[[0, 1, 0]]]
-
-
-def test_same_image_same_bytes(tmp_path):
-    for name in ("a", "b"):
-        write_png(tmp_path / f"{name}.png", rgba())
-        write_exr(tmp_path / f"{name}.exr", rgba())
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
-
-
-@pytest.mark.parametrize(("name", "write"), [("a.png", write_png), ("a.exr", write_exr)])
-def test_nothing_is_replaced_unasked(tmp_path, name, write):
-    path = tmp_path / name
-    path.write_text("mine")
-    refused(UsageError, "--overwrite", write, path, rgba())
-    assert path.read_text() == "mine"
-    write(path, rgba(), overwrite=True)
-    assert path.read_bytes()[:4] != b"mine"
-    assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (0, 4, 4), (4, 4, 5)])

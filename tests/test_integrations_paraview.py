@@ -23,7 +23,7 @@ from vvgt_cli.integrations import command, paraview_job, paraview_view
 from vvgt_cli.splat import render
 
 ROOT = Path(__file__).parent.parent
-ROOM = ROOT / "vvgt_cli" / "integrations"
+ADAPTERS = ROOT / "vvgt_cli" / "integrations"
 STARTS = f"env PYTHONPATH={ROOT} NUMBA_NUM_THREADS=1 {sys.executable} -m vvgt_cli.commands.main"
 SYSTEM = "/usr/bin/python3"
 MPI = ("mpirun", "--allow-run-as-root", "--oversubscribe", "--mca", "mpi_yield_when_idle", "1", "-n", "2")
@@ -55,7 +55,7 @@ def paraview(
 
     found("pvpython")
     picture, script = name.with_name("view.png"), ROOT / "tests" / "paraview_script.py"
-    said = run(*by, script, ROOM / "paraview_plugin.py", volume, picture, name, *given, DISPLAY=display, **more)
+    said = run(*by, script, ADAPTERS / "paraview_plugin.py", volume, picture, name, *given, DISPLAY=display, **more)
     return np.asarray(Image.open(picture).convert("RGB")), said
 
 
@@ -124,7 +124,7 @@ def test_a_simulation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         with monkeypatch.context() as stubs:
             for key, module in modules.items():
                 stubs.setitem(sys.modules, key, module)
-            runpy.run_path(str(ROOM / "catalyst.py"))["catalyst_execute"](step)
+            runpy.run_path(str(ADAPTERS / "catalyst.py"))["catalyst_execute"](step)
     assert ["a place for the step" in heard[0], "'step'" in heard[1], "No such file" in heard[2]] == [True] * 3
     assert len(heard) == 3
 
@@ -228,7 +228,7 @@ def test_two_ranks_leave_one_file_a_time_step(program: tuple[str, ...], tmp_path
         pytest.skip(f"{SYSTEM} has no paraview or no mpi4py (Debian: python3-paraview, python3-mpi4py)")
     script = ROOT / "tests" / "catalyst_simulation.py"
     settings = {"VVGT_OUTPUT": str(tmp_path / "dye_{:02d}.ply"), "VVGT_TF": "viridis", "VVGT_GAUSSIANS": "3000"}
-    said = run(*MPI, *program, script, ROOM / "catalyst.py", 2, 40, tmp_path / "whole.vti", **settings)
+    said = run(*MPI, *program, script, ADAPTERS / "catalyst.py", 2, 40, tmp_path / "whole.vti", **settings)
     print(re.search("simulation .*", said))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dye_00.ply", "dye_01.ply", "whole.vti"]
     words = ["init", str(tmp_path / "whole.vti"), "-o", str(tmp_path / "one.ply"), "--tf", "viridis", "--quiet"]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.endings import LISTS, written
 from vvgt_cli.commands.plugin import FOLDER, PLUGINS, plugin
 
 ROOT = Path(__file__).parents[1]
@@ -40,3 +41,8 @@ def test_adapters_are_listed_and_packaged() -> None:
     packaged = {path for pattern in data["vvgt_cli.integrations"] for path in FOLDER.glob(pattern)}
     assert set(beside) <= packaged
     assert FOLDER / "blender" / "gaussian_splats" / "blender_manifest.toml" in packaged
+
+
+@pytest.mark.parametrize("row", LISTS, ids=lambda row: row[0])
+def test_endings_in_other_programs_are_those_of_the_table(row) -> None:
+    assert written(*row) == (ROOT / row[0]).read_text("utf-8"), "make formats"

@@ -271,17 +271,6 @@ def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goe
     assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.5)
 
 
-def test_what_a_kernel_reaches():
-    from vvgt_cli.closed_form.quadrature import block_moments
-    from vvgt_cli.jit.cache import reached
-    from vvgt_cli.splat.tiles import blend
-
-    modules, constants = reached(blend.py_func)
-    assert "vvgt_cli.splat.tiles" in modules
-    assert {"TILE = 16", "HALF = np.float32(0.5)"} <= constants
-    assert {"vvgt_cli.closed_form.quadrature", "vvgt_cli.dvr.kernel"} <= reached(block_moments.py_func)[0]
-
-
 @pytest.fixture(scope="module")
 def stepped(tmp_path_factory):
     """What `STEP` prints, and the folder that it leaves; to be copied."""

@@ -244,10 +244,8 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     (tmp_path / "one.json").write_text(json.dumps({"1": {"name": "one", "color": "#ffffff"}}))
     for more, code, said in (
         (("--tf", "viridis"), 2, "replace --tf by --labels"),
-        (("--tf-range", "0,1"), 2, "replace --tf-range by --labels"),
         (("--labels", tmp_path / "t.json"), 1, "none of its labels is visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
-        (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):
         assert said in vvgt.fails(code, "recolor", label_file, *more, "-o", tmp_path / "a.ply")
     done = vvgt.fails(2, "render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")

@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
 from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
 
 from tests.refused import refused
-from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.errors import DataError
 from vvgt_cli.look import read_transfer_function, unit_distance
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.volume import Volume
@@ -244,35 +243,20 @@ def test_inviwo_mask_and_data_values(file) -> None:
     ("content", "name", "message"),
     [
         ("1\n1\n0.9\n", "a.vp", r"3 lines of numbers; expected the nine"),
-        (vp().replace("8 -3024", "9 -3024"), "a.vp", "8 numbers after the count 9"),
         (vp().replace("-86.9", "x"), "a.vp", "scalar opacity: .*expected finite numbers"),
         (vp().replace("0.6", "1.6"), "a.vp", r"opacity 1\.6; expected a number in"),
         ({"volumeProperties": []}, "a.vp.json", "expected a list of objects with components"),
         (vp_json(scalarOpacity=3), "a.vp.json", "scalarOpacity; expected an object with points"),
         (vp_json(scalarOpacityUnitDistance=0), "a.vp.json", "unit distance 0"),
-        (vp_json(rgbTransferFunction={"hsvWrap": "no", "points": [{"x": 0, "color": [1, 0, 0]}]}), "a.vp.json",
-         "hsvWrap: 'no'; expected true or false"),
-        ({"scalarOpacity": 1, "colorTransfer": 2}, "a.json", "expected text, a count and numbers"),
-        (XML.format(space="Hue"), "a.xml", "ColorSpace 'Hue'"),
         (XML.format(space="RGB").replace('"false"', '"true"'), "a.xml", "indexed colour map"),
-        (XML.format(space="RGB").replace('x="0.5"', 'x="half"'), "a.xml", "fire: point x: 'half'"),
-        ("<ColorMaps><ColorMap name='a' space='RGB'>", "a.xml", "damaged XML"),
         ("<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "a.xml", "declares entities"),
         ("<svg/>", "a.xml", "not a transfer function"),
         (ITF.format(lo=0.9, hi=0.1, type=0), "a.itf", "mask from 0.9 to 0.1"),
-        (ITF.format(lo=0, hi=1, type=0).replace('<pos content="0.25" />', ""), "a.itf", "1 positions and 2 colours"),
-        (ITF.format(lo=0, hi=1, type=0).replace('content="0.25"', 'content="-1"'), "a.itf", "expected x in"),
     ],
 )  # fmt: skip
 def test_faulty_files_are_one_clear_line(file, content, name: str, message: str) -> None:
     path = file(content, name)
     assert path in refused(DataError, message, read_transfer_function, path)
-
-
-def test_presets_that_do_not_exist(file) -> None:
-    for content, name in ((vp(), "a.vp"), (vp_json(), "b.json"), (ITF.format(lo=0, hi=1, type=0), "c.itf")):
-        with pytest.raises(DataError, match="no presets; omit #x"):
-            read_transfer_function(file(content, name) + "#x")
 
 
 @pytest.mark.parametrize("form", ["minimal", "paraview"])
@@ -355,10 +339,7 @@ def test_info_tells_functions_from_volumes(vvgt, file) -> None:
         assert "of no known format" not in vvgt.fails(1, "info", file(content, name))
 
 
-def test_errors_are_ours(file) -> None:
-    """Cut at every length, each form ends in one of our errors or is read."""
-    for content, name in ((vp(), "a.vp"), (json.dumps(vp_json()), "b.json"), (ITF.format(lo=0, hi=1, type=0), "c.itf")):
-        for cut in range(1, len(content), 7):
-            path = file(content[:cut], name)
-            with suppress(VvgtError):
-                assert read_transfer_function(path).breakpoints().size
+def test_presets_that_do_not_exist(file) -> None:
+    for content, name in ((vp(), "a.vp"), (vp_json(), "b.json"), (ITF.format(lo=0, hi=1, type=0), "c.itf")):
+        with pytest.raises(DataError, match="no presets; omit #x"):
+            read_transfer_function(file(content, name) + "#x")

@@ -1,15 +1,12 @@
 """Transfer-function files and names: what they become, and one clear line for what they are not."""
 
 import json
-from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.refused import refused
-from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look import read_transfer_function
 
 PRESET = {
@@ -95,19 +92,12 @@ def test_log_scale_is_kept(file):
     [
         ({"RGBPoints": None}, "categorical preset"),
         ({"RGBPoints": [0, 1, 1]}, r"RGBPoints: a list of 3; expected a flat list of x, r, g, b"),
-        ({"RGBPoints": []}, "RGBPoints: a list of 0"),
         ({"RGBPoints": [0, 1, 2, 0]}, "colour 2; expected a number in"),
         ({"RGBPoints": [0, 1, "1", 0]}, r"RGBPoints\[2\]: '1'; expected a number"),
-        ({"RGBPoints": [0, 1, True, 0]}, r"RGBPoints\[2\]: True"),
-        ({"Points": [0, 1, 0.5]}, "Points: a list of 3"),
         ({"Points": [0, float("nan"), 0.5, 0]}, r"Points\[1\]: nan; expected a finite"),
-        ({"Points": [float("inf"), 1, 0.5, 0]}, "finite"),
         ({"Points": [0, 1.5, 0.5, 0]}, r"opacity 1\.5"),
-        ({"Points": [0, 1, -0.5, 0]}, r"midpoint -0\.5"),
-        ({"Points": "none"}, "Points: 'none'"),
         ({"Points": [10**400, 1, 0.5, 0]}, "finite"),
         ({"ColorSpace": "XYZ"}, "ColorSpace 'XYZ'; expected one of RGB"),
-        ({"NanColor": [1, 2]}, "NanColor"),
         ({"NanColor": [1, 2, 3]}, "NanColor"),
     ],
 )
@@ -139,22 +129,14 @@ def test_minimal_json_on_percentiles(file):
     ("fields", "message"),
     [
         ({"points": []}, "expected a list of objects"),
-        ({"points": [1]}, "expected a list of objects"),
         ({"points": [{"x": 1}]}, r"points\[0\]: has x; expected x with rgb or opacity"),
-        ({"points": [{"rgb": [0, 0, 0]}]}, r"points\[0\]: has rgb"),
         ({"points": [{"x": 1, "opacity": 1}]}, "no point has rgb"),
         ({"points": [{"x": 1, "rgb": [1, 1, 1]}]}, "no point has opacity"),
-        ({"points": [{"x": 1, "rgb": [1, 1], "opacity": 1}]}, r"points\[0\]\.rgb"),
         ({"points": [{"x": 1, "rgb": [1, 1, 1], "alpha": 1}]}, "unknown key 'alpha'"),
-        ({"points": [{"x": None, "rgb": [1, 1, 1], "opacity": 1}]}, r"points\[0\]\.x: None"),
-        ({"points": [{"x": 1, "rgb": [1, 1, 1], "opacity": 2}]}, "opacity 2"),
         ({"range": [1, 1]}, "expected lo below hi"),
-        ({"range": "all"}, r"range 'all'; expected \[lo, hi\]"),
         ({"range": [0, 1]}, "with a range expected x in"),
         ({"range": "percentile"}, "expected x in"),
         ({"opacity_unit_distance": 0}, "unit distance 0"),
-        ({"opacity_unit_distance": "paraview"}, "opacity_unit_distance: 'paraview'"),
-        ({"color_space": "CMYK"}, "colour space 'CMYK'"),
         ({"rnage": [0, 1]}, "unknown key 'rnage'; expected color_space"),
     ],
 )
@@ -169,8 +151,6 @@ def test_faulty_minimal_files_are_one_clear_line(file, fields, message):
         ("", "not JSON"),
         ("{'a': 1}", "not JSON .line 1, column 2"),
         ("[]", "not a transfer function"),
-        ("3", "not a transfer function"),
-        ('{"a": 1.5}', "not a transfer function"),
         ("[" * 100_000, "not JSON|too deep"),
         ("1" * 10_000, "too long"),
     ],
@@ -213,46 +193,10 @@ def test_colormap_names():
     [
         ("virids", "neither a file, a name of 'vvgt tf list' nor a matplotlib colour map; did you mean viridis"),
         ("", "an empty name"),
-        ("viridis:1", "expected NAME"),
         ("viridis:a,b", "expected NAME"),
         ("viridis:0.8,0.2", r"ramp 0\.8 to 0\.2"),
-        ("viridis:0,1:0", "up to 0"),
-        ("viridis:nan,1", "ramp nan"),
-        ("viridis:0,1:0.5:3", "expected NAME"),
-        ("no/such/file", "no such file"),
         ("preset.json#x", "no such file"),
     ],
 )
 def test_bad_names_are_usage_errors(source, message):
     refused(UsageError, message, read_transfer_function, source)
-
-
-JSON_VALUES = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=5)
-        | st.dictionaries(st.sampled_from([*PRESET, *MINIMAL, "x", "rgb"]), inner, max_size=4)
-    ),
-    max_leaves=12,
-)
-
-
-@given(key=st.sampled_from([*PRESET, *MINIMAL, "range"]), value=JSON_VALUES, base=st.sampled_from([PRESET, MINIMAL]))
-def test_any_field_may_hold_anything(tmp_path_factory, key, value, base):
-    path = tmp_path_factory.mktemp("tf") / "a.json"
-    path.write_text(json.dumps({**base, key: value}))
-    tf = None
-    with suppress(VvgtError):  # any other exception fails
-        tf = read_transfer_function(str(path))
-    if tf is None:
-        return
-    opacity = tf.opacity(np.linspace(-10, 110, 20))
-    assert ((opacity >= 0) & (opacity <= 1)).all()
-
-
-@given(data=st.binary(max_size=60))
-def test_any_bytes_are_read_or_refused(tmp_path_factory, data):
-    path = tmp_path_factory.mktemp("tf") / "a.json"
-    path.write_bytes(data)
-    with pytest.raises(DataError):
-        read_transfer_function(str(path))

@@ -9,7 +9,6 @@ import pytest
 import vvgt_cli
 from tests.processes import replaced
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.images import read_exr, read_png
 
 nib = pytest.importorskip("nibabel")
@@ -70,31 +69,22 @@ def at(data, monkeypatch):
     return data
 
 
-# name: (volume, options); all of `convert`, to one .ply
-ROWS = {
-    "function": ("scalars.nii", ("--tf", "tf.json")),
-    "no function": ("scalars.nii", ()),
-    "directions": ("scalars.nii", ("--tf", "tf.json", "--light", "1,1,2", "--light", "left")),
-    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows", "--ambient-occlusion", "0.3")),
-    "labels": ("labels.nii", ("--labels", "auto")),  # lit by default
-    "recognised labels, uniform": ("labels.nii", ("--init", "uniform")),
-    "layers": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto")),
-    "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
-    "colours": ("rgb_0.tif", ()),
-    "colours, lit": ("rgb_0.tif", ("--light", "headlight")),
-    "channels": ("rgb_0.tif", ("--component", "all")),
-    "a channel, few steps": ("rgb_0.tif", ("--component", "0", "--steps", "12")),
-    "time, no steps": ("four.nii", ("--time", "1", "--tf", "tf.json", "--steps", "0")),
-    "crop, size": ("scalars.nii", ("--tf", "tf.json", "--crop", "3:28,:,2:", "--max-size", "0.05")),
-    "mask, rule": ("scalars.nii", ("--tf", "tf.json", "--mask", "mask.nii", "--rule", "playcanvas")),
-    "masked labels, unlit": ("labels.nii", ("--labels", "auto", "--mask", "mask.nii", "--light", "none")),
-    "world": ("scalars.nii", ("--tf", "tf.json", "--target-psnr", "35", "--frame", "world", "--up", "superior")),
-    "wavelet, lit": (
+# a row for each kind of kernel: rays and moments of a function or of a grid, with light or without
+ROWS = {  # name: (volume, options); all of `convert`, to one .ply
+    "function, cropped and masked": (
         "scalars.nii",
-        ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight", "--sh-degree", "3"),
+        ("--tf", "tf.json", "--crop", "3:28,:,2:", "--max-size", "0.05", "--mask", "mask.nii", "--rule", "playcanvas"),
+    ),
+    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows", "--ambient-occlusion", "0.3")),
+    "colours in the world": ("rgb_0.tif", ("--target-psnr", "35", "--frame", "world", "--up", "z")),
+    "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
+    "wavelet, lit, of a time step": (
+        "four.nii",
+        ("--time", "1", "--tf", "tf.json", "--init", "wavelet", "--light", "headlight", "--sh-degree", "3"),
     ),
     "model, lit by the function": ("scalars.nii", ("--tf", "lit.json", "--model", "vvgt-small")),
 }
+LONG = list(ROWS)[-2:]
 
 
 def converted(vvgt, volume, options, out: Path, *more):
@@ -104,36 +94,24 @@ def converted(vvgt, volume, options, out: Path, *more):
     return json.loads(report.read_text())
 
 
-@pytest.fixture(scope="module")
-def blocks_of_16(tmp_path_factory):
-    """Rows in blocks of 16, each converted once: (report, bytes) by row."""
-    kept, folder = {}, tmp_path_factory.mktemp("blocks")
-
-    def convert(vvgt, row):
-        if row not in kept:
-            out = folder / "x.ply"
-            kept[row] = converted(vvgt, *ROWS[row], out, *BLOCKS), out.read_bytes()
-            assert sorted(path.name for path in folder.iterdir()) == ["x.ply", "x.report.json"]
-        return kept[row]
-
-    return convert
-
-
-@pytest.mark.parametrize("row", ROWS)
-def test_a_feature_works_in_memory_and_in_blocks_and_errors_agree(vvgt, at, tmp_path, blocks_of_16, row):
+@pytest.mark.parametrize("row", [pytest.param(row, marks=[pytest.mark.long] * (row in LONG)) for row in ROWS])
+def test_memory_and_blocks_of_any_size_agree(vvgt, at, tmp_path, row):
     memory = converted(vvgt, *ROWS[row], tmp_path / "memory.ply")
-    blocks, _ = blocks_of_16(vvgt, row)
+    blocks = converted(vvgt, *ROWS[row], tmp_path / "16.ply", *BLOCKS)
     assert abs(memory["scores"]["psnr"] - blocks["scores"]["psnr"]) <= AGREE
     assert abs(memory["conditions"][0]["psnr"] - blocks["conditions"][0]["psnr"]) <= CLOSER
     assert memory["scores"]["psnr"] > 20
     assert [stage["name"] for stage in memory["stages"] if stage["name"] not in ("scene", "compile")] == [
         stage["name"] for stage in blocks["stages"] if stage["name"] != "compile"
     ]
+    more = ("--workers", "2") if row == "shadows" else ()
+    converted(vvgt, *ROWS[row], tmp_path / "32.ply", "--blocks", "32", *more)
+    assert (tmp_path / "16.ply").read_bytes() == (tmp_path / "32.ply").read_bytes()
+    assert not [path for path in tmp_path.iterdir() if path.suffix not in (".ply", ".json")]
 
 
-@pytest.mark.parametrize("row", ["directions", "layers"])
-def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, row):
-    volume, options = ROWS[row]
+def test_pictures_and_scores_of_a_file_are_the_same_in_memory_and_in_blocks(vvgt, at, tmp_path):
+    volume, options = ROWS["layers, lit"]
     vvgt.ok("init", volume, *options, *FEWEST[:4], "-o", tmp_path / "a.ply")
     shared = ("evaluate", tmp_path / "a.ply", "--volume", volume, *options, "--step", "1", "--json")
     memory, blocks = (json.loads(vvgt(*shared, *more).out) for more in ((), BLOCKS))
@@ -142,113 +120,66 @@ def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, 
     for one, other in zip(memory["conditions"], blocks["conditions"], strict=True):
         assert one["psnr"] == pytest.approx(other["psnr"], abs=CLOSER)
     assert memory["texture"] == pytest.approx(blocks["texture"], abs=0.05, nan_ok=True)
-
-
-FEW = ("function", "shadows", "labels", "layers, lit", "colours", "masked labels, unlit", "wavelet, lit")
-
-
-@pytest.mark.parametrize("row", [row if row in FEW else pytest.param(row, marks=pytest.mark.long) for row in ROWS])
-def test_the_bytes_do_not_depend_on_the_blocks(vvgt, at, tmp_path, blocks_of_16, row):
-    _, expected = blocks_of_16(vvgt, row)
-    for blocks in (("32",), ("16", "--workers", "2")) if row == FEW[0] else (("32",),):
-        out = tmp_path / f"{'-'.join(blocks)}.ply"
-        converted(vvgt, *ROWS[row], out, "--blocks", *blocks)
-        assert out.read_bytes() == expected
-
-
-@pytest.mark.parametrize("ending", SUFFIXES[1:])
-def test_every_format_in_blocks(vvgt, at, tmp_path, ending):
-    found = vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *FEWEST, *BLOCKS, "-o", tmp_path / f"x{ending}")
-    assert "the format costs" in found.err
-    assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
-
-
-@pytest.mark.parametrize("blocks", [(), BLOCKS], ids=["memory", "blocks"])
-class TestEitherWay:
-    """What has no error of its own to compare."""
-
-    def test_preview_and_checkpoint(self, vvgt, at, tmp_path, blocks):
-        more = ("-o", tmp_path / "x.ply", "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept")
-        vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, *more)
-        picture = read_png(tmp_path / "x.png")
-        assert picture.shape[:2] == (3 * 64, 3 * 64)
-        assert picture[:, :64].max() > 0.5
-        assert np.abs(picture[:, :64] - picture[:, 64:128]).mean() < 0.02
-
-    def test_time_budget_and_dry_run(self, vvgt, at, tmp_path, blocks):
-        base = ("convert", "scalars.nii", "--tf", "tf.json", *FEWEST[:4], *blocks)
-        vvgt.ok(*base, "--time-budget", "60", "-o", tmp_path / "x.ply")
-        assert b"closed form" in vvgt.ok(*base, "--dry-run", "-o", tmp_path / "y.ply").out
-        assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]
-
-    def test_several_functions(self, vvgt, at, tmp_path, blocks):
-        both = ("--tf", "tf.json", "--tf", "other.json")
-        vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
-        vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *blocks, "-o", tmp_path / "x.html")
-        names = ["x.html", "x_index.json", "x_other.ply", "x_tf.ply"]
-        assert sorted(path.name for path in tmp_path.iterdir()) == names
-        rows = json.loads((tmp_path / "x_index.json").read_text())["files"]
-        assert [(row["name"], row["file"]) for row in rows] == [("tf", "x_tf.ply"), ("other", "x_other.ply")]
-
-    @pytest.mark.parametrize(
-        ("volume", "options"),
-        [
-            ("four.nii", ("--tf", "tf.json")),
-            ("four.nii", ("--tf", "tf.json", "--light", "headlight")),
-            ("labels_*.nii", ("--labels", "auto")),
-            ("rgb_*.tif", ()),
-        ],
-        ids=["scalars", "lit", "labels", "colours"],
-    )
-    def test_a_series(self, vvgt, at, tmp_path, blocks, volume, options):
-        vvgt.ok("convert", volume, *options, *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
-        assert {"x_0.ply", "x_1.ply"} <= {path.name for path in tmp_path.iterdir()}
-        index = json.loads((tmp_path / "x_index.json").read_text())
-        assert [(row["frame"], row["file"], row["psnr"] > 15) for row in index["files"]] == [
-            (0, "x_0.ply", True), (1, "x_1.ply", True)
-        ]  # fmt: skip
-
-    def test_a_series_as_a_page(self, vvgt, at, tmp_path, blocks):
-        vvgt.ok("convert", "four.nii", "--tf", "tf.json", *FEWEST, *blocks, "-o", tmp_path / "x.html")
-        assert [path.name for path in tmp_path.iterdir()] == ["x.html"]
-
-    def test_labels_one_by_one(self, vvgt, at, tmp_path, blocks):
-        vvgt.ok("convert", "labels.nii", "--split-labels", *FEWEST, *blocks, "-o", tmp_path / "x_{}.ply")
-        index = json.loads((tmp_path / "x_index.json").read_text())
-        assert [row["label"] for row in index["files"]] == [1, 2, 3]
-
-    @pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours", "layers", "wavelet, lit"])
-    def test_the_closed_form_alone(self, vvgt, at, tmp_path, blocks, row):
-        volume, options = ROWS[row]
-        fit = FEWEST[:4]
-        vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
-        vvgt.ok("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz")
-        assert len(vvgt_cli.read_ply(tmp_path / "x.spz")[0]) == len(vvgt_cli.read_ply(tmp_path / "x.ply")[0])
-
-    def test_the_closed_form_alone_under_the_light_of_the_functions_file(self, vvgt, at, tmp_path, blocks):
-        base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)
-        vvgt.ok(*base, "-o", tmp_path / "x.ply")
-        assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
-        vvgt.ok(*base, "-o", tmp_path / "y" / "lod-meta.json")
-        vvgt.ok(*base, "--light", "none", "-o", tmp_path / "z" / "lod-meta.json")
-        lit, plain = (vvgt_cli.read_ply(tmp_path / name / "lod-meta.json")[0] for name in "yz")
-        assert np.abs(lit.colors.mean(axis=0) - plain.colors.mean(axis=0)).max() > 0.05
-
-    @pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours"])
-    def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
-        volume, options = ROWS[row]
-        vvgt.ok("render-views", volume, *options, *blocks, "--views 3 --test-views 1 --size 48 -o", tmp_path / "views")
-        assert [path.name for path in tmp_path.iterdir()] == ["views"]
-
-
-@pytest.mark.parametrize("row", ["function", "shadows", "labels", "colours"])
-def test_pictures_of_blocks_are_those_of_memory(vvgt, at, tmp_path, row):
-    volume, options = ROWS[row]
-    for name, blocks in (("memory", ()), ("blocks", BLOCKS)):
+    for name, how in (("memory", ()), ("blocks", BLOCKS)):
         few = ("--views", "2", "--test-views", "1", "--size", "48")
-        vvgt.ok("render-views", volume, *options, *blocks, *few, "-o", tmp_path / name)
+        vvgt.ok("render-views", volume, *options, *how, *few, "-o", tmp_path / name)
     for path in sorted((tmp_path / "memory").glob("t*/*.exr")):
         one, other = (read_exr(tmp_path / name / path.parent.name / path.name)[0] for name in ("memory", "blocks"))
         assert one.max() > 0.3
         np.testing.assert_allclose(one, other, atol=2e-3)
         assert np.abs(one - other).mean() < 1e-4
+
+
+def test_preview_and_checkpoint(vvgt, at, tmp_path):
+    more = ("-o", tmp_path / "x.ply", "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept")
+    vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *BLOCKS, *more)
+    picture = read_png(tmp_path / "x.png")
+    assert picture.shape[:2] == (3 * 64, 3 * 64)
+    assert picture[:, :64].max() > 0.5
+    assert np.abs(picture[:, :64] - picture[:, 64:128]).mean() < 0.02
+
+
+@pytest.mark.long
+def test_time_budget_and_dry_run(vvgt, at, tmp_path):
+    base = ("convert", "scalars.nii", "--tf", "tf.json", *FEWEST[:4], *BLOCKS)
+    vvgt.ok(*base, "--time-budget", "60", "-o", tmp_path / "x.ply")
+    assert b"closed form" in vvgt.ok(*base, "--dry-run", "-o", tmp_path / "y.ply").out
+    assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]
+
+
+@pytest.mark.long
+def test_several_functions(vvgt, at, tmp_path):
+    both = ("--tf", "tf.json", "--tf", "other.json")
+    vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *BLOCKS, "-o", tmp_path / "x_{}.ply")
+    vvgt.ok("convert", "scalars.nii", *both, *FEWEST, *BLOCKS, "-o", tmp_path / "x.html")
+    names = ["x.html", "x_index.json", "x_other.ply", "x_tf.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+@pytest.mark.parametrize(
+    ("volume", "options"), [("four.nii", ("--tf", "tf.json", "--light", "headlight")), ("labels_*.nii", ())]
+)
+def test_a_series(vvgt, at, tmp_path, volume, options):
+    vvgt.ok("convert", volume, *options, *FEWEST, *BLOCKS, "-o", tmp_path / "x_{}.ply")
+    assert {"x_0.ply", "x_1.ply"} <= {path.name for path in tmp_path.iterdir()}
+    index = json.loads((tmp_path / "x_index.json").read_text())
+    assert [(row["frame"], row["file"], row["psnr"] > 15) for row in index["files"]] == [
+        (0, "x_0.ply", True), (1, "x_1.ply", True)
+    ]  # fmt: skip
+
+
+@pytest.mark.long
+def test_a_page_of_a_series_and_files_of_labels(vvgt, at, tmp_path):
+    vvgt.ok("convert", "four.nii", "--tf", "tf.json", *FEWEST, *BLOCKS, "-o", tmp_path / "x.html")
+    vvgt.ok("convert", "labels.nii", "--split-labels", *FEWEST, *BLOCKS, "-o", tmp_path / "x_{}.ply")
+    index = json.loads((tmp_path / "x_index.json").read_text())
+    assert [row["label"] for row in index["files"]] == [1, 2, 3]
+
+
+def test_the_closed_form_alone_under_the_light_of_the_functions_file(vvgt, at, tmp_path):
+    base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *BLOCKS)
+    for name, more in (("x.ply", ()), ("y/lod-meta.json", ()), ("z/lod-meta.json", ("--light", "none"))):
+        vvgt.ok(*base, *more, "-o", tmp_path / name)
+    assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
+    lit, plain = (vvgt_cli.read_ply(tmp_path / name / "lod-meta.json")[0] for name in "yz")
+    assert np.abs(lit.colors.mean(axis=0) - plain.colors.mean(axis=0)).max() > 0.05

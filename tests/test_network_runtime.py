@@ -13,7 +13,7 @@ from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.network import runtime
 from vvgt_cli.network.card import CARD, find_model, read_card
-from vvgt_cli.network.prepare import pack, prepare
+from vvgt_cli.network.prepare import pack
 
 STEP = np.arange(14) * 0.01
 
@@ -70,15 +70,6 @@ def test_output_that_is_not_finite_is_an_error(tmp_path):
     refused(DataError, "not finite", model.improve, gaussians, cameras, images)
 
 
-def test_inputs_of_other_shapes_are_an_error_of_one_line(folder):
-    gaussians, cameras, images = scene()
-    prepared = prepare(gaussians, cameras, images, TINY)
-    prepared.views["images"] = prepared.views["images"][:, :3]
-    with pytest.raises(DataError, match="image graph failed") as error:
-        runtime.Model.open(folder).run_rows(prepared)
-    assert "\n" not in str(error.value)
-
-
 def _edit_card(folder: Path, **changes):
     (folder / CARD).write_text(json.dumps({**json.loads((folder / CARD).read_text()), **changes}))
 
@@ -94,30 +85,9 @@ def _damage(folder):
     (folder / "image.onnx").write_bytes(content)
 
 
-def _not_onnx(folder):
-    (folder / "geometry.onnx").write_bytes(b"not a graph at all")
-    card = json.loads((folder / CARD).read_text())
-    import hashlib
-
-    content = (folder / "geometry.onnx").read_bytes()
-    card["graphs"]["geometry"] |= {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    (folder / CARD).write_text(json.dumps(card))
-
-
 def _other_input(folder):
     geometry_graph(folder / "geometry.onnx", STEP, extra="normals")
     write_card(folder)
-
-
-def _other_output(folder):
-    geometry_graph(folder / "geometry.onnx", STEP, output="splats")
-    write_card(folder)
-
-
-def _other_names(folder):
-    card = json.loads((folder / CARD).read_text())
-    card["graphs"]["geometry"]["inputs"] = ["gaussians"]
-    (folder / CARD).write_text(json.dumps(card))
 
 
 def _config(folder, side, **changes):
@@ -138,22 +108,13 @@ def _outside(folder):
         (lambda f: (f / "image.onnx").unlink(), "image.onnx: no such file"),
         (_truncate, "truncated"),
         (_damage, "sha256"),
-        (_not_onnx, "cannot load"),
         (_other_input, "needs normals"),
-        (_other_output, "gives splats"),
-        (_other_names, "its card says"),
         (_outside, "no such file"),
         (lambda f: _config(f, "image", heads=0), "heads"),
-        (lambda f: _config(f, "image", views=2.5), "expected a value like"),
         (lambda f: _config(f, "geometry", window=10**9), "window 1000000000"),
-        (lambda f: _config(f, "geometry", depths=[1, 1, 1, 1, 60_000]), "numbers from 0 to 256"),
         (lambda f: (f / CARD).write_text("{"), "not a model card"),
-        (lambda f: (f / CARD).write_text("[]"), "not a model card"),
         (lambda f: _edit_card(f, schema=99), "schema 99"),
-        (lambda f: _edit_card(f, format="other"), "other of schema"),
         (lambda f: _edit_card(f, colour="red"), "colour"),
-        (lambda f: _edit_card(f, config={}), "config"),
-        (lambda f: _edit_card(f, graphs={}), "expected"),
     ],
 )
 def test_a_model_that_is_not_one_gets_one_clear_line(folder, spoil, message):

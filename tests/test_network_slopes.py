@@ -5,12 +5,10 @@ import pytest
 from network_models import scene
 
 from tests.splat_twin import render_backward_reference
-from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.network.config import SLOPES
-from vvgt_cli.network.prepare import STEP, halved, own_axes_gradients, pack, slope_rows, unpack
+from vvgt_cli.network.prepare import STEP, own_axes_gradients, pack, slope_rows, unpack
 from vvgt_cli.splat import render, render_reference
 
 
@@ -72,15 +70,3 @@ def test_what_no_view_shows_has_neither_slope_nor_error():
     assert not row[:13].any()
     np.testing.assert_allclose(row[13:18], np.log(1e-4), rtol=1e-6)
     np.testing.assert_allclose(row[18:20], [np.log(0.01), 0], atol=1e-6)
-
-
-def test_halved_views_show_what_whole_ones_do():
-    gaussians, _, _ = scene(count=50)
-    cameras = default_views("train", 2, size=64)
-    few, small, rule = halved(cameras, np.stack([render(gaussians, camera) for camera in cameras]))
-    assert small.shape == (2, 32, 32, 4)
-    assert rule.dilation == DILATION / 4
-    for camera, view in zip(few, small, strict=True):
-        assert np.abs(render(gaussians, camera, rule) - view).mean() < 0.01
-    odd = default_views("train", 2, size=33)
-    assert halved(odd, np.zeros((2, 33, 33, 4), np.float32))[2].dilation == DILATION

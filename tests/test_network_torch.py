@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch")
 
 from vvgt_cli.network import layers, model  # noqa: E402
 from vvgt_cli.network.export import randomised  # noqa: E402
-from vvgt_cli.network.model import NeighbourConv, Vvgt  # noqa: E402
+from vvgt_cli.network.model import Vvgt  # noqa: E402
 
 
 def tensors(arrays):
@@ -77,30 +77,6 @@ def test_gradients_reach_every_parameter(config):
         assert parameter.grad.abs().max() > 0, name
 
 
-def test_attention_is_softmax_of_products():
-    torch.manual_seed(0)
-    module = layers.Attention(16, 2, qk_norm=True)
-    x = torch.randn(3, 7, 16)
-    q, k, v = module.qkv(x).chunk(3, dim=-1)
-    mixed = torch.empty(3, 7, 16)
-    for batch, h in product(range(3), range(2)):
-        part = slice(8 * h, 8 * h + 8)
-        scores = module.q_norm(q[batch, :, part]) @ module.k_norm(k[batch, :, part]).T / 8**0.5
-        mixed[batch, :, part] = torch.softmax(scores, dim=-1) @ v[batch, :, part]
-    assert torch.allclose(module(x), module.proj(mixed), atol=1e-6)
-
-
-def test_rope_makes_products_depend_on_the_difference_of_places():
-    cos, sin = layers.axial_rope(6, special=2, width=16)
-    q, k = torch.randn(2, 1, 16)
-    turned_q, turned_k = layers.apply_rope(q, (cos, sin)), layers.apply_rope(k, (cos, sin))  # (38, 16): at every place
-    products = turned_q @ turned_k.T
-    at = lambda row, column: 2 + 6 * row + column  # noqa: E731
-    assert torch.allclose(products[at(1, 2), at(3, 1)], products[at(2, 4), at(4, 3)], atol=1e-5)
-    assert not torch.allclose(products[at(1, 2), at(3, 1)], products[at(1, 2), at(1, 3)], atol=1e-3)
-    assert torch.allclose(turned_q[0], q[0])  # special tokens are not turned
-
-
 def naive_epipolar(module, x, points, matrices, eyes, maps):
     """Eq. 7 with all keys of a token side by side, one token at a time, torch's own bilinear sampling."""
     uv, seen = layers.project(points, matrices)
@@ -147,18 +123,6 @@ def test_epipolar_attention_against_a_materialised_twin():
         assert (module(*rest)[-2] == 0).all()
 
 
-def test_the_bias_orders_views_by_distance():
-    module, _, points, _, eyes, _ = epipolar_case(torch.tensor([[0.3, -0.2, 0.5]]))
-    seen = torch.ones(4, 1, dtype=torch.bool)
-    with torch.no_grad():
-        for raw in (-3.0, 0.0, 3.0):
-            module.raw_beta.fill_(raw)
-            bias = module.bias(points, eyes, seen)[:, 0]
-            assert (bias[torch.argsort((eyes - points).norm(dim=1))].diff() < 0).all()
-        beta = torch.nn.functional.softplus(torch.tensor(3.0))
-        assert torch.allclose(bias, -beta * (eyes - points).norm(dim=1) / 3**0.5, atol=1e-5)
-
-
 def test_projection_against_the_cameras():
     cameras = default_views("test", size=50)
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3)).astype(np.float32)
@@ -169,16 +133,6 @@ def test_projection_against_the_cameras():
         inside = (z > 0.01) & (u >= 0) & (u <= c.width) & (v >= 0) & (v <= c.height)
         assert np.array_equal(seen[i].numpy(), inside)
         assert np.allclose(uv[i].numpy()[inside], np.column_stack([u / c.width, v / c.height])[inside], atol=1e-5)
-
-
-def test_neighbour_convolution_is_a_sum_over_those_that_are_there():
-    module = NeighbourConv(4)
-    x, table = torch.randn(5, 4), torch.randint(0, 6, (5, 27))
-    expected = torch.zeros(5, 4)
-    for i, j in product(range(5), range(27)):
-        if table[i, j] < 5:
-            expected[i] += x[table[i, j]] * module.weight[j]
-    assert torch.allclose(module(x, table), expected, atol=1e-5)
 
 
 def test_the_head_moves_along_the_gaussians_own_axes():
@@ -192,21 +146,6 @@ def test_the_head_moves_along_the_gaussians_own_axes():
     axis = model.rotation(rows[:, 6:10])[:, :, 0]
     assert torch.allclose(moved, 2 * rows[:, 3:4].exp() * axis, atol=1e-6)
     assert torch.allclose(out[:, 3:], rows[:, 3:], atol=1e-6)
-
-
-def test_gaussians_a_pixel_stand_on_their_rays():
-    config = replace(TINY, variant="wo_3dt")
-    gaussians, cameras, images = scene(views=2)
-    with torch.inference_mode():
-        out = network(config)(tensors(prepare(gaussians, cameras, images, config).arrays())).numpy()
-    side = 4 * config.image.grid
-    assert out.shape == (2 * side * side, 14)
-    for i, c in enumerate(cameras):
-        x, y, z = (out[i * side * side :][: side * side, :3] @ c.rotation.T + c.translation).T
-        v, u = np.divmod(np.arange(side * side), side)
-        assert np.allclose((c.fx * x / z + c.cx) / c.width, (u + 0.5) / side, atol=1e-4)
-        assert np.allclose((c.fy * y / z + c.cy) / c.height, (v + 0.5) / side, atol=1e-4)
-        assert (z > 0).all()
 
 
 def test_small_is_small():

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.processes import python
 from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.images.metrics import psnr
@@ -64,14 +63,6 @@ def test_axes_point_to_where_neighbours_lie():
     factors[1] *= -1
     shared.aligned(means, factors, np.zeros(len(means), np.float32), np.zeros((len(means), 3), np.float32))
     assert (np.einsum("kij,i->kj", factors[:3].astype(np.float64), way) > 0).all()
-
-
-def test_known_numbers_do_not_depend_on_the_scene_s_size():
-    g = many()
-    means, factors, logits, colors = parts(g)
-    known = shared.aligned(means, factors.copy(), logits, colors)
-    half = shared.aligned(means * np.float32(0.5), factors * np.float32(0.5), logits, colors)
-    np.testing.assert_allclose(half, known, atol=1e-4)
 
 
 @pytest.mark.parametrize("count", [MANY, 30_011])
@@ -200,25 +191,6 @@ def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns
     still.before[:] = np.inf  # sums beyond float32
     still.weights(way)
     assert still.factor == 7
-
-
-def test_weights_are_the_same_bytes_for_any_number_of_threads():
-    code = (
-        "import hashlib; from tests.test_optimize_shared import *; s = OwnAxes(many(12_500), CAMERAS); s.taken = 1\n"
-        "w = s.common(np.random.default_rng(0).normal(size=(13, 12_500)).astype(np.float32))\n"
-        "print(hashlib.sha256(b''.join(a.tobytes() for a in w)).hexdigest())"
-    )
-    threads = [{"OPENBLAS_NUM_THREADS": n, "NUMBA_NUM_THREADS": n} for n in ("1", "2")]
-    assert len({python("-c", code, variables=some)[0] for some in threads}) == 1
-
-
-def test_few_gaussians_share_nothing_and_have_the_whole_rate():
-    state = OwnAxes(many(shared.LEAST - 1), CAMERAS)
-    assert state.shared is None
-    state.taken = 1
-    floors, given, _ = state.common(np.ones((13, shared.LEAST - 1), np.float32))
-    assert given.size == 0
-    assert floors.max() <= 1e-15
 
 
 @pytest.mark.parametrize("kind", ["alike", "in one place", "wide and narrow", "infinite", "1e25", "1e10"])

@@ -225,7 +225,9 @@ def test_frames_share_what_stands_still_whatever_their_comments_say():
         assert len(content) < 1000
 
 
-@pytest.mark.parametrize("more", [(), ("--light", "headlight"), ("--blocks", "16")], ids=" ".join)
+@pytest.mark.parametrize(
+    "more", [(), pytest.param(("--light", "headlight"), marks=pytest.mark.long), ("--blocks", "16")]
+)
 def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
     run = ("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more)
     vvgt.ok(*run, "-o", beat / "f_{}.ply")
@@ -301,13 +303,12 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
 
 @pytest.mark.parametrize(
     "more",
-    [("--shard", "1/1"), ("--live",), ("--light", "above", "--shadows"), ("--target-psnr", "60")],
+    [("--shard", "1/1"), ("--light", "above", "--shadows")],
     ids=lambda more: more[0],
 )
 def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
     """A part of a series (here all of it) goes on too; the others have each frame by itself."""
     for file in ("v_2.npy", "v_3.npy"):
         (beat / file).unlink()
-    how = HOW[:4] if more == ("--live",) else HOW
-    done = vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
+    done = vvgt.ok("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "f_{}.ply")
     assert ("differences " in done.err) == (more[0] == "--shard")

@@ -16,7 +16,7 @@ from tests.report_runs import document, run, runs
 from vvgt_cli.commands.report_runs import RunOptions, plan_runs, random_points
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
-from vvgt_cli.score.charts import FILES, draw, log_ticks
+from vvgt_cli.score.charts import FILES, draw
 from vvgt_cli.score.curves import (
     OTHER,
     STAGES,
@@ -26,8 +26,6 @@ from vvgt_cli.score.curves import (
     pareto,
     psnr,
     read_series,
-    short,
-    table,
     unit_costs,
 )
 from vvgt_cli.score.page import Pictures, page
@@ -103,6 +101,7 @@ def test_a_report_writes_every_file_and_scores_every_run(scene_report):
     assert found["machine"]["cpu"]
 
 
+@pytest.mark.long
 def test_a_report_in_blocks_has_the_same_scores(scene_report, vvgt, tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.commands.report_runs.warm_up", lambda *_: None)
     folder, found = scene_report
@@ -232,24 +231,6 @@ def test_the_scoring_costs_nothing_and_units_are_medians():
     assert found["refinement, a step"] == pytest.approx((steps[1] + steps[2]) / 2)
     assert "test views, a run" not in found
     assert unit_costs([]) == {}
-
-
-def test_tables_have_a_column_a_stage_and_a_row_a_run():
-    rows = list(csv.DictReader(io.StringIO(table(runs()))))
-    assert len(rows) == len(runs())
-    for row, one in zip(rows, runs(), strict=True):
-        stages = {stage["name"]: stage["seconds"] for stage in one["stages"]}
-        for name, seconds in stages.items():
-            assert float(row[f"seconds: {name}"]) == pytest.approx(seconds, abs=1e-4)
-        assert row["psnr_alpha"] == ""
-
-
-def test_ticks_lie_within_and_are_some():
-    for lo, hi in ((0.9, 1.1), (1, 60), (1e-3, 1e6), (25, 38), (2.0, 2.6)):
-        found = log_ticks(lo, hi)
-        assert all(lo <= tick <= hi for tick in found)
-        assert len(found) >= 1
-    assert [short(n) for n in (7, 1536, 1e5, 2.5e6)] == ["7", "1.54k", "100k", "2.5M"]
 
 
 def test_charts_name_every_run_and_follow_the_page():

@@ -47,7 +47,7 @@ def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, 
     memory = tmp_path / "memory.ply"
     vvgt.ok("init", raw, "-o", memory, *FIT)
     files = []
-    for size in ("16", "32", "128", "auto"):
+    for size in ("16", "auto"):
         path = tmp_path / f"{size}.ply"
         vvgt.ok("init", raw, "-o", path, *FIT, "--blocks", size)
         files.append(path.read_bytes())
@@ -64,7 +64,7 @@ def in_memory_and_in_blocks(vvgt, raw, folder, *fit):
     return one, other
 
 
-@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "60000"])
+@pytest.mark.parametrize("budget", ["7", "60000"])
 def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
     fit = ("--max-gaussians", budget, "--size", "100", "-q")
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, raw, tmp_path, *fit))
@@ -76,21 +76,6 @@ def test_surfaces_of_labels_lie_where_they_do_in_memory(vvgt, tmp_path):
     np.save(tmp_path / "v.npy", ((r < 14) + (r < 8)).astype(np.uint8))
     fit = ("--labels", "auto", "--light", "none", "--max-gaussians", "2000", "--size", "200", "-q")
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, tmp_path / "v.npy", tmp_path, *fit))
-
-
-def test_of_several_regions_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.cut.ENOUGH", 1)
-    both = []
-    for path in in_memory_and_in_blocks(vvgt, raw, tmp_path, "--max-gaussians", "100000", "--size", "100", "-q"):
-        found = read_ply(path)[0]
-        both.append(found.take(np.lexsort(found.means.T)))
-    assert len(both[0]) == len(both[1]) > 65536
-    for name, values in both[0].arrays().items():
-        if name != "colors":
-            np.testing.assert_array_equal(values, both[1].arrays()[name])
-    apart = np.abs(both[0].colors - both[1].colors).max(axis=1)
-    assert 0 < (apart > 0).mean() < 0.3  # at the borders: neighbours are those of a region
-    assert np.sqrt((apart**2).mean()) < 0.004
 
 
 def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
@@ -160,7 +145,7 @@ def store(kind, path, values, chunks=(16, 20, 24)):
     return path / "v.zarr"
 
 
-@pytest.mark.parametrize("kind", ["zarr2", "zarr3", "hdf5"])
+@pytest.mark.parametrize("kind", ["zarr2", "hdf5"])
 def test_chunked_files_are_read_in_blocks(vvgt, tmp_path, kind):
     source = store(kind, tmp_path, bodies().astype(np.float32))
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, source, tmp_path, *FIT))

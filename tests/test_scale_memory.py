@@ -58,17 +58,6 @@ def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path
     assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run
 
 
-def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt, tmp_path, monkeypatch):
-    import tifffile
-
-    values = np.round(bodies((34, 37, 20)) * 255).astype(np.uint8)
-    (tmp_path / "slices").mkdir()
-    for z, plane in enumerate(values):
-        tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
-    monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
-    assert "processed in blocks" in vvgt.ok("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1]).err
-
-
 def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
     import tifffile
 

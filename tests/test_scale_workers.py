@@ -111,6 +111,7 @@ def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
     assert not (tmp_path / "a.ply").exists()
 
 
+@pytest.mark.long
 def test_dasks_workers_convert_labels_under_light(vvgt, tmp_path):
     pytest.importorskip("distributed")
     np.save(tmp_path / "v.npy", np.digitize(bodies((70, 30, 25)), [0.2, 0.6]).astype(np.uint8))
@@ -182,6 +183,7 @@ def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
     assert not (tmp_path / ".a.ply.blocks").exists()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_killed_worker_of_dask_costs_nothing_but_time(raw, alone, tmp_path):
     pytest.importorskip("distributed")
@@ -266,6 +268,7 @@ def slurm(tmp_path):
     return folder, {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_FAKE": str(folder), **settings}
 
 
+@pytest.mark.long
 def test_jobs_under_slurm_leave_the_same_bytes(raw, alone, tmp_path, slurm):
     folder, variables = slurm
     options = ("--workers", 2, "--scheduler", "slurm", "--memory", "3G", "--threads", 1)
@@ -281,6 +284,7 @@ def test_jobs_under_slurm_leave_the_same_bytes(raw, alone, tmp_path, slurm):
     assert all("export NUMBA_NUM_THREADS=1" in script for script in scripts)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_slurm_job_that_ends_is_followed_by_another(raw, alone, tmp_path, slurm):
     folder, variables = slurm
@@ -340,18 +344,7 @@ def test_slurm_jobs_that_all_end_early_are_reported(slurm, jobs, monkeypatch):
     assert 2 <= len(list(slurm[0].glob("job-*.sh"))) <= 8  # one that ends first on a busy machine is followed by others
 
 
-def test_a_slurm_job_that_ends_before_it_answers_is_followed_by_another(slurm, jobs, monkeypatch, tmp_path):
-    """One job works meanwhile; the other's first try finds a broken node."""
-    monkeypatch.setenv("SLURM_FIRST", f"mkdir {tmp_path}/broken && exit 3")
-    with jobs() as runner:
-        until, working = time.monotonic() + 60, 0
-        while working < 2 and time.monotonic() < until:
-            runner.run(time.sleep, [0.2] * 4, None)
-            working = sum("Registered to" in path.read_text() for path in slurm[0].glob("job-*.log"))
-    assert working == 2
-    assert len(list(slurm[0].glob("job-*.sh"))) == 3
-
-
+@pytest.mark.long
 def test_slurm_jobs_that_are_long_in_coming_are_waited_for(jobs, monkeypatch):
     monkeypatch.setenv("SLURM_FIRST", "sleep 4")
     told = []

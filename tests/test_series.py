@@ -191,13 +191,6 @@ def levels(folder: Path) -> dict[str, bytes]:
     return {name: content for name, content in files_in(folder).items() if "/" in name}
 
 
-def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
-    out = series / "out" / "{:02d}.ply"
-    done = vvgt.fails(2, "convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
-    assert "--dry-run with frames: a plan is for one volume" in done
-    assert not list((series / "out").iterdir())
-
-
 def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(request, console, finished=None, start=None) -> SimpleNamespace:
         Path(request.output).write_text("short")
@@ -229,15 +222,11 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((series / "none_*.npy", "-o", "{}.ply"), "no file matches"),
         ((frames, "-o", series / "{}{}.ply"), "expected one place for the frame's number"),
         ((frames, "-o", series / "{:02d}.ply", "--report", series / "r.json"), "--report .*expected one place"),
-        ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "expected one folder"),
         ((frames, "-o", series / "{}" / "a.ply"), "expected one folder; got .*0, .*1, .*2$"),
-        ((frames, "-o", "s/{}/lod-meta.json", "--report", "{}.json"), "one folder, s, and those in it; got .$"),
         ((frames, "-o", series / "none/a/{}/lod-meta.json"), "none/a/0 does not exist"),
         ((frames, "-o", series / "out" / "{}" / "b" / "lod-meta.json"), "place in the last folder's name"),
-        ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
-        ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),
-        ((frames, "-o", series / "a.ply", "--shard", "1/2"), "--shard with one volume: .*a place for the number"),
+        ((frames, "-o", series / "{:02d}.ply", "--dry-run"), "--dry-run with frames: a plan is for one volume"),
         ((frames, "-o", series / "{}.ply", "--shard", "1/2", "--overwrite"), "would remove each other's files"),
         ((frames, "-o", series / "a.ply"), "run_8.npy is no slice.*out_{:04d}.ply"),
         ((frames, "-o", series / "{:02d}.ply", "--tf", tf, "--tf-range", "50,60"), "shows nothing in any of 4 frames"),
@@ -355,10 +344,11 @@ def test_a_note_of_all_frames_is_printed_once(vvgt, series: Path, monkeypatch) -
         (("s_1.nii", "--tf", "hot", "--tf", "bone", "-o", "f_{}.ply"), "index axes 73.3 degrees apart", "s_1"),
     ):
         told = vvgt.ok("convert", *call, *how).err
-        assert (told.count(text), told.count(f"{first}: the same holds 3 times")) == (1, 1), told
+        again = [line for line in told.splitlines() if f"{first}: " in line and line.endswith(": 3 times in all")]
+        assert (sum(text in line for line in told.splitlines() if line not in again), len(again)) == (1, 1), told
         for k in (1, 2, 3) if "{}.ply" in call[-1] and call[0] == "two_*.vti" else ():
             assert f"frame {k} of 3" in told
-    assert "the same holds" not in vvgt.ok("convert", "s_1.nii", "-o", "c.ply", *how).err
+    assert "times in all" not in vvgt.ok("convert", "s_1.nii", "-o", "c.ply", *how).err
 
 
 def test_a_function_that_fits_is_named_where_none_is_given(vvgt, series: Path, monkeypatch) -> None:

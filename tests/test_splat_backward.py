@@ -114,14 +114,6 @@ def test_needles_pancakes_points_and_giants_match_the_twin(axes):
     assert_matches_twin(g, camera(48, 48), tight=2e-2, share=0.1)  # float32 cancels in the exponent of a long needle
 
 
-def test_what_lies_behind_the_eye_has_no_gradient():
-    g, c = cloud(400, 2, scale=0.02), camera(40, 40, eye=(0.1, 0.05, 0.0), fov=90.0)
-    ours, _ = assert_matches_twin(g, c, share=0.03)
-    behind = (g.means @ c.rotation.T + c.translation)[:, 2] <= 0.01
-    assert 50 < behind.sum() < 350
-    assert not any(getattr(ours, field)[behind].any() for field in FIELDS)
-
-
 def test_a_gaussian_at_the_near_plane_has_a_finite_gradient():
     c = camera(32, 32)
     depths = np.array([0.0099, 0.0100001, 0.011, 0.02])
@@ -189,16 +181,6 @@ def test_colour_gradients_of_a_million_add_up_to_the_alpha_of_the_picture():
     found = render_backward(white, c, p, image, np.ones((64, 64, 4), np.float32))
     assert all(np.isfinite(getattr(found, field)).all() for field in FIELDS)
     assert found.colors.sum(dtype=np.float64) == pytest.approx(3 * image[..., 3].sum(dtype=np.float64), rel=1e-4)
-
-
-def test_the_same_call_gives_the_same_bytes():
-    g, c = cloud(500, 7, scale=0.05), camera(64, 64)
-    grad = np.random.default_rng(0).normal(size=(64, 64, 4))
-    p = project(g, c)
-    image = render(g, c, projection=p)
-    first, second = (render_backward(g, c, p, image, grad) for _ in range(2))
-    for field in FIELDS:
-        assert getattr(first, field).tobytes() == getattr(second, field).tobytes()
 
 
 @pytest.mark.parametrize("rule", [RULES["inria"], RULES["compensated"]], ids=lambda rule: rule.name)

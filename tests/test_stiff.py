@@ -45,6 +45,19 @@ STIFF = SCALARS | GRIDS
 LIT = [name for name in SCALARS if name not in {f"type {kind}" for kind in TYPES}]
 EVERYTHING = Lighting(True, ((0.6, -0.48, 0.64), (0.0, 0.0, 1.0)), shadows=True, occlusion=0.2)
 SIZE = 64
+STIFFEST = (  # for every change; the others are long
+    "depth 1e+06 a voxel", "shell of a thousandth", "spacing (1.0, 1.0, 1000.0)", "values of 1e+300", "a block of nan",
+    "a single visible voxel", "labels of depth 1e+06 a voxel", "a voxel of a label of opacity 1",
+    "layers that meet in half a voxel",
+)  # fmt: skip
+assert set(STIFFEST) <= set(STIFF)
+
+
+def scenes(names):
+    """Parametrise by names of scenes, all but `STIFFEST` for the long tier."""
+    return pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=[pytest.mark.long] * (name not in STIFFEST)) for name in names]
+    )
 
 
 def assert_within(figure):
@@ -113,7 +126,7 @@ def test_functions_are_stretched_to_extreme_ranges_and_transparent_at_nan():
 # ---- views
 
 
-@pytest.mark.parametrize("name", STIFF)
+@scenes(STIFF)
 def test_views_match_the_twin_and_long_steps_stay_bounded(name):
     stiff = STIFF[name]
     scene, view = stiff.make(), camera(fov=stiff.fov)
@@ -121,7 +134,7 @@ def test_views_match_the_twin_and_long_steps_stay_bounded(name):
     assert_within(bound_long_steps(scene, view))
 
 
-@pytest.mark.parametrize("name", LIT)
+@scenes(LIT)
 def test_lit_views_match_the_twin_and_lit_gaussians_are_finite(name):
     """Under a headlight; every third also under two more lights with shadows and occlusion."""
     stiff, at = SCALARS[name], LIT.index(name)
@@ -165,7 +178,7 @@ def test_no_colour_between_two_labels_is_invented(scene):
 # ---- closed form and conversion
 
 
-@pytest.mark.parametrize("name", STIFF)
+@scenes(STIFF)
 def test_optical_mass_equals_quadrature_and_every_cut_keeps_it(name):
     stiff = STIFF[name]
     scene = stiff.make()
@@ -190,14 +203,6 @@ def test_one_gaussian_keeps_the_mass_of_a_faint_ball():
     assert ours == pytest.approx(exact, rel=0.05)  # the cut at 1/255
 
 
-CONVERTED = (
-    "depth 1e-06 a voxel", "depth 1e+06 a voxel", "opacity 1", "shell of a thousandth", "constant", "(7, 8, 1) voxels",
-    "lengths of 1e+30", "values of 1e-30", "a block of nan", "checkerboard", "a single visible voxel",
-    "a label for each voxel", "a voxel of a label of opacity 1", "labels in turns, opacity 1",
-    "labels of depth 1e+06 a voxel", "a colour of 1", "layers that meet in half a voxel",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CONVERTED)
+@scenes(STIFF)
 def test_no_stage_of_a_conversion_loses(name):
     assert_within(convert_scene(STIFF[name].make()))

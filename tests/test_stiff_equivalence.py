@@ -89,9 +89,17 @@ def assert_alike(one, other, limit):
     assert np.abs(one - other).mean() <= limit * one.max()
 
 
-@pytest.mark.parametrize("live", [False, True], ids=["baked", "live"])
+STIFFEST = [("a single visible voxel", "headlight", False), ("labels in layers of a voxel", "none", True)]
+ALL = [
+    (name, light, live)
+    for live in (False, True)
+    for light, names in (("none", ROWS), ("headlight", LIT))
+    for name in names
+]
+
+
 @pytest.mark.parametrize(
-    ("name", "light"), [*((name, "none") for name in ROWS), *((name, "headlight") for name in LIT)]
+    ("name", "light", "live"), [pytest.param(*row, marks=[pytest.mark.long] * (row not in STIFFEST)) for row in ALL]
 )
 def test_in_blocks_as_in_memory(name, light, live):
     found = [ROWS[name].converted(live, light, blocks) for blocks in (None, BLOCK)]
@@ -101,7 +109,9 @@ def test_in_blocks_as_in_memory(name, light, live):
     assert_alike(*found, SAME)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name != "spacing 20:1")) for name in ROWS]
+)
 def test_streamed_as_in_one_file(vvgt, tmp_path, name):
     row, found = ROWS[name], []
     np.save(tmp_path / "a.npy", row.data)

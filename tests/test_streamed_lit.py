@@ -41,7 +41,7 @@ def nearest(found: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndarr
     return near[same], rows[same]
 
 
-@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("light", [pytest.param("head", marks=pytest.mark.long), "shadows"])
 def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_path: Path, light: str) -> None:
     out = tmp_path / "out" / "lod-meta.json"
     vvgt.ok("init", volume, *FIT, *LIGHTS[light], "--blocks", "32", "-o", out)

@@ -195,15 +195,6 @@ def test_losses_against_the_metrics():
     assert float(whole) == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_rate_rises_and_falls_along_a_cosine():
-    config = replace(CONFIG, steps=101, warmup=1, rate=1e-4, last_rate=1e-6)
-    rates = [loop.rate(step, config) for step in range(101)]
-    assert rates[0] == pytest.approx(1e-4)
-    assert rates[-1] == pytest.approx(1e-6)
-    assert rates[1 + 99 // 2] == pytest.approx((1e-4 + 1e-6) / 2, rel=0.03)
-    assert np.all(np.diff(rates[1:]) < 0)
-
-
 def test_configurations_survive_yaml_and_faults_are_named(tmp_path):
     path = tmp_path / "c.yaml"
     path.write_text(config_text(CONFIG))

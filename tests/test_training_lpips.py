@@ -118,13 +118,6 @@ def test_other_files_are_refused_in_one_line(files, tmp_path):
     refused(DataError, "finite", load_lpips, replace(config, lpips_backbone=str(tmp_path / "nan.pth")))
 
 
-def test_a_missing_file_ends_a_run_before_any_scene_is_made(files, tmp_path):
-    config = replace(CONFIG, loss=replace(files[0], lpips_linear="nowhere.pth"))
-    with pytest.raises(DataError, match=r"nowhere.pth: no such file"):
-        loop.train(config, str(tmp_path), str(tmp_path / "run"), Console(quiet=True))
-    assert not list(tmp_path.iterdir())
-
-
 def test_it_is_asked_for_with_both_files_or_not_at_all(files):
     assert load_lpips(LossConfig()) is None
     refused(UsageError, "lpips_backbone", LossConfig, lpips=0.05)

@@ -63,7 +63,7 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     pictures = {name: square(read_png(tmp_path / f"{name}.png")[..., :3]) for name in ("live", "better")}
     edge = len(pictures["live"])
     camera = orbit_views(1, size=edge)[0]
-    _, (volume,) = vvgt.render_views("example:blob:24", function, [camera])
+    _, (volume,) = vvgt.render_views("example:blob:24", function, cameras=[camera])
     live, better = (psnr(volume[..., :3], pictures[name]) for name in ("live", "better"))
     print(f"{size}: against the volume at {edge} px: live {live:.2f} dB, converted {better:.2f} dB")
     assert better > live + 2

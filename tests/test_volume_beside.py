@@ -7,13 +7,11 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
-import xarray
 import zarr
 
 from tests.ramps import X, Y, Z, check_grid, ramp
 from tests.refused import refused
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.library.inputs import _labelled
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.stored import loaded
 
@@ -101,11 +99,6 @@ def test_coordinates_that_fit_in_several_ways_are_named(tmp_path: Path) -> None:
     refused(UsageError, "axis z has steps .*--dims X Y Z", read_volume, uneven)
 
 
-def test_coordinates_of_an_xarray_along_other_dimensions() -> None:
-    lines = {name: (f"n{name}", line) for name, line in LINES.items()}
-    check_grid(_labelled(xarray.DataArray(VALUES, lines, dims=("nz", "ny", "nx")), ReadOptions(), "v"))
-
-
 @pytest.mark.parametrize(
     ("form", "arrays"),
     [
@@ -125,16 +118,6 @@ def test_particles_are_no_picture(tmp_path: Path, form: str, arrays: dict) -> No
         refused(DataError, f"particles .*{first}", read_volume, path, ReadOptions(array=first))
     beside = write(tmp_path, form, arrays | {"density": VALUES})
     assert read_volume(beside).dims == VALUES.shape[::-1]
-
-
-def test_values_at_stations_are_no_picture(tmp_path: Path) -> None:
-    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
-        for name, size in (("time", 2), ("height", 3), ("cell", 20)):
-            file.createDimension(name, size)
-        for name in ("lon", "lat"):
-            file.createVariable(name, "f8", ("cell",))[:] = np.arange(20.0)
-        file.createVariable("t", "f4", ("time", "height", "cell"))[:] = 1
-    refused(DataError, "x and y both lie along cell", read_volume, str(tmp_path / "v.nc"))
 
 
 @pytest.mark.parametrize("blocks", [False, True])

@@ -190,12 +190,8 @@ def test_a_magnitude_needs_one_grid(tmp_path: Path) -> None:
     [
         (r"<size>4 5 6", "<size>4 5 7", "setup 0 has 4 x 5 x 6 voxels; expected 4 x 5 x 7, as its XML file says"),
         (r"data\.hdf5", "none.h5", "its data 'none.h5' are not beside it; expected .*none.h5"),
-        (r"data\.hdf5", "../../data.h5", "are not beside it"),
         (r"<hdf5.*</hdf5>", "<files/>", "image loader 'bdv.hdf5'; expected HDF5, N5 or OME-Zarr"),
-        (r"<affine>1 ", "<affine>one ", "damaged .*; expected setups, time points and registrations"),
         (r"<ViewSetups>.*</ViewSetups>", "", "0 setups at 2 time points"),
-        (r"<last>1", "<last>-1", "damaged .*time points"),
-        (r"</SpimData>", "", "damaged XML metadata"),
         (r"<SpimData", '<!DOCTYPE a [<!ENTITY b "c">]><SpimData', "entities"),
     ],
 )

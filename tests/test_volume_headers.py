@@ -115,20 +115,12 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
     ("fields", "message"),
     [
         ({"sizes": "5 4 999999999999"}, "the file has"),
-        ({"sizes": "5 4 4"}, "the file has"),
         ({"sizes": "5 4 4", "encoding": "gzip"}, "damaged gzip data"),
-        ({"sizes": "5 4 0"}, "whole numbers of at least 1"),
         ({"sizes": "5 4 many"}, "whole numbers of at least 1"),
-        ({"sizes": "5 4"}, "dimension 3 but sizes"),
         ({"dimension": 5, "sizes": "1 2 2 3 5"}, "spatial axes"),
-        ({"type": "block"}, "type is 'block'"),
         ({"endian": None}, "no field 'endian'"),
-        ({"endian": "middle"}, "expected little or big"),
-        ({"encoding": "hex"}, "encoding 'hex'"),
-        ({"byte skip": -2}, "byte skip -2"),
         ({"space directions": "(1,0,0) (0,1,0)"}, "expected 3 vectors"),
         ({"data file": "/etc/passwd"}, "header's own folder"),
-        ({"data file": "../v.raw"}, "header's own folder"),
         ({"data file": "none.raw"}, "does not exist beside it"),
         ({"data file": "v%02d.raw 0 9 1"}, "10 data files of 5 x 4 values"),
     ],
@@ -231,13 +223,8 @@ def test_metaimage_components_and_steps(tmp_path: Path) -> None:
     ("fields", "message"),
     [
         ({"DimSize": "5 4 99999999999"}, "the file has"),
-        ({"NDims": 2}, "NDims 2"),
-        ({"ElementType": "MET_STRING"}, "ElementType MET_STRING"),
         ({"ElementDataFile": "../v.raw"}, "header's own folder"),
-        ({"ElementDataFile": "LIST"}, "several files"),
         ({"ElementDataFile": None}, "no ElementDataFile"),
-        ({"ElementNumberOfChannels": 0}, "expected at least 1"),
-        ({"HeaderSize": -7}, "HeaderSize -7"),
         ({"ElementSpacing": "1 one 1"}, "3 finite numbers"),
     ],
 )
@@ -291,12 +278,9 @@ def test_inviwo_old_names_scaling_and_sequences(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"Format": "FLOAT8"}, "Format 'FLOAT8'"),
         ({"Resolution": None}, "no field 'resolution'"),
-        ({"Resolution": "5 4"}, "expected three numbers"),
         ({"Resolution": "5 4 400"}, "the file has"),
         ({"RawFile": "/etc/passwd"}, "header's own folder"),
-        ({"ByteOffset": "x"}, "whole number"),
     ],
 )
 def test_inviwo_lies(tmp_path: Path, fields: dict, message: str) -> None:
@@ -333,15 +317,10 @@ def test_vgi(tmp_path: Path, newline: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("size = 5 4 3", "size = 5 4 2", "first file of .*expected all of it"),
         ("{volumeprimitive1}", "[file2]\nName = w.vol\n{volumeprimitive1}", "expected all of it in one file"),
         ("BitsPerElement = 16", "BitsPerElement = 32", "has 122 bytes; expected 242"),
-        ("Datatype = signed integer", "Datatype = colour", "'colour' of 16 bits; expected raw"),
-        ("FileFormat = raw", "FileFormat = tiff", "FileFormat tiff"),
-        ("Size = 5 4 3", "Size = 5 4", "expected raw, three numbers"),
         ("v.vol", "x.vol", "does not exist beside it"),
         ("[file1]", "[file2]", "no volume of numbers"),
-        ("SkipHeader = 2", "SkipHeader = -2", "expected raw"),
         ("resolution = 0.05 0.1", "resolution = 0,05 0,1", "decimal points"),
     ],
 )
@@ -349,36 +328,3 @@ def test_vgi_lies(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "v.vol").write_bytes(b"xx" + VALUES.tobytes())
     assert old in VGI
     refused(DataError, message, read_volume, write(tmp_path / "v.vgi", VGI.replace(old, new).encode()))
-
-
-@pytest.mark.parametrize("kind", ["nrrd", "mha"])
-def test_vtk_writes_what_we_read(tmp_path: Path, kind: str) -> None:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-    from vtkmodules.vtkIOImage import vtkMetaImageReader, vtkMetaImageWriter, vtkNrrdReader
-
-    image = vtkImageData()
-    image.SetDimensions(5, 4, 3)
-    image.SetSpacing(0.5, 1, 2)
-    image.SetOrigin(1, 2, 3)
-    image.GetPointData().SetScalars(numpy_to_vtk(VALUES.ravel()))
-    path = tmp_path / f"v.{kind}"
-    if kind == "mha":
-        writer = vtkMetaImageWriter()
-        writer.SetInputData(image)
-        writer.SetFileName(str(path))
-        writer.Write()
-        reader = vtkMetaImageReader()
-    else:
-        fields = {"space dimension": 3, "space directions": "(0.5,0,0) (0,1,0) (0,0,2)", "space origin": "(1,2,3)"}
-        path.write_bytes(nrrd(fields, VALUES.astype("<i2").tobytes()))
-        reader = vtkNrrdReader()
-    reader.SetFileName(str(path))
-    reader.Update()
-    volume = read_volume(str(path))
-    np.testing.assert_array_equal(volume.data, VALUES)
-    theirs = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
-    np.testing.assert_array_equal(volume.data.ravel(), theirs.ravel())
-    assert (volume.spacing, volume.origin) == ((0.5, 1, 2), (1, 2, 3))
-    if kind == "mha":  # VTK 9.7 takes the first axis of a NRRD file for components, and so its spacing for x's
-        assert (reader.GetOutput().GetSpacing(), reader.GetOutput().GetOrigin()) == ((0.5, 1, 2), (1, 2, 3))

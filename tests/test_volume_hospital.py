@@ -220,21 +220,6 @@ def test_times_as_in_dcm2niix(tmp_path: Path) -> None:
         check_same(read_volume(source, ReadOptions(time=t)), theirs, t)
 
 
-def test_info_lists_volumes_and_a_series_is_made_of_them(vvgt, tmp_path: Path) -> None:
-    source = series(tmp_path / "in", [{"EchoTime": e} for e in (4.92, 7.38)])
-    assert "step 1, name EchoTime 7.38 ms, option --time 1" in vvgt("info", source).out.decode()
-    few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
-    vvgt.ok("convert", source, "-o", tmp_path / "p_{:02d}.ply", "--tf", "viridis", *few)
-    assert sorted(p.name for p in tmp_path.glob("p_*.ply")) == ["p_00.ply", "p_01.ply"]
-
-
-def test_places_with_different_numbers_of_images(tmp_path: Path) -> None:
-    series(tmp_path, [{}, {}, {}])
-    next(iter(sorted(tmp_path.iterdir()))).unlink()
-    with pytest.raises(DataError, match="11 images in 4 places, 2 to 3 in each, and no attribute tells volumes apart"):
-        read_volume(str(tmp_path))
-
-
 def test_one_image_that_was_taken_again_is_skipped(tmp_path: Path) -> None:
     series(tmp_path, [{"AcquisitionNumber": 1}])
     save(image(STACK[0] + 7, (0, 0, 0), AcquisitionNumber=2, InstanceNumber=9), tmp_path / "again.dcm")
@@ -399,11 +384,6 @@ def test_modality_look_up_tables_as_in_pydicom(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.data[k], apply_modality_lut(one.pixel_array, one))
 
 
-def test_palettes_are_said(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="its palette is for display; values are as they are stored"):
-        read_volume(series(tmp_path, [{}], PhotometricInterpretation="PALETTE COLOR"))
-
-
 def test_zip_archives_and_dicomdir(tmp_path: Path) -> None:
     source = series(tmp_path / "in", [{}])
     for name, front in (("a.zip", ""), ("b.zip", "study/series/")):
@@ -425,3 +405,10 @@ def test_raw_values_that_begin_like_dicom_are_raw_where_they_are_said_to_be(tmp_
     save(image(STACK[0], (0, 0, 0)), tmp_path / "v")
     size = (tmp_path / "v").stat().st_size
     assert read_volume(str(tmp_path / "v"), ReadOptions(dims=(size, 1, 1), dtype="uint8")).dims == (size, 1, 1)
+
+
+def test_places_with_different_numbers_of_images(tmp_path: Path) -> None:
+    series(tmp_path, [{}, {}, {}])
+    next(iter(sorted(tmp_path.iterdir()))).unlink()
+    with pytest.raises(DataError, match="11 images in 4 places, 2 to 3 in each, and no attribute tells volumes apart"):
+        read_volume(str(tmp_path))

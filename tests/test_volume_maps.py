@@ -226,15 +226,10 @@ def test_dx_as_another_library_writes_it(tmp_path: Path) -> None:
     ("name", "change", "message"),
     [
         ("v.cube", (" 3 0.5", " 0 0.5"), "at least 1 voxel"),
-        ("v.cube", (" 3 0.5", " 9 0.5"), "holds 60 values"),
         ("v.cube", (" 3 0.5", " 9999999999 0.5"), "check that the file is whole"),
         ("v.cube", ("-2.0 1.0", "nan 1.0"), "finite numbers"),
-        ("v.cube", ("E-0", "oops"), "not a list"),
         ("v.dx", ("items 60", "items 61"), "expected one of 3 x 4 x 5"),
-        ("v.dx", ("counts 3", "counts 0"), "regular grid"),
-        ("v.dx", ("delta 0 0.25 0\n", ""), "2 deltas"),
         ("v.dx", ("type double", "type string"), "of type 'string'"),
-        ("v.dx", ("class array", "class list"), "its header ends"),
     ],
 )
 def test_text_lies(tmp_path: Path, name: str, change: tuple[str, str], message: str) -> None:

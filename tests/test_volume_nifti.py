@@ -182,20 +182,13 @@ def test_content_beats_name(tmp_path: Path) -> None:
     ("at", "values", "message"),
     [
         (40, np.array([3, 32767, 32767, 32767], "<i2"), "the file has"),
-        (40, np.array([3, 5, 0, 3], "<i2"), "at least 1 voxel"),
         (40, np.array([9], "<i2"), "1 to 7 axes"),
-        (40, np.array([8], "<i2"), "1 to 7 axes"),
-        (40, np.array([0], "<i2"), "1 to 7 axes"),
-        (40, np.array([-1], "<i2"), "1 to 7 axes"),
         (40, np.array([3, 0, 4, 5], "<i2"), "at least 1 voxel"),
-        (40, np.array([3, 4, 5, 0], "<i2"), "at least 1 voxel"),
         (70, np.array([128], "<i2"), "need 532 bytes"),
         (70, np.array([32], "<i2"), "complex64"),
-        (70, np.array([7], "<i2"), "unknown type 7"),
         (108, np.array([np.nan], "<f4"), "vox_offset"),
         (108, np.array([1e9], "<f4"), "the file has"),
         (112, np.array([np.inf], "<f4"), "scl_slope inf"),
-        (344, np.array([0], "<i4"), "named like a NIfTI file"),
     ],
 )
 def test_lies(tmp_path: Path, at: int, values: np.ndarray, message: str) -> None:

@@ -7,32 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tests.processes import python
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.blocks import parse_numbers
-from vvgt_cli.volume.readers import READERS, Reader, known_suffixes, register, volume_name
+from vvgt_cli.volume.readers import READERS, Reader, known_suffixes, volume_name
 
 NRRD = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n" + bytes(range(8))
-HEADS = (
-    NRRD,
-    b"NDims = 3\nDimSize = 2 2 2\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n" + bytes(8),
-    b"RawFile: v.raw\nResolution: 2 2 2\nFormat: UINT8\n",
-    b"# vtk DataFile Version 3.0\nt\nBINARY\nDATASET STRUCTURED_POINTS\nDIMENSIONS 2 2 2\nORIGIN 0 0 0\nSPACING 1 1 1\n"
-    b"POINT_DATA 8\nSCALARS s char\nLOOKUP_TABLE default\n" + bytes(8),
-    b"11111\n2 2 2 8\n1 1 1\n1 1 1 1\n1 1 X...3 X\x08\x01\0" + b"3 X\x04\x01\0" * 2,
-    b"II*\0\x08\0\0\0\x02\0\0\x01\x04\0\x01\0\0\0\x02\0\0\0\x01\x01\x04\0\x01\0\0\0\x02\0\0\0\0\0\0\0",
-    (348).to_bytes(4, "little") + bytes(36) + np.array([3, 2, 2, 2, 1, 1, 1, 1], "<i2").tobytes() + bytes(14)
-    + np.array([2, 8], "<i2").tobytes() + bytes(2) + np.ones(8, "<f4").tobytes() + np.array([352], "<f4").tobytes()
-    + bytes(232) + b"n+1\0" + bytes(12),
-    b'<?xml version="1.0"?>\n<VTKFile type="ImageData" byte_order="LittleEndian"><ImageData WholeExtent="0 1 0 1 0 1" '
-    b'Origin="0 0 0" Spacing="1 1 1"><Piece Extent="0 1 0 1 0 1"><PointData><DataArray type="UInt8" Name="a" '
-    b'format="ascii">1 2 3 4 5 6 7 8</DataArray></PointData></Piece></ImageData></VTKFile>',
-)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["v.nrrd", "v.dat", "v.vti", "v", "v.unknown"])
@@ -46,46 +29,6 @@ def test_a_name_with_the_wrong_content_is_one_clear_line(tmp_path: Path, suffix:
     path = tmp_path / f"v{suffix}"
     path.write_bytes(b"nothing that any format begins with")
     refused(VvgtError, r"expected|no field|has no ElementDataFile|unknown layout", read_volume, str(path))
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    head=st.sampled_from(HEADS),
-    edits=st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=4)), max_size=4),
-    cut=st.integers(0, 500),
-)
-def test_damaged_files_end_in_one_line(tmp_path: Path, head: bytes, edits: list[tuple[int, bytes]], cut: int) -> None:
-    body = bytearray(head)
-    for at, new in edits:
-        at %= len(body)
-        body[at : at + len(new)] = new
-    path = tmp_path / "v"
-    path.write_bytes(body[: cut or None])
-    try:
-        volume = read_volume(str(path))
-    except VvgtError as error:
-        message = str(error)
-    else:
-        message = f"v: {volume.data.size} voxels"
-    assert message.startswith((str(path), "v: "))
-    assert "\n" not in message
-    assert len(message) < 1000
-
-
-def test_the_undamaged_heads_are_read(tmp_path: Path) -> None:
-    (tmp_path / "v.raw").write_bytes(bytes(8))
-    for k, head in enumerate(HEADS):
-        path = tmp_path / f"v{k}"
-        path.write_bytes(head)
-        if head.startswith(b"II*"):  # directories without pixels
-            refused(DataError, "damaged", read_volume, str(path))
-        elif head.startswith(b"11111"):  # its first plane has 8 voxels, 4 were declared
-            refused(DataError, "plane 0 of 2", read_volume, str(path))
-        elif b"n+1\0" in head:
-            path.write_bytes(head[:352].ljust(352, b"\0") + bytes(8))
-            assert read_volume(str(path)).dims == (2, 2, 2)
-        else:
-            assert read_volume(str(path)).dims == (2, 2, 2)
 
 
 def test_what_cannot_be_opened(tmp_path: Path) -> None:
@@ -132,13 +75,6 @@ def test_names() -> None:
         ("plain", "plain"),
     ):
         assert volume_name(Path(name)) == expected
-
-
-def test_the_registry_checks_itself() -> None:
-    with pytest.raises(ValueError, match="registered twice"):
-        register(Reader("NRRD", (".x",), lambda path, options: None))  # type: ignore[arg-type,return-value]
-    with pytest.raises(ValueError, match="lower case"):
-        register(Reader("new", ("X",), lambda path, options: None))  # type: ignore[arg-type,return-value]
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)

@@ -207,21 +207,10 @@ def test_legacy_sections_written_by_hand(tmp_path: Path) -> None:
     [
         (legacy(b"POINT_DATA 60\nSCALARS a float\nLOOKUP_TABLE default\n" + bytes(239)), "240 bytes of values"),
         (legacy(b"POINT_DATA 999999999999\nSCALARS a double\nLOOKUP_TABLE default\n" + bytes(64)), "are declared"),
-        (legacy(b"FIELD f 1\nx 999999999 999999999 double\n" + bytes(64)), "are declared"),
-        (
-            legacy(b"POINT_DATA 8\nSCALARS a char\nLOOKUP_TABLE default\n" + bytes(8)),
-            "8 point values; 5 x 4 x 3 were expected",
-        ),
-        (legacy(b"POINT_DATA 60\nSCALARS a quaternion\n" + bytes(64)), "unknown type"),
         (legacy(b"POINT_DATA 60\nNONSENSE\n"), "unknown section"),
-        (legacy(b"POINT_DATA 60\nFIELD f 2\n"), "fewer arrays"),
-        (legacy(b"POINT_DATA\n"), "damaged legacy VTK file"),
         (legacy(b""), "no array of numbers"),
-        (legacy(b"POINT_DATA 60\nSCALARS a int\n1 2 3\n", "ASCII"), "holds 3 values"),
         (legacy(b"POINT_DATA 60\nSCALARS a int\n" + b"one " * 60, "ASCII"), "not a list of int32 numbers"),
-        (legacy(b"", "HEX"), "expected ASCII or BINARY"),
         (legacy(b"", kind="POLYDATA"), "of a polydata.*Resample To Image"),
-        (legacy(b"POINT_DATA 1\nSCALARS a char\n" + bytes(1), dims="1 x 1"), "damaged legacy VTK file"),
     ],
 )
 def test_legacy_lies(tmp_path: Path, text: bytes, message: str) -> None:
@@ -234,12 +223,8 @@ def test_legacy_lies(tmp_path: Path, text: bytes, message: str) -> None:
     ("old", "new", "message"),
     [
         (b'WholeExtent="0 4 0 3 0 2"', b'WholeExtent="0 4000000 0 300000 0 200000"', "cannot hold"),
-        (b'WholeExtent="0 4 0 3 0 2"', b'WholeExtent="0 4 0 3 0 -1"', "is empty"),
-        (b'WholeExtent="0 4 0 3 0 2"', b'WholeExtent="0 4 0 3"', "expected 6 numbers"),
-        (b'type="ImageData"', b'type="PolyData"', "type PolyData; expected ImageData"),
         (b"vtkZLibDataCompressor", b"vtkMagicCompressor", "compressor"),
         (b'type="UInt8"', b'type="UInt64"', "VTK cannot read|declares|cannot hold"),
-        (b"<Piece", b"<<Piece", "XML is damaged"),
     ],
 )
 def test_vti_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str], old: bytes, new: bytes, message: str) -> None:
@@ -250,17 +235,6 @@ def test_vti_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str], old: bytes,
     path.write_bytes(body.replace(old, new))
     refused(DataError, message, read_volume, str(path))
     assert capfd.readouterr() == ("", ""), "VTK must not print"
-
-
-@pytest.mark.parametrize("compressor", ["none", "ZLib"])
-def test_vti_cut_short(tmp_path: Path, capfd: pytest.CaptureFixture[str], compressor: str) -> None:
-    path = tmp_path / "v.vti"
-    body = Path(write_vti(path, image(a=VALUES.astype("f8")), compressor=compressor)).read_bytes()
-    path.write_bytes(body[: body.index(b"<AppendedData") + 60])
-    with pytest.raises(DataError) as caught:
-        read_volume(str(path))
-    assert "\n" not in str(caught.value)
-    assert capfd.readouterr() == ("", "")
 
 
 def test_vti_of_fewer_voxels_than_it_stores(tmp_path: Path) -> None:
@@ -303,13 +277,9 @@ def test_slc_as_vtk_reads_it(tmp_path: Path, coding: int) -> None:
         (slc([b"3 X\x7f\x01\0"] * 3), "plane 0 of 3 is damaged"),  # a run past the plane's end
         (slc([b"3 X\xff\x01\x02"] * 3), "plane 0 of 3 is damaged"),  # literals past the data's end
         (slc([b"3 X\x05\x01\0"] * 3), "plane 0 of 3 is damaged"),  # too few voxels
-        (slc([b"99999 X\x14\x01\0"] * 3), "plane 0 of 3 is damaged"),
         (slc([b"3 X\x14\x01\0"] * 2), "plane 2 of 3 has no size"),
         (slc([], dims="99999 99999 99999"), "cannot hold"),
-        (slc([], bits=16), "expected 8 bits"),
-        (slc([], coding=7), "SLC coding 7"),
         (slc([bytes(59)], coding=0), "the file has"),
-        (b"11111 5 4", "no SLC header"),
     ],
 )
 def test_slc_lies(tmp_path: Path, body: bytes, message: str) -> None:
@@ -347,14 +317,6 @@ def write_tiff(path: Path, values: np.ndarray, samples: int = 1) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("code", ["u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"])
-def test_tiff_stack(tmp_path: Path, code: str) -> None:
-    volume = read_volume(write_tiff(tmp_path / "v.tif", VALUES.astype(code)), ReadOptions(spacing=(1, 1, 3)))
-    np.testing.assert_array_equal(volume.data, VALUES)
-    assert volume.data.dtype == code
-    assert volume.spacing == (1, 1, 3)
-
-
 @pytest.mark.parametrize("code", ["u1", "u2", "f4"])
 def test_tiff_as_vtk_writes_and_reads_it(tmp_path: Path, code: str) -> None:
     data = image()
@@ -370,13 +332,6 @@ def test_tiff_as_vtk_writes_and_reads_it(tmp_path: Path, code: str) -> None:
     reader.Update()
     theirs = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
     np.testing.assert_array_equal(read_volume(str(tmp_path / "w.tif")).data.ravel(), theirs)
-
-
-def test_tiff_colours(tmp_path: Path) -> None:
-    values = RNG.integers(0, 255, (3, 4, 5, 3)).astype("u1")
-    source = write_tiff(tmp_path / "v.tif", values, samples=3)
-    refused(UsageError, "3 channels of type uint8", read_volume, source)
-    np.testing.assert_array_equal(read_volume(source, ReadOptions(component=1)).data, values[..., 1])
 
 
 def test_tiff_lies(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

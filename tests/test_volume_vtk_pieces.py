@@ -136,14 +136,10 @@ def _edit(path: Path, old: str, new: str) -> None:
     [
         ("p1.vti", "gone.vti", "'gone.vti' does not exist beside it"),
         ("p1.vti", "../../etc/passwd", "expected a file in the header's own folder"),
-        ("p1.vti", "v.pvti", "a VTK file of type PImageData; expected ImageData, a piece"),
         ("p1.vti", "p0.vti", "expected the place that v.pvti gives it"),
         ('"2 4 0 3 0 2"', '"2 3 0 3 0 2"', "lie in none of its pieces"),
-        ('"2 4 0 3 0 2"', '"1 3 0 3 0 2"', "lie in none of its pieces"),
         ('"2 4 0 3 0 2"', '"2 5 0 3 0 2"', "expected one within"),
-        ('"2 4 0 3 0 2"', '"2 4 0 3"', "expected 6 numbers"),
         ('type="Float64" Name="cells"', 'type="Float32" Name="cells"', "as v.pvti says"),
-        ('Name="cells"', 'Name="cell"', "no array 'cells'|none of that name"),
         ('WholeExtent="0 4 0 3 0 2"', 'WholeExtent="0 4000000 0 3000000 0 2000000"', "memory|lie in none"),
     ],
 )

@@ -24,9 +24,11 @@ if TYPE_CHECKING:
     from vvgt_cli.commands.check import check
     from vvgt_cli.commands.evaluate import evaluate
     from vvgt_cli.commands.infer import infer
+    from vvgt_cli.commands.info import info
     from vvgt_cli.commands.optimize import optimize
     from vvgt_cli.commands.recolor import recolor
     from vvgt_cli.commands.render import render
+    from vvgt_cli.commands.render_views import render_views
     from vvgt_cli.commands.synth import synth
     from vvgt_cli.commands.view import view
     from vvgt_cli.conversion.clouds import Clouds
@@ -34,9 +36,8 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import convert, read_ply, read_volume, render_views
+    from vvgt_cli.library.functions import Session, convert, read_ply, read_volume
     from vvgt_cli.library.inputs import Goal, Look
-    from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import Volume
@@ -46,18 +47,15 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("convert", "read_ply", "read_volume", "render_views"),
+    "library.functions": ("Session", "convert", "read_ply", "read_volume"),
     "library.inputs": ("Goal", "Look"),
-    "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
     "conversion.result": ("Conversion", "Result"),
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
-    **{
-        f"commands.{name}": (name,)
-        for name in ("check", "evaluate", "infer", "optimize", "recolor", "render", "synth", "view")
-    },
+    **{f"commands.{name}": (name,) for name in ("check", "evaluate", "infer", "info", "optimize", "recolor", "render")},
+    **{f"commands.{name}": (name,) for name in ("render_views", "synth", "view")},
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -85,6 +83,7 @@ __all__ = [
     "evaluate",
     "export_plotter",
     "infer",
+    "info",
     "optimize",
     "orbit_views",
     "read_ply",

@@ -56,14 +56,15 @@ class Once:
 
     def first(self, line: str) -> bool:
         """Return whether a message is new, and count it."""
-        name, _, text = line.partition(": ")
-        first, count = self._said.get(text or line, (name, 0))
+        _, _, text = line.partition(": ")
+        first, count = self._said.get(text or line, (line, 0))
         self._said[text or line] = first, count + 1
         return not count
 
     def repeated(self) -> list[str]:
-        """Return a line for each message that came again."""
-        return [f"{name}: the same holds {count} times" for name, count in self._said.values() if count > 1]
+        """Return a line for each message that came again: its beginning as it first came, and how often it came."""
+        said = ((first.partition("; ")[0], count) for first, count in self._said.values())
+        return [f"{first}: {count} times in all" for first, count in said if count > 1]
 
 
 @dataclass

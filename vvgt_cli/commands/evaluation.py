@@ -178,8 +178,10 @@ def score(
         size, rule = size or device.size, rule or device.rule
     inputs = [*request.paths(), *([ply] if isinstance(ply, str) else [])]
     check_outputs(Output.of("--preview", preview, (".png",)), inputs, overwrite)
-    gaussians, header = open_gaussians(ply)
     place = split_name(ply) if isinstance(ply, str) else None
+    if place is not None and place[1] in (None, VIEW):
+        ply = str(place[0])
+    gaussians, header = open_gaussians(ply)
     size, drawn = size or header.screen_size or SIZE, file_rule(header, rule)
     with opened_as_recorded(run, request, gaussians, header, size, options) as field:
         volume = field.source.volume

@@ -24,7 +24,7 @@ from vvgt_cli.progress import Console, Once
 from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
 
-COMMANDS = [  # modules of this room, with underscores
+COMMANDS = [  # modules of this subpackage, with underscores
     *("convert", "init", "merge", "optimize", "recolor", "view", "render", "render-views", "evaluate", "check"),
     *("report", "info", "tf", "infer", "export", "train", "synth", "plugin", "warmup"),
 ]

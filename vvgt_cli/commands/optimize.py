@@ -69,7 +69,7 @@ def optimize(
     if max_gaussians is not None and method != "3dgs":
         raise UsageError(f"--max-gaussians applies to --method 3dgs; --method {method} does not change the number")
     if (steps is None) == (time_budget is None):
-        raise UsageError("give either --steps N or --time-budget shared.SECONDS")
+        raise UsageError("give either --steps N or --time-budget SECONDS")
     kept = None if checkpoint is None else os.fspath(checkpoint)
     how = OptimizeOptions.of(
         method, steps=steps, time_budget=time_budget, target_psnr=target_psnr, max_gaussians=max_gaussians, seed=seed,

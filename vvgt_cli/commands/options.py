@@ -54,9 +54,9 @@ def group(name: str, **options: Decorator) -> Decorator:
 
 
 def _component(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
-    if value is None or value == "magnitude":
-        return value
-    return int(value) if value.isascii() and value.isdecimal() else value
+    if value == "":
+        raise click.BadParameter("'' names none; expected a number, a name, magnitude, color or all")
+    return int(value) if value and value.isascii() and value.isdecimal() else value
 
 
 _READ = dict(
@@ -301,8 +301,6 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
             console = click.get_current_context().find_object(type) or Console
             return function(*args, console=console(quiet, interruption=interruption), **kwargs)
 
-    # click wraps a paragraph's lines unless it begins with \b
-    wrapper.__doc__ = re.sub(r"\n( *)(Examples?:\n)", "\n\\1\b\n\\1\\2", function.__doc__ or "")
     return wrapper
 
 
@@ -371,7 +369,7 @@ def block_options_of(blocks: dict[str, Any]) -> BlockOptions | None:
 
 
 def arguments(
-    console: Console, optics: dict[str, Any] | None = None, light: dict[str, Any] | None = None,
+    console: Console | None = None, optics: dict[str, Any] | None = None, light: dict[str, Any] | None = None,
     blocks: dict[str, Any] | None = None, read: Mapping[str, Any] = {}, **options: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the arguments of the function that a command calls, with its groups of options as the function takes them.
@@ -381,10 +379,12 @@ def arguments(
     from vvgt_cli.library.inputs import Look
 
     if optics is not None:
-        options["look"] = Look(**optics, light=light)
+        several = (optics["tf"] or [None]) if isinstance(optics["tf"], tuple) else [optics["tf"]]
+        looks = [Look(**optics | {"tf": tf}, light=light) for tf in several]
+        options["look"] = looks if len(looks) > 1 else looks[0]
     if blocks is not None:
         options["blocks"] = block_options_of(blocks)
-    return {**options, **read, "progress": console}
+    return {**options, **read, **({} if console is None else {"progress": console})}
 
 
 fit_options = group(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vvgt_cli.commands.view_files import Layout
-from vvgt_cli.commands.view_sets import CameraRequest, ViewsRequest, render_view_sets
+from vvgt_cli.commands.view_sets import camera_views, write_views
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.settings import BlockOptions
@@ -75,13 +75,11 @@ class PeerViews:
         Raises:
             DataError, UsageError: as `vvgt render-views`.
         """
-        assert source.tf is None or isinstance(source.tf, str), "reports are of files"
-        tfs = () if source.tf is None else (source.tf,)
         run = Run(Console(quiet=True), ConversionReport("report"))
         with run.stage("views") as stage:
-            cameras = CameraRequest(views=count, size=size)
-            request = ViewsRequest(source, tfs, str(folder), cameras, Layout("png"), blocks=blocks)
-            render_view_sets(request, run.console)
+            write_views(
+                run, {"": source}, folder, camera_views("sphere", count, size=size), Layout("png"), blocks=blocks
+            )
         return cls(folder, count, stage)
 
 

@@ -26,20 +26,20 @@ FIELDS = {  # tag of each parameter, by the option of `vvgt convert` whose help 
     "max_gaussians": "<integer>",
     "size": "<integer>",
 }
-HEAD = f"""<?xml version="1.0" encoding="utf-8"?>
+HEAD = """<?xml version="1.0" encoding="utf-8"?>
 <executable>
 <category>Rendering</category>
 <title>Gaussian Splats (command)</title>
 <description>Converts a volume under a transfer function to 3D Gaussian splats: a page that opens in a browser, or a
 file for viewers.</description>
-<version>{VERSION}</version>
+<version>{version}</version>
 <parameters>
 <label>Files</label><description>Volume and result</description>
 <boolean hidden="true"><name>slicer</name><longflag>slicer</longflag><label>slicer</label>
 <description>Says that Slicer calls</description><default>true</default></boolean>
 <image><name>volume</name><label>Volume</label>
 <description>Volume to convert</description><channel>input</channel><index>0</index></image>
-<file fileExtensions=".html,.ply,.spz,.sog,.glb,.usdc,.usdz"><name>output</name><label>Result</label>
+<file fileExtensions="{endings}"><name>output</name><label>Result</label>
 <description>Page, or file of Gaussians</description><channel>output</channel><index>1</index></file>
 </parameters>
 <parameters>
@@ -48,8 +48,10 @@ file for viewers.</description>
 
 def description() -> str:
     """Return the XML that describes `vvgt convert` to Slicer, with the help and defaults of its options."""
+    from vvgt_cli.gaussians.formats import ENDINGS
+
     options = {option.name: option for option in command.params if isinstance(option, click.Option)}
-    lines = [HEAD]
+    lines = [HEAD.format(version=VERSION, endings=",".join(ENDINGS))]
     for name, tag in FIELDS.items():
         option = options["layers" if name == LAYER else name]
         kind = tag[1:-1].partition(" ")[0]

@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.files import blender_json, colmap_model, point_cloud_ply, transforms_json
+from vvgt_cli.errors import UsageError
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.files import read_view
 from vvgt_cli.look.function import TransferFunctionLike
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.field.field import Field
 
-FORMATS = ("both", "exr", "png")
 CONTACT = "contact.png"
 POINTS_FILE = "points3d.ply"  # the original 3DGS code looks for this name
 POINTS = 20_000  # Gaussians of the closed form whose centres become the cloud
@@ -55,8 +55,13 @@ class Layout:
 
     format: str = "both"
     half: bool = False
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Sequence[float] = (0.0, 0.0, 0.0)
     points: bool = True
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for 16 bits of no EXR."""
+        if self.half and self.format == "png":
+            raise UsageError("--half applies to EXR, which --format png does not write; give only one of the two")
 
     @property
     def suffix(self) -> str:

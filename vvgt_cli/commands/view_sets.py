@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from vvgt_cli.commands.view_files import (
     thumbnail,
     thumbnails,
 )
-from vvgt_cli.conversion.manifest import Manifest, Shard
+from vvgt_cli.conversion.manifest import Manifest, Shard, parse_shard
 from vvgt_cli.device import on_device
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
 from vvgt_cli.field.blocked import Blocked
@@ -40,6 +41,7 @@ from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
 from vvgt_cli.images import write_png
 from vvgt_cli.jit.ahead import VIEWS, for_blocks
+from vvgt_cli.library.inputs import PathLike
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.version import VERSION
@@ -56,189 +58,220 @@ NO_POINTS = np.zeros((0, 3))
 SPHERE, ORBIT = "sphere", "orbit"
 
 
-@dataclass(frozen=True)
-class CameraRequest:
-    """Views to render.
+def camera_views(
+    cameras: PathLike | Sequence[Camera], views: int | None = None, test_views: int | None = None,
+    size: int | None = None, fov: float | None = None, radius: float | None = None,
+) -> list[View]:  # fmt: skip
+    """Return the views of a set, training views first; arguments are those of `vvgt_cli.render_views`.
 
-    Attributes:
-        kind: ``sphere``, ``orbit`` or the path of a `transforms.json`.
-        views, test_views: their numbers; None: 24 and 10. A file decides both.
-        size: image height in pixels; None: the file's, or 400.
-        fov: vertical field of view in degrees, None: 40.
-        radius: distance from the centre, unit frame, None: 3.
+    Raises:
+        UsageError: options that a file or cameras decide, or no such file.
+        DataError: an invalid file, or views of one name.
     """
+    if cameras not in (SPHERE, ORBIT):
+        given = {"--views": views, "--test-views": test_views, "--fov": fov, "--radius": radius}
+        if stated := [f"{option} {value}" for option, value in given.items() if value is not None]:
+            raise UsageError(f"{stated[0]}: the file of --cameras decides this; omit it")
+        if isinstance(cameras, str | os.PathLike):
+            return _read(os.fspath(cameras), size)
+        return [View("train", camera if size is None else camera.resized(size / camera.height)) for camera in cameras]
+    count, kept = (
+        SET_VIEWS["train"] if views is None else views,
+        SET_VIEWS["test"] if test_views is None else test_views,
+    )
+    lens: dict[str, Any] = {"size": size or SIZE, "fov": fov or FIELD_OF_VIEW, "radius": radius or RADIUS}
+    train = default_views("train", count, **lens) if cameras == SPHERE else orbit_views(count, **lens)
+    test = default_views("test", kept, **lens)
+    return [View("train", camera) for camera in train] + [View("test", camera) for camera in test]
 
-    kind: str = SPHERE
-    views: int | None = None
-    test_views: int | None = None
-    size: int | None = None
-    fov: float | None = None
-    radius: float | None = None
 
-    def make(self) -> list[View]:
-        """Return the views, training views first.
+def _read(path: str, size: int | None) -> list[View]:
+    if not Path(path).is_file():
+        raise UsageError(f"--cameras {path}: no such file; expected sphere, orbit or a transforms.json")
+    views: dict[str, View] = {}
+    frames = read_frames(path, size)
+    for frame in sorted(frames, key=lambda frame: frame.test):
+        # the Blender style names images without a suffix, so a dot would be read as one
+        name = re.sub(r"[^\w-]", "_", frame.camera.name)
+        if name in views:
+            raise DataError(f"{path}: two views become {name!r}; expected names that differ in letters or digits")
+        views[name] = View("test" if frame.test else "train", replace(frame.camera, name=name))
+    if all(frame.test for frame in frames):
+        raise DataError(f"{path}: all views are test views; expected some training views")
+    return list(views.values())
 
-        Raises:
-            UsageError: options that a file of cameras decides, or no such file.
-            DataError: an invalid file, or views of one name.
-        """
-        if self.kind not in (SPHERE, ORBIT):
-            return self._read()
-        size, fov, radius = self.size or SIZE, self.fov or FIELD_OF_VIEW, self.radius or RADIUS
-        count = SET_VIEWS["train"] if self.views is None else self.views
-        if self.kind == SPHERE:
-            train = default_views("train", count, size=size, radius=radius, fov=fov)
-        else:
-            train = orbit_views(count, size=size, radius=radius, fov=fov)
-        kept = SET_VIEWS["test"] if self.test_views is None else self.test_views
-        test = default_views("test", kept, size=size, radius=radius, fov=fov)
-        return [View("train", camera) for camera in train] + [View("test", camera) for camera in test]
 
-    def _read(self) -> list[View]:
-        given = {
-            "--views": self.views, "--test-views": self.test_views, "--fov": self.fov, "--radius": self.radius
-        }  # fmt: skip
-        for option, value in given.items():
-            if value is not None:
-                raise UsageError(f"{option} {value}: the file of --cameras decides this; omit it")
-        if not Path(self.kind).is_file():
-            raise UsageError(f"--cameras {self.kind}: no such file; expected sphere, orbit or a transforms.json")
-        views: dict[str, View] = {}
-        frames = read_frames(self.kind, self.size)
-        for frame in sorted(frames, key=lambda frame: frame.test):
-            # the Blender style names images without a suffix, so a dot would be read as one
-            name = re.sub(r"[^\w-]", "_", frame.camera.name)
-            if name in views:
-                raise DataError(
-                    f"{self.kind}: two views become {name!r}; expected names that differ in letters or digits"
-                )
-            views[name] = View("test" if frame.test else "train", replace(frame.camera, name=name))
-        if all(frame.test for frame in frames):
-            raise DataError(f"{self.kind}: all views are test views; expected some training views")
-        return list(views.values())
+def folders_of(root: Path, names: Sequence[str]) -> list[Path]:
+    """Return one folder for each look: in ``root``, by its name in plain characters, where there are several.
+
+    Raises:
+        UsageError: two looks of one name, or a folder that cannot be made.
+    """
+    check_folder(root, "views")
+    if len(names) == 1:
+        return [root]
+    found: dict[str, str] = {}
+    for name in names:
+        plain = re.sub(r"[^\w.-]+", "_", name).strip(".") or "function"
+        if plain in found:
+            raise UsageError(f"functions {found[plain]} and {name} would both go to {root / plain}; rename one")
+        found[plain] = name
+    return [root / plain for plain in found]
 
 
 @dataclass(frozen=True)
-class ViewsRequest:
-    """A set of views for each function.
+class Rays:
+    """How views are rendered; arguments of `vvgt_cli.render_views`."""
 
-    Attributes:
-        source: volume to read; its ``tf`` is not used.
-        tfs: transfer functions; empty: one made from the histogram.
-        output: directory; several functions get a subdirectory each, by name.
-        cameras: views to render.
-        layout: files to write.
-        renderer: ``vvgt`` or ``vtk``.
-        samples: rays along a pixel's edge everywhere, None: 5 or 13 where neighbours differ, else 1.
-        step: sampling distance in voxels.
-        shard: part of the views to render.
-        overwrite: replace the views of another run.
-        blocks: how the volume is processed in blocks; None: in memory, or in blocks if it is large.
-        device: "cpu" or "cuda", where our own renderer casts the rays of a volume in memory.
-    """
-
-    source: SourceRequest
-    tfs: tuple[str, ...]
-    output: str
-    cameras: CameraRequest = field(default_factory=CameraRequest)
-    layout: Layout = field(default_factory=Layout)
     renderer: str = "vvgt"
-    samples: int | None = None
+    samples: int | str = "adaptive"
     step: float = 0.5
-    shard: Shard = field(default_factory=Shard)
-    overwrite: bool = False
-    blocks: BlockOptions | None = None
     device: str = "cpu"
 
-    def folders(self) -> list[Path]:
-        """Return one folder per function.
-
-        Raises:
-            UsageError: two functions of one name, or a folder that cannot be made.
-        """
-        root = Path(self.output)
-        check_folder(root, "views")
-        if len(self.tfs) < 2:
-            return [root]
-        names: dict[str, str] = {}
-        for tf in self.tfs:
-            name = function_name(tf)
-            if name in names:
-                raise UsageError(f"--tf {names[name]} and --tf {tf} would both go to {root / name}; rename one")
-            names[name] = tf
-        return [root / name for name in names]
-
-
-def function_name(tf: str) -> str:
-    """Return the folder name of a function: its file's stem, `#Preset` and colour-map range in plain characters."""
-    path, _, pick = tf.partition("#")
-    name = re.sub(r"\.json$", "", path.replace("\\", "/").rpartition("/")[2], flags=re.I)
-    return re.sub(r"[^\w.-]+", "_", f"{name}-{pick}" if pick else name).strip(".") or "function"
+    def __post_init__(self) -> None:
+        """Raise UsageError for samples that VTK has not."""
+        if self.renderer == "vtk" and self.samples not in ("adaptive", 1):
+            raise UsageError(f"--samples {self.samples}: VTK casts one ray per pixel; omit it")
 
 
 @dataclass
-class _Job:
+class _Set:
     """One function's folder and the views to render there."""
 
     source: Source
+    blocks: Blocked | None  # where the volume is not in memory
     manifest: Manifest
+    layout: Layout
+    views: list[View]
     pending: list[View]  # this part's
     files: list[str]  # of the descriptions and models that this part writes
     small: dict[str, np.ndarray] = field(default_factory=dict)  # thumbnails of views that were rendered
-    field: Blocked | None = None  # where the volume is not in memory
 
     @property
     def folder(self) -> Path:
         return self.manifest.folder
 
 
-def render_view_sets(request: ViewsRequest, console: Console | None = None) -> int:
-    """Render the missing views and return their number.
+Opened = list[tuple[Source, Blocked | None]]
+Points = Callable[[int], tuple[np.ndarray, np.ndarray]]
+
+
+def open_looks(
+    run: Run, requests: Sequence[SourceRequest], blocks: BlockOptions | None, folders: Sequence[Path] | None,
+    size: int, renderer: str, stack: ExitStack,
+) -> Opened:  # fmt: skip
+    """Return a volume under each of several looks, with its field if it is read in blocks, which ``stack`` closes.
+
+    Args:
+        run: times the stages.
+        requests: for one volume.
+        blocks: None: in blocks if the volume is large.
+        folders: blocks are kept beside them, one a look; None: in a temporary folder, for one.
+        size: px, height of a view.
+        renderer: "vtk" needs the volume in memory.
+        stack: closes what is opened.
+
+    Raises:
+        DataError: a volume or function that is not valid, or a sheared volume.
+        UsageError: a renderer that needs the volume in memory.
+    """
+    options, opened = blocks or automatic(requests[0], run.console), Opened()
+    if options is not None and renderer != "vvgt":
+        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: vvgt")
+    if options is None:
+        with run.stage("read") as stage:
+            opened = [(source, None) for source in load_all(requests)]
+            stage.note = describe_source(opened[0][0])
+    else:
+        for request, folder in zip(requests, folders or [Path()], strict=True):
+            store = stack.enter_context(store_beside(str(folder) if folders else None))
+            part = stack.enter_context(blocked(run, request, options, store, FieldNeeds(POINTS, size)))
+            opened.append((part.source, part))
+    volume = opened[0][0].volume
+    if volume.sheared:
+        raise DataError(
+            f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
+            "volume; resample it first ('vvgt convert' accepts it)"
+        )
+    sources = [source for source, _ in opened]
+    lit = [source for source in sources if source.lighting is not None]
+    lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
+    kernels = (lit or sources)[-1].kernels(VIEWS)
+    run.compile(for_blocks(kernels) if options else kernels, sources[0].kernel_type())
+    return opened
+
+
+def prepare(
+    run: Run, source: Source, blocks: Blocked | None, rays: Rays, cameras: Sequence[Camera]
+) -> tuple[Draw, Points]:
+    """Return what draws a view of ``cameras``, and what makes points to start from for a size in px."""
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.dvr.backends import view_renderer
+
+    settings = RenderSettings(rays.step, None if rays.samples == "adaptive" else int(rays.samples))
+    if blocks is not None:
+        return draw_in_blocks(blocks, settings, cameras), partial(field_points, blocks)
+    with run.stage("scene") as stage:
+        scene = on_device(source.scene(), rays.device, run.console.message)
+        stage.note = f"{source.name}, opacity per {source.unit_distance:g} ({source.unit_label})"
+    inside = view_renderer(rays.renderer, scene, settings) if cameras else partial(render_view, scene)
+    return render_in_box(inside, scene.volume.axes), partial(start_points, scene)
+
+
+def render_looks(
+    console: Console, requests: Mapping[str, SourceRequest], views: list[View], rays: Rays, blocks: BlockOptions | None,
+    output: PathLike | None, shard: str, overwrite: bool, *layout: Any,
+) -> tuple[list[Camera], np.ndarray | None]:  # fmt: skip
+    """Return the cameras, and the images (n, h, w, 4) of one look unless they are written.
+
+    Arguments and errors are those of `vvgt_cli.render_views`; ``layout`` are those of `Layout`.
+    """
+    run, part = Run(console, ConversionReport("render-views")), parse_shard(shard)
+    if overwrite and part.count > 1:
+        raise UsageError(
+            "--overwrite with --shard: shards would remove each other's files; remove the directory instead"
+        )
+    cameras = [view.camera for view in views if view.split == "train" or output is not None]
+    if output is not None:
+        write_views(run, requests, Path(output), views, Layout(*layout), rays, part, overwrite, blocks)
+        return cameras, None
+    if len(requests) > 1 or len({(camera.width, camera.height) for camera in cameras}) != 1:
+        raise UsageError(
+            f"{len(requests)} looks, {len(cameras)} cameras; expected, without a folder to write, one look and cameras "
+            "of one size"
+        )
+    with ExitStack() as stack:
+        asked, height = list(requests.values()), cameras[0].height
+        ((source, field),) = open_looks(run, asked, blocks, None, height, rays.renderer, stack)
+        draw, _ = prepare(run, source, field, rays, cameras)
+        return cameras, np.stack([draw(camera) for camera in cameras])
+
+
+def write_views(
+    run: Run, requests: Mapping[str, SourceRequest], output: Path, views: list[View], layout: Layout,
+    rays: Rays | None = None, shard: Shard | None = None, overwrite: bool = False, blocks: BlockOptions | None = None,
+) -> None:  # fmt: skip
+    """Render the missing views of a volume under each look, by name, into a folder, or one in it for each of several.
 
     Raises:
         UsageError: a folder with another run's views or unknown files, or options that do not fit.
         DataError: invalid input, or a function that shows nothing.
     """
-    if request.overwrite and request.shard.count > 1:
-        raise UsageError(
-            "--overwrite with --shard: shards would remove each other's files; remove the directory instead"
-        )
-    if request.renderer == "vtk" and request.samples not in (None, 1):
-        raise UsageError(f"--samples {request.samples}: VTK casts one ray per pixel; omit it")
-    run = Run(console or Console(), ConversionReport("render-views"))
-    views, folders = request.cameras.make(), request.folders()
+    folders, asked = folders_of(output, list(requests)), list(requests.values())
+    rays, shard = rays or Rays(), shard or Shard()
     with ExitStack() as stack:
-        functions = dict(zip(folders, request.tfs or (None,), strict=True))
-        size = views[0].camera.height
-        fields = fields_of(run, request.source, request.blocks, functions, size, request.renderer, stack)
-        if fields is None:
-            with run.stage("read") as stage:
-                sources = load_all(request.source, request.tfs or (None,))
-                stage.note = describe_source(sources[0])
-        else:
-            sources = [field.source for field in fields]
-        volume = sources[0].volume
-        if volume.sheared:
-            raise DataError(
-                f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
-                "volume; resample it first ('vvgt convert' accepts it)"
-            )
-        lit = [source for source in sources if source.lighting is not None]
-        lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
-        kernels = (lit or sources)[-1].kernels(VIEWS)
-        run.compile(kernels if fields is None else for_blocks(kernels), sources[0].kernel_type())
+        opened = open_looks(run, asked, blocks, folders, views[0].camera.height, rays.renderer, stack)
         with run.stage("plan") as stage:
-            jobs = _plan(request, views, folders, sources, fields)
-            total = sum(len(job.pending) for job in jobs)
-            stage.note = f"{len(jobs) * len(views)} views, {total} to render here"
-        for job in jobs:
-            _work(run, request, job, views)
-            if job.field is not None:
-                job.field.run_pass.store.remove()
-    return total
+            sets = _plan(opened, folders, views, layout, rays, shard, overwrite)
+            total = sum(len(one.pending) for one in sets)
+            stage.note = f"{len(sets) * len(views)} views, {total} to render here"
+        for one in sets:
+            _work(run, one, rays)
+            if one.blocks is not None:
+                one.blocks.run_pass.store.remove()
 
 
-def _settings(request: ViewsRequest, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
+def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
     """Return everything that the files depend on, named as on the command line."""
     cameras = {split: [view.camera for view in views if view.split == split] for split in ("train", "test")}
     sizes = dict.fromkeys(f"{view.camera.width} x {view.camera.height}" for view in views)
@@ -253,78 +286,66 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
         "size": ", ".join(sizes),
         "cameras": cameras_digest(cameras["train"] + cameras["test"]),
         **({} if source.volume.direction == IDENTITY else {"direction": list(source.volume.direction)}),
-        "renderer": request.renderer,
-        "samples": 1 if request.renderer == "vtk" else request.samples or "adaptive",
-        "step": request.step,
-        "format": request.layout.format,
-        "half": request.layout.half,
-        "background": list(request.layout.background),
-        **({} if request.layout.points else {"points": False}),
+        "renderer": rays.renderer,
+        "samples": 1 if rays.renderer == "vtk" else rays.samples,
+        "step": rays.step,
+        "format": layout.format,
+        "half": layout.half,
+        "background": list(layout.background),
+        **({} if layout.points else {"points": False}),
     }
 
 
 def _plan(
-    request: ViewsRequest, views: list[View], folders: list[Path], sources: list[Source], fields: list[Blocked] | None
-) -> list[_Job]:
+    opened: Opened, folders: Sequence[Path], views: list[View], layout: Layout, rays: Rays, shard: Shard,
+    overwrite: bool,
+) -> list[_Set]:  # fmt: skip
     """Find what is missing in every folder, before anything is written."""
-    content, layout = volume_digest(sources[0].volume), request.layout
-    first = request.shard.index == 1  # the first part describes the set
-    jobs = []
-    for i, (folder, source) in enumerate(zip(folders, sources, strict=True)):
-        manifest = Manifest(folder, _settings(request, views, source, content), request.shard)
+    content = volume_digest(opened[0][0].volume)
+    sets = []
+    for i, (folder, (source, blocks)) in enumerate(zip(folders, opened, strict=True)):
+        manifest = Manifest(folder, _settings(layout, rays, views, source, content), shard)
         files = [*layout.descriptions(views), *layout.model_names()]
         planned = [name for view in views for name in layout.files(view)]
-        manifest.open([*planned, *files, CONTACT], request.overwrite)
-        mine = [view for j, view in enumerate(views) if request.shard.holds(i * len(views) + j)]
+        manifest.open([*planned, *files, CONTACT], overwrite)
+        mine = [view for j, view in enumerate(views) if shard.holds(i * len(views) + j)]
         pending = [view for view in mine if not all(map(manifest.complete, layout.files(view)))]
-        missing = [name for name in files if first and not manifest.complete(name)]
-        jobs.append(_Job(source, manifest, pending, missing, field=None if fields is None else fields[i]))
-    return jobs
+        # the first part describes the set
+        missing = [name for name in files if shard.index == 1 and not manifest.complete(name)]
+        sets.append(_Set(source, blocks, manifest, layout, views, pending, missing))
+    return sets
 
 
-def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None:
+def _work(run: Run, one: _Set, rays: Rays) -> None:
     """Make what is missing in one function's folder; whatever may fail early runs before the first write."""
-    from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.dvr.backends import view_renderer
-
-    manifest, layout = job.manifest, request.layout
+    manifest, layout, views = one.manifest, one.layout, one.views
     built = layout.descriptions(views)
-    models = any(name not in built for name in job.files)
-    settings = RenderSettings(request.step, request.samples)
-    draw: Draw | None = None
-    points: Callable[[int], tuple[np.ndarray, np.ndarray]]
-    if job.field is not None:
-        draw = draw_in_blocks(job.field, settings, [view.camera for view in job.pending])
-        points = partial(field_points, job.field)
-    elif job.pending or models:
-        with run.stage("scene") as stage:
-            scene = on_device(job.source.scene(), request.device, run.console.message)
-            stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
-        inside = view_renderer(request.renderer, scene, settings) if job.pending else None
-        draw = None if inside is None else render_in_box(inside, scene.volume.axes)
-        points = partial(start_points, scene)
+    models = any(name not in built for name in one.files)
+    if one.pending or models:
+        draw, points = prepare(run, one.source, one.blocks, rays, [view.camera for view in one.pending])
     if models and layout.points:
         with run.stage("points") as stage:
             found = points(views[0].camera.height)
             if not len(found[0]):
-                raise NothingVisible(job.source.volume.name, job.source.tf.name)
+                raise NothingVisible(one.source.volume.name, one.source.tf.name)
             stage.note = f"{len(found[0])} points to start from"
         built |= layout.models(views, *found)
     elif models:
         built |= layout.models(views, NO_POINTS, NO_POINTS)
     for name in ("", *layout.folders(views)):
-        (job.folder / name).mkdir(parents=True, exist_ok=True)
-    with claim(job.folder / request.shard.manifest):
-        if job.files or not (job.folder / request.shard.manifest).exists():
+        (one.folder / name).mkdir(parents=True, exist_ok=True)
+    own = one.folder / manifest.shard.manifest
+    with claim(own):
+        if one.files or not own.exists():
             manifest.record()  # first: it says whose the folder is
-            _write(manifest, {name: built[name] for name in job.files})
-        if job.pending and draw is not None:
-            _render(run, request, job, draw)
-        _contact(run, job, layout, views)
+            _write(manifest, {name: built[name] for name in one.files})
+        if one.pending:
+            _render(run, one, draw)
+        _contact(run, one)
 
 
-def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
-    for path in (job.folder / name for view in job.pending for name in request.layout.files(view)):
+def _render(run: Run, one: _Set, draw: Draw) -> None:
+    for path in (one.folder / name for view in one.pending for name in one.layout.files(view)):
         for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):  # by a killed run
             left.unlink(missing_ok=True)
     with run.stage("views") as stage:
@@ -332,38 +353,38 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
         with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
             written: Future[list[str]] = writer.submit(list)
             try:
-                for done, view in enumerate(job.pending, 1):
+                for done, view in enumerate(one.pending, 1):
                     image = draw(view.camera)
-                    job.manifest.record(written.result())
-                    written = writer.submit(_keep, job, request.layout, view, image)
+                    one.manifest.record(written.result())
+                    written = writer.submit(_keep, one, view, image)
                     if bar:
-                        bar(done, len(job.pending))
+                        bar(done, len(one.pending))
             finally:
-                job.manifest.record(written.result())
-        camera = job.pending[0].camera
-        stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
+                one.manifest.record(written.result())
+        camera = one.pending[0].camera
+        stage.note = f"{len(one.pending)} views of {camera.width} x {camera.height} px in {one.folder}"
 
 
-def _keep(job: _Job, layout: Layout, view: View, image: np.ndarray) -> list[str]:
+def _keep(one: _Set, view: View, image: np.ndarray) -> list[str]:
     """Write a view's images, keep its thumbnail if no pixel is rounded, and return the relative paths."""
-    if layout.exact:
-        job.small[view.stem] = thumbnail(image, view.camera)
-    return layout.write(job.folder, view, image)
+    if one.layout.exact:
+        one.small[view.stem] = thumbnail(image, view.camera)
+    return one.layout.write(one.folder, view, image)
 
 
-def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
+def _contact(run: Run, one: _Set) -> None:
     """Write the contact sheet once all shards' views exist; the run that completes them does it."""
-    manifest = job.manifest
+    manifest, layout, views = one.manifest, one.layout, one.views
     manifest.refresh()
     names = [name for view in views for name in layout.files(view)]
     if not all(manifest.complete(name, content=False) for name in names):
-        run.console.message(f"{job.folder}: views of other shards are missing; the last shard writes {CONTACT}")
+        run.console.message(f"{one.folder}: views of other shards are missing; the last shard writes {CONTACT}")
         return
-    if job.pending or not manifest.complete(CONTACT):
+    if one.pending or not manifest.complete(CONTACT):
         with run.stage("contact sheet"):
-            write_png(job.folder / CONTACT, thumbnails(job.folder, views, layout.background, job.small), overwrite=True)
+            write_png(one.folder / CONTACT, thumbnails(one.folder, views, layout.background, one.small), overwrite=True)
             manifest.record([CONTACT])
-    job.small.clear()
+    one.small.clear()
 
 
 def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
@@ -374,34 +395,6 @@ def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
 
 
 TOGETHER = 1 << 24  # pixels of views that are made at once
-
-
-def fields_of(
-    run: Run,
-    source: SourceRequest,
-    options: BlockOptions | None,
-    functions: dict[Path, str | None],
-    size: int,
-    renderer: str,
-    stack: ExitStack,
-) -> list[Blocked] | None:
-    """Return a field in blocks for each function (by folder), None if the volume is read whole; ``stack`` closes them.
-
-    A view is ``size`` px high; ``options`` None: automatic. Raise UsageError for a ``renderer`` that needs the volume
-    in memory.
-    """
-    options = options or automatic(source, run.console)
-    if options is None:
-        return None
-    if renderer != "vvgt":
-        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: vvgt")
-    fields = []
-    for folder, tf in functions.items():
-        store = stack.enter_context(store_beside(str(folder)))
-        fields.append(
-            stack.enter_context(blocked(run, replace(source, tf=tf), options, store, FieldNeeds(POINTS, size)))
-        )
-    return fields
 
 
 def draw_in_blocks(

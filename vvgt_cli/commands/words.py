@@ -8,6 +8,7 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import click
 from click.core import ParameterSource
@@ -137,6 +138,11 @@ SECTIONS = {  # parameters by name, in the order shown; all others come first, u
 
 class SectionedCommand(click.Command):
     """A command that lists its options under the headings of `SECTIONS`, and takes one value of most of them."""
+
+    def __init__(self, name: str | None, *, help: str | None = None, **attributes: Any) -> None:
+        """Keep the lines of examples apart: click wraps other paragraphs."""
+        text = re.sub(r"\n( *)(Examples?:\n)", "\n\\1\b\n\\1\\2", help or "")
+        super().__init__(name, help=text, **attributes)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments; where there are more files than expected, say how a series is given.

@@ -25,7 +25,7 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.streamed import is_streamed
+from vvgt_cli.gaussians.formats.streamed import folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
@@ -49,7 +49,8 @@ def check_request(request: ConvertRequest) -> None:
 def plan_of(request: ConvertRequest, console: Console | None = None) -> Plan:
     """Return the plan of `convert`, after reading the volume and timing a small view; errors are those of `convert`."""
     run = Run(console or Console(), ConversionReport("convert"))
-    check_outputs(request.outputs(), request.inputs(), request.overwrite)
+    with folder_of(request.output):
+        check_outputs(request.outputs(), request.inputs(), request.overwrite)
     with open_field(run, request, resumes=False) as field:
         work = work_of(run, request, field)
         _, plan = _planned(work, request)

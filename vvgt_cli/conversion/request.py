@@ -166,7 +166,7 @@ class ConvertRequest:
         if known is not None and known.suffix == ".html":
             header, each = page_bytes(degree, self.live or self.editor, not self.live)
             header += SMALLEST_SLICES if self.slices else 0
-        elif known is not None and self.limits.max_megabytes is not None:
+        elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
             raise UsageError(
                 f"--max-size needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"
             )

@@ -129,16 +129,17 @@ class Result:
         )
 
     def recolor(
-        self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
-        labels: str | LabelTable | None = None, light: LightOptions | None = None,
+        self, tf: str | TransferFunction | None = None, *, tf_range: str = "data",
+        opacity_unit_distance: str | None = None, labels: str | LabelTable | None = None,
+        light: LightOptions | None = None,
         layers: Mapping[int | str, str | TransferFunction | LabelTable] | None = None,
     ) -> Result:  # fmt: skip
         """Return live Gaussians (``convert(..., live=True)``) under another function: ``vvgt recolor``.
 
         Args:
-            look: file, colour map's name, or a function; None: their own.
-            range: "data", "rescale" or "LO,HI": position of the function's nodes.
-            unit_distance: world length of the opacities, "paraview" or "mean-spacing"; None: the function's own.
+            tf: file, colour map's name, or a function; None: their own.
+            tf_range: "data", "rescale" or "LO,HI": position of the function's nodes.
+            opacity_unit_distance: a length in the world, "paraview" or "mean-spacing"; None: the function's own.
             labels: for a label map, a table, its file, or "auto"; None: their own.
             light: light options; None: those of the function's file, else those they were made under.
             layers: for several layers or channels, functions or label tables by number or name; the others keep
@@ -151,9 +152,9 @@ class Result:
         from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
 
         others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
-        asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions(), others)
-        tf, options = resolve_look("result", self.ply, asked)
-        found = apply_function(self.gaussians, self.ply, tf, options)
+        asked = FunctionRequest(tf, tf_range, opacity_unit_distance, labels, light or LightOptions(), others)
+        function, options = resolve_look("result", self.ply, asked)
+        found = apply_function(self.gaussians, self.ply, function, options)
         return Result(found, ConversionReport("recolor"), options)
 
     def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:

@@ -281,13 +281,11 @@ def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
         DataError: a file is not valid, or the function leaves the volume invisible.
         UsageError: the options do not suit the file.
     """
-    return load_all(request, (request.tf,), access)[0]
+    return load_all([request], access)[0]
 
 
-def load_all(
-    request: SourceRequest, tfs: Sequence[str | TransferFunction | None], access: Access = IN_MEMORY
-) -> list[Source]:
-    """Read one volume and return it under each of several functions; ``request.tf`` is ignored.
+def load_all(requests: Sequence[SourceRequest], access: Access = IN_MEMORY) -> list[Source]:
+    """Read one volume and return it under each of several looks.
 
     Raises:
         DataError, UsageError: see `load`.
@@ -295,21 +293,22 @@ def load_all(
     from vvgt_cli.look import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.look.resolve import parse_tf_range
 
-    tf_range = parse_tf_range(request.tf_range)
-    functions = [
-        read_transfer_function(tf) if isinstance(tf, str) else tf for tf in tfs
-    ]  # functions are small: report their errors before reading the volume
-    if None in functions and tf_range != "data":
-        raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
-    content = access.open(request.volume, request.read)
-    reused = content is request.volume and access is IN_MEMORY  # for several functions
-    if not is_plain(content, functions[0], request.labels, request.layers, access):
-        return [_layered(request, content, tf, tf_range, access) for tf in functions]
-    volume = content.volumes[0]
-    unit_distance(request.unit_distance, volume)  # report its errors first
-    stats = content.statistics if reused else access.statistics(volume)
-    sources = []
-    for tf in functions:
+    functions = []  # which are small: report their errors before reading the volume
+    for request in requests:
+        tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
+        functions.append((request, tf, parse_tf_range(request.tf_range)))
+        if tf is None and request.tf_range != "data":
+            raise UsageError("--tf-range: it places the nodes of a function; expected --tf as well")
+    content = access.open(requests[0].volume, requests[0].read)
+    reused = content is requests[0].volume and access is IN_MEMORY  # for several functions
+    volume, sources, stats = content.volumes[0], [], None
+    for request, tf, tf_range in functions:
+        if not is_plain(content, tf, request.labels, request.layers, access):
+            sources.append(_layered(request, content, tf, tf_range, access))
+            continue
+        unit_distance(request.unit_distance, volume)  # report its errors first
+        if stats is None:
+            stats = content.statistics if reused else access.statistics(volume)
         whole = request.statistics[0] if request.statistics else stats
         if tf:
             shown = resolve(tf, whole, tf_range, volume.hounsfield)

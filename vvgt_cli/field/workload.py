@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -146,8 +146,12 @@ def _quickest(call: Callable[[], object], calls: int = 3) -> float:
     return min(taken)
 
 
+@cache
 def pace() -> float:
-    """Return this machine's time relative to the machine of the fit, drawing Gaussians on as many threads."""
+    """Return this machine's time relative to the machine of the fit, drawing Gaussians on as many threads.
+
+    It is measured once a process: a batch asks for it at every frame.
+    """
     from vvgt_cli.cameras import default_views
     from vvgt_cli.splat import render
 

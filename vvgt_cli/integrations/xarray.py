@@ -11,8 +11,7 @@ from typing import Any
 
 import xarray
 
-from vvgt_cli.library.functions import convert, render_views
-from vvgt_cli.library.session import Session
+import vvgt_cli as vvgt
 
 
 @xarray.register_dataarray_accessor("vvgt")  # type: ignore[no-untyped-call]
@@ -25,12 +24,12 @@ class Accessor:
 
     def convert(self, look: Any = None, goal: Any = None, **options: Any) -> Any:
         """Convert the array; see `vvgt_cli.convert`. A ``time`` axis needs ``time=N``."""
-        return convert(self._array, look, goal, **options)
+        return vvgt.convert(self._array, look, goal, **options)
 
-    def render_views(self, output: Any, **options: Any) -> Any:
+    def render_views(self, look: Any = None, output: Any = None, **options: Any) -> Any:
         """Render calibrated views of the array; see `vvgt_cli.render_views`."""
-        return render_views(self._array, output, **options)
+        return vvgt.render_views(self._array, look, output, **options)
 
-    def session(self, **reading: Any) -> Session:
+    def session(self, **reading: Any) -> vvgt.Session:
         """Return a session, which reads the array once for several looks; see `vvgt_cli.Session`."""
-        return Session(self._array, **reading)
+        return vvgt.Session(self._array, **reading)

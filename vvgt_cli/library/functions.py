@@ -1,36 +1,33 @@
-"""The commands as functions, with the options of docs/commands."""
+"""Conversions and reading as functions, and sessions: a volume for several conversions."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     Goal,
     GoalLike,
-    LookLike,
     LooksLike,
     PathLike,
     Reading,
     VolumeLike,
     blocks_of,
     console_of,
+    content_of,
     looks_of,
     source_of,
     volume_of,
     with_look,
 )
 from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import Stored
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from vvgt_cli.conversion.clouds import Clouds
 
 
@@ -117,45 +114,39 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     return open_gaussians(os.fspath(path))
 
 
-def render_views(
-    volume: VolumeLike,
-    look: LookLike = None,
-    cameras: Sequence[Camera] | int = 24,
-    *,
-    size: int = 400,
-    step: float = 0.5,
-    **reading: Unpack[Reading],
-) -> tuple[list[Camera], np.ndarray]:
-    """Render pictures of a volume in memory; ``vvgt render-views`` writes them for trainers.
+class Session:
+    """A volume, read and laid out once, for conversions under one function after another.
 
     >>> import vvgt_cli as vvgt
-    >>> cameras, images = vvgt.render_views("example:blob:16", cameras=2, size=32)
-    >>> images.shape
-    (2, 32, 32, 4)
+    >>> session = vvgt.Session("example:blob:16")
+    >>> few = {"max_gaussians": 20, "size": 32, "steps": 0}
+    >>> [len(session.convert(tf, few).gaussians) <= 20 for tf in ("gray", "viridis")]
+    [True, True]
+
+    It can be passed wherever the library takes a volume.
 
     Args:
-        volume: as in `convert`.
-        look: as in `convert`.
-        cameras: cameras in the unit frame, all of one size, or the number of training views.
-        size: pixels along the edge of the training views.
-        step: step along a ray, in voxels.
-
-    Returns:
-        cameras, images: (n, h, w, 4) float32, premultiplied RGBA.
+        volume, reading: as in `convert`.
 
     Raises:
-        DataError, UsageError: see `convert`; cameras differ in size.
+        DataError, UsageError: see `convert`.
     """
-    import numpy as np
 
-    from vvgt_cli.cameras.boxed import render_in_box
-    from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.field.source import load
+    def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
+        """Read the volume; see the class."""
+        self.content = content_of(volume, reading)
+        if isinstance(self.volume.data, Stored):
+            raise UsageError(
+                f"{self.volume.name}: a Dask array, which is not in memory; convert it without a session, or pass "
+                "the result of its compute()"
+            )
+        self.content.prepare()
 
-    views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
-    if len({(view.width, view.height) for view in views}) != 1:
-        raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
-    source = load(source_of(volume, look, reading))
-    scene = source.scene()
-    draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
-    return views, np.stack([draw(view) for view in views])
+    @property
+    def volume(self) -> Volume:
+        """Return the volume, or the first of colours and channels."""
+        return self.content.volumes[0]
+
+    def convert(self, look: LooksLike = None, goal: GoalLike = None, **options: Any) -> Conversion | Clouds:
+        """Convert the volume under another look, or several, with the options of `convert`."""
+        return convert(self, look, goal, **options)

@@ -137,7 +137,8 @@ def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
     if not names or len(set(names)) < len(names):
         stated = ", ".join(dict.fromkeys(names)) or "none"
         raise UsageError(
-            f"{len(looks)} looks, named {stated}; expected one name each: pass a mapping of names to looks"
+            f"{len(looks)} looks, named {stated}; expected one name each: rename a file, or pass a "
+            "mapping of names to looks"
         )
     return dict(zip(names, looks, strict=True)), True
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.function import BY, PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS
-from vvgt_cli.look.resolve import BY
 
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:

@@ -15,7 +15,16 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.volume.types import triple
 
-DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma", "mean", "level")
+DOMAINS = {  # of nodes: words of an axis, and, where the data decide their values, of messages
+    "data": ("data value", ""),
+    "fraction": ("fraction of the data range", ""),
+    "percentile": ("fraction of the voxels", "percentiles"),
+    "foreground": ("fraction of the voxels in front of the background", "percentiles of the foreground"),
+    "sigma": ("standard deviations above the mean", "standard deviations"),
+    "mean": ("multiples of the foreground's mean", "multiples of the mean"),
+    "level": ("level", "levels"),
+}
+BY = {domain: words for domain, (_, words) in DOMAINS.items() if words}
 PER_VOXEL = "mean-spacing"  # as --opacity-unit-distance calls it
 SPACES = ("RGB", "HSV", "Lab", "Prolab", "Diverging", "Lab/CIEDE2000", "Step")  # ParaView's ColorSpace
 PATH_SAMPLES = 1025  # colours, of 8 bits a channel, by which a CIEDE2000 path between two nodes is kept
@@ -166,11 +175,8 @@ class ColorMap:
 def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
     """Check the arrays of a function and sort them as VTK does (equal positions keep their order), float64.
 
-    Args:
-        nodes: empty midpoints and sharpness become 0.5 and 0.
-        what: the function, for messages.
-        column: name of the attribute with the values.
-        called: name of the values in messages.
+    Empty midpoints and sharpness become 0.5 and 0; ``column`` is the attribute with the values, ``called`` so in
+    messages.
 
     Raises:
         DataError: no node, lengths that differ, a value that is not finite, or one outside [0, 1] (positions aside).

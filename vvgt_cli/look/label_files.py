@@ -75,18 +75,27 @@ def holds_table(source: str | None) -> bool:
 def is_table(path: Path) -> bool:
     """Return whether a file holds a table of labels and nothing else, by its name and first line."""
     suffix = path.suffix.lower()
-    if suffix not in TEXTS:
+    if suffix not in (*TEXTS, *SEPARATED):
         return suffix in TABLES
     try:
         text = text_of(path, "a table of labels")
         if text.lstrip().startswith(("{", "[")):
             parsed = json_of(text, path)
             function = '"RGBPoints"' in text or any(one.matches(parsed) for one in (slicer, minimal, lut))
-            return not function and bool(table_of(parsed, str(path)))
+            alone = isinstance(parsed, dict) and [*map(type, parsed.values())] == [int]  # {"a": 1} may be anything
+            return not function and not alone and bool(table_of(parsed, str(path)))
     except DataError:
         return False
     rows = (line.strip() for line in text.splitlines())
     first = next((row for row in rows if row and not row.startswith("#")), "")
+    if suffix in SEPARATED:
+        head = [cell.strip().lower() for cell in re.split("[\t,;]", first)]
+        numbers, rest = (
+            set(COLUMNS["number"]) & set(head),
+            {name for key in COLUMNS for name in COLUMNS[key]} & set(head),
+        )
+        named = len(head) > 1 and not _DECIMAL.fullmatch(head[1])
+        return bool(numbers and len(rest) > 1) or (named and bool(_INTEGER.fullmatch(head[0])))
     return bool(_SNAP.fullmatch(first) or _plain(first))
 
 

@@ -9,15 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.function import PER_VOXEL, TransferFunction
+from vvgt_cli.look.function import BY, PER_VOXEL, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import Volume
 
-BY = {"percentile": "percentiles", "foreground": "percentiles of the foreground", "sigma": "standard deviations"}
-BY |= {"mean": "multiples of the mean", "level": "levels"}
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
@@ -45,12 +43,9 @@ def resolve(
     With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which was
     assumed: values if the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
 
-    Args:
-        tf: as read; of any domain.
-        statistics: of the data.
-        tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale`` stretches
-            them linearly to the data range, ``LO,HI`` to that range.
-        hounsfield: whether the file states that data values are Hounsfield units; else the histogram decides.
+    ``tf_range``: ``data`` takes nodes as they are (fractions and percentiles: of the data), ``rescale`` stretches them
+    linearly to the data range, ``LO,HI`` to that range. ``hounsfield`` is whether the file states Hounsfield units;
+    else the histogram decides.
 
     Raises:
         DataError: no finite voxel; a function of one position to stretch.

@@ -8,19 +8,10 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.files import atomic_write
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import DOMAINS, TransferFunction
 from vvgt_cli.volume.stats import Statistics
 
 SAMPLES = 1024
-X_LABEL = {
-    "data": "data value",
-    "fraction": "fraction of the data range",
-    "percentile": "fraction of the voxels",
-    "foreground": "fraction of the voxels in front of the background",
-    "mean": "multiples of the foreground's mean",
-    "level": "level",
-    "sigma": "standard deviations above the mean",
-}
 
 
 def draw(
@@ -42,7 +33,7 @@ def draw(
         _draw_histogram(axes, statistics)
     x = np.unique(np.concatenate([np.linspace(lo, hi, SAMPLES), np.clip(tf.breakpoints(), lo, hi)]))
     _draw_curve(axes, tf, x)
-    axes.set(xlim=(lo, hi), ylim=(0, 1.02), xlabel=X_LABEL[tf.domain], ylabel="opacity per unit distance")
+    axes.set(xlim=(lo, hi), ylim=(0, 1.02), xlabel=DOMAINS[tf.domain][0], ylabel="opacity per unit distance")
     axes.set_title(tf.name, parse_math=False)
     with atomic_write(path, overwrite) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})

@@ -80,11 +80,8 @@ def suggest(statistics: Statistics, count: int, voxels: float, spacing: float) -
     gives a ray through the volume an optical depth of 1.5 on average, so that common values are fog and rare ones
     solid. A peak that spans more than a quarter of the values is no background.
 
-    Args:
-        statistics: range and histogram of the data.
-        count: functions, at least 1.
-        voxels: along a ray through the volume, for instance the mean of its dimensions.
-        spacing: a voxel's edge, world units: what opacities are per.
+    ``voxels`` lie along a ray through the volume (the mean of its dimensions, say), ``spacing`` is a voxel's edge in
+    world units: what opacities are per.
 
     Raises:
         DataError: no finite voxel, or a single value.

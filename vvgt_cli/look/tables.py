@@ -30,10 +30,7 @@ def exposed_distance(tf: TransferFunctionLike, statistics: Statistics, edge: flo
 
     So an X-ray depends neither on the function's unit distance nor on how opaque the whole of it is.
 
-    Args:
-        tf: function on data values.
-        statistics: of the volume.
-        edge: longest edge of its box; the result is in the same unit.
+    ``edge`` is the longest one of the volume's box; the result is in the same unit.
 
     Raises:
         DataError: the function shows nothing.

@@ -96,14 +96,10 @@ def load_block(
 ) -> np.ndarray:  # fmt: skip
     """Load the block of ``shape`` and ``dtype`` at byte ``offset`` of a file.
 
-    Args:
-        path: the file.
-        dtype: with its byte order.
-        shape: numpy order (slowest first).
-        offset: bytes before the (possibly compressed) block; -1 means that the block ends the file (raw only).
-        encoding: ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``, ``bzip2`` or ``text``.
-        skip: decompressed bytes to skip.
-        packed: slices are read front to back, so that a large compressed block of three axes may stay in its file.
+    ``dtype`` is with its byte order, ``shape`` slowest first. -1 as ``offset`` means that the block ends the file (raw
+    only); ``skip`` counts decompressed bytes. ``encoding`` is ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``,
+    ``bzip2`` or ``text``. ``packed``: slices are read front to back, so that a large compressed block of three axes may
+    stay in its file.
 
     Returns:
         `np.memmap` for ``raw``, else an array in memory, or `Packed`.

@@ -26,15 +26,8 @@ def choose(
 ) -> int:  # fmt: skip
     """Return the index of the array (dataset, grid, ...) that is asked for, or of the only one.
 
-    Args:
-        names: values of the option, one an array.
-        rows: description of each, for messages.
-        wanted: one of the names; None for the only array.
-        source: for messages.
-        what: word for an array, in the singular, for messages.
-        how: how to choose one, for messages.
-        option: flag that chooses one.
-        note: why none of several is chosen without the option, for messages.
+    ``names`` are values of the ``option`` that chooses, ``rows`` describe them. ``what`` is the word for one, ``how``
+    says how to choose, and ``note`` why none of several is taken without the option.
 
     Raises:
         DataError: there are none.
@@ -139,7 +132,7 @@ def select_component(
         text = f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
         raise SeveralComponents(text, n, color and n in (3, 4)) if component is None else UsageError(text)
     if component == "magnitude":
-        return magnitude(values, *scaling), (1.0, 0.0)
+        return magnitude(np.moveaxis(values, -1, 0), *scaling), (1.0, 0.0)
     return contiguous(values[..., int(component)]), scaling
 
 
@@ -157,11 +150,7 @@ def selected_dtype(info: ArrayInfo, component: int | str | None, source: str) ->
 def channel_numbers(wanted: Sequence[str], count: int, names: Sequence[str], source: str) -> list[int]:
     """Return the numbers of the channels that are asked for, each once.
 
-    Args:
-        wanted: what stands between the commas of ``A,B``: numbers, names, and pieces of names that have commas.
-        count: how many channels there are.
-        names: their names, where they have any.
-        source: for messages.
+    ``wanted`` is what stands between the commas of ``A,B``: numbers, names, and pieces of names that have commas.
 
     Raises:
         UsageError: no channel of that name or number, or several of that name.
@@ -186,12 +175,12 @@ def contiguous(field: np.ndarray) -> np.ndarray:
     return field if field.flags.c_contiguous else np.ascontiguousarray(field)
 
 
-def magnitude(values: np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
-    """Return norms (nz, ny, nx) float32 of values (nz, ny, nx, c), ``slope * stored + intercept``, slice by slice."""
-    out = np.empty(values.shape[:3], np.float32)
-    for z, plane in enumerate(values):
-        total = np.zeros(plane.shape[:2])
-        for c in range(plane.shape[2]):
-            total += (plane[..., c].astype(np.float64) * slope + intercept) ** 2
-        out[z] = np.sqrt(total)
+def magnitude(bands: Sequence[np.ndarray] | np.ndarray, slope: float = 1.0, intercept: float = 0.0) -> np.ndarray:
+    """Return norms (nz, ny, nx) float32 of bands (nz, ny, nx) of values ``slope * stored + intercept``, by slices."""
+    out = np.empty(bands[0].shape, np.float32)
+    for z, row in enumerate(out):
+        total = np.zeros(row.shape)
+        for band in bands:
+            total += (band[z].astype(np.float64) * slope + intercept) ** 2
+        row[...] = np.sqrt(total)
     return out

@@ -103,9 +103,8 @@ def fields_of_sections(path: Path) -> HeaderFields:
 def type_of(text: str, aliases: Mapping[str, str] | None = None) -> np.dtype | None:
     """Return the type of numbers that a name such as ``unsigned short int``, ``uchar`` or ``uint16_t`` stands for.
 
-    Args:
-        text: the name, in any case, words separated by blanks or underscores.
-        aliases: numpy's code of names that a format has for itself, without blanks, in lower case; they come first.
+    Words of the name are separated by blanks or underscores, in any case. ``aliases`` are numpy's codes of names that a
+    format has for itself, without blanks, in lower case; they come first.
 
     Returns:
         The type in native byte order; None for an unknown name. A ``char`` is signed, a ``byte`` is not.

@@ -17,11 +17,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, select_component
-from vvgt_cli.volume.headers import printable, text_of
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Stored, Volume, float_dtype, printable, text_of, triple
 from vvgt_cli.volume.space import metres, unit_name
-from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume, float_dtype, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
@@ -134,16 +131,10 @@ def labelled_volume(
 ) -> Volume:  # fmt: skip
     """Make a volume of an array with named axes.
 
-    Args:
-        stored: stored values (mapped, perhaps), or a function that reads a part, by a slice or a number for each axis.
-        dtype: of the stored values.
-        axes: slowest first.
-        attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
-        options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
-            a single such axis, either.
-        source: for messages.
-        name: of the volume.
-        chunks: of the array in its file, one an axis; with ``options.stored`` it stays there and is read in blocks.
+    ``stored`` holds the values (mapped, perhaps), or is a function that reads a part by a slice or a number for each
+    axis; ``axes`` come slowest first. ``options.time`` is the index along the axis of time, ``component`` that along
+    another that is not of space; of a single such axis, either. With ``options.stored`` an array with ``chunks`` stays
+    in its file and is read in blocks.
 
     Returns:
         Axes in the order z, y, x and ascending; values that the attributes call missing are NaN.

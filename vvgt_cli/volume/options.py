@@ -101,11 +101,7 @@ class ReadOptions:
     def step(self, steps: int, source: str, what: str = "time steps", **facts: Any) -> int:
         """Return the time step asked for, or the only one of ``steps``.
 
-        Args:
-            steps: how many there are.
-            source: for messages.
-            what: the steps are called.
-            **facts: ``times``, ``unit`` and ``names`` for `SeveralSteps`.
+        ``what`` the steps are called, and the ``facts`` times, unit and names, are for `SeveralSteps`.
 
         Raises:
             SeveralSteps: several and none chosen.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +19,7 @@ from typing import Any
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
+GROUP = "vvgt.readers"  # of entry points
 HEAD_BYTES = 4096
 HDF5 = b"\x89HDF\r\n\x1a\n"  # which files of several formats begin with
 
@@ -26,7 +28,7 @@ def lazy(name: str, *first: Any) -> Callable[..., Any]:
     """Make a function that stands for another one and imports its module when it is called.
 
     Args:
-        name: ``family.module.function`` in this room.
+        name: ``family.module.function`` in this subpackage.
         *first: arguments that go before those of the call.
     """
     return partial(_call, name, *first)
@@ -87,6 +89,7 @@ class Reader:
 Scheme = Callable[[str, ReadOptions], Volume]
 
 READERS: list[Reader] = []
+_asked: list[str] = []  # groups whose readers have been registered
 SCHEMES: dict[str, Scheme] = {}
 STEPPED: set[str] = set()  # schemes whose volumes may have time steps
 
@@ -99,6 +102,26 @@ def register(*readers: Reader) -> None:
         if reader.name in (r.name for r in READERS):
             raise ValueError(f"{reader.name}: registered twice")
         READERS.append(reader)
+
+
+def register_plugins() -> bool:
+    """Register the readers of other packages, once a process; return whether there are any.
+
+    An entry point of the group `GROUP` names a table of readers, as our families' ``FORMATS`` are. One that fails is a
+    warning that names its package.
+    """
+    from importlib.metadata import entry_points  # takes a tenth of a second: asked for files that we do not know
+
+    before = len(READERS)
+    for entry in () if _asked else entry_points(group=GROUP):
+        try:
+            register(*entry.load())
+        except Exception as error:
+            package = entry.dist.name if entry.dist else entry.value
+            why = f"{type(error).__name__}: {error}"
+            warnings.warn(f"{package}: its readers cannot be used ({why}); update or remove this package", stacklevel=2)
+    _asked.append(GROUP)
+    return len(READERS) > before
 
 
 def register_scheme(name: str, open_scheme: Scheme, times: bool = False) -> None:

@@ -21,7 +21,7 @@ from vvgt_cli.volume.medical import MASKS
 from vvgt_cli.volume.options import ReadOptions, crop, masked, parse_crop
 from vvgt_cli.volume.plain import RAW
 from vvgt_cli.volume.plain.raw import parse_name, read_stdin
-from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, is_glob
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, is_glob, register_plugins
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.tiff import SLICES
 from vvgt_cli.volume.types import Volume
@@ -34,9 +34,7 @@ PREVIEWS = 10  # pictures for each volume beside them, up to which they do not m
 def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     """Read a volume from a file, from standard input (``-``, raw bytes) or from a registered scheme.
 
-    Args:
-        source: a path, ``PATH:/inner/path`` for formats that hold several arrays, ``-`` or ``scheme:rest``.
-        options: see `ReadOptions`.
+    The ``source`` is a path, ``PATH:/inner/path`` for formats that hold several arrays, ``-`` or ``scheme:rest``.
 
     Returns:
         The volume, cropped and masked; memory-mapped where the format stores plain values. Where its file states an
@@ -178,6 +176,8 @@ def _folder(path: Path, source: str) -> Reader:
             others = sum(len(names) for kind, names in lying.items() if kind not in (*mine, "picture"))
             if reader.whole or own >= others:
                 return reader
+    if register_plugins():
+        return _folder(path, source)
     if lying:
         listing = "; ".join(f"{len(names)} {kind} ({listed(names, ', ', 3)})" for kind, names in lying.items())
         raise DataError(f"{source}: a folder; expected one volume, found {listing}: give one of the files")
@@ -255,9 +255,12 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
         return found
     if options.dims and (options.dtype or named is None or not named.resamples):
         return RAW
+    by_name = named is not None and (named.by_name or named.nameable)
+    if not by_name and register_plugins():
+        return _find(path, head, options)
     if known := way_out(path, inner, by_name=named is None):
         raise DataError(f"{path}: {known}")
-    if named is not None and (named.by_name or named.nameable):
+    if named is not None and by_name:
         return named
     if named is not None:
         raise DataError(

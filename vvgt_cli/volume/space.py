@@ -42,13 +42,8 @@ def unit_rows(vectors: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def placed(field: Any, steps: Any, origin: Any, options: ReadOptions, name: str, **facts: Any) -> Volume:
     """Make the volume of a field whose index axes step along given vectors.
 
-    Args:
-        field: (nz, ny, nx) stored values.
-        steps: (3, 3) world vectors of a step along x, y and z, one a row.
-        origin: (3,) world position of the first voxel's centre.
-        options: ``spacing`` replaces the lengths of the steps.
-        name: of the volume.
-        **facts: other attributes of `Volume`.
+    ``steps`` (3, 3) are the world vectors of a step along x, y and z, one a row, and ``origin`` is the centre of the
+    first voxel. ``options.spacing`` replaces the lengths of the steps; ``facts`` are other attributes of `Volume`.
     """
     spacing, direction = unit_rows(steps)
     first = tuple(np.asarray(origin, np.float64).tolist())
@@ -90,10 +85,8 @@ def unit_name(length: float | None) -> str:
 def one_unit(units: Sequence[str], source: str, spacing_given: bool) -> tuple[np.ndarray, str]:
     """Find the factors that bring lengths along several axes to one unit.
 
-    Args:
-        units: unit of each axis, as the file writes it; "" where it states none.
-        source: for messages.
-        spacing_given: the caller replaces the file's spacing, so that its units need not compare.
+    ``units`` are those of the axes, as the file writes them, "" where it states none. They need not compare where the
+    caller has given the spacing.
 
     Returns:
         Factors (n,) float64, and the short name of the unit of the first axis that states one, "" if none does or it is

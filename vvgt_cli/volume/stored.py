@@ -60,7 +60,7 @@ class Stored:
         slices = tuple(slice(*k.indices(n)) for k, n in zip(whole, self.shape, strict=True))
         try:
             return self._read(slices)
-        except VvgtError:
+        except (VvgtError, MemoryError):
             raise
         except Exception as error:  # whatever codecs raise
             raise self._damaged(slices, error) from error

@@ -18,6 +18,7 @@ from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.rays import RayFile, composed
+from vvgt_cli.field.settings import MANY
 from vvgt_cli.field.workload import Workload, pace
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.rules import INRIA
@@ -70,6 +71,8 @@ class OutOfCore(Stage):
 
         run, field = work.run, work.field
         assert isinstance(field, Blocked)
+        if self.together and self.steps:
+            run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/scale.md)")
         if self.alone:
             field.views.expect(scored_views(work.fit.size))
         make_blocks(work, field)

@@ -1,6 +1,7 @@
 """File formats of other programs for Gaussians, and the page that shows them."""
 
 from vvgt_cli.gaussians.formats.choose import (
+    ENDINGS,
     SUFFIXES,
     Format,
     encoded,
@@ -11,4 +12,4 @@ from vvgt_cli.gaussians.formats.choose import (
     ready,
 )
 
-__all__ = ["SUFFIXES", "Format", "encoded", "format_of", "is_splats", "read_columns", "read_splats", "ready"]
+__all__ = ["ENDINGS", "SUFFIXES", "Format", "encoded", "format_of", "is_splats", "read_columns", "read_splats", "ready"]

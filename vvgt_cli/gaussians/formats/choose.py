@@ -68,6 +68,8 @@ FORMATS = (  # the first whose ending fits is taken: a longer ending stands befo
     Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
+_ENDINGS = dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in SUFFIXES)
+ENDINGS = sorted(_ENDINGS, key=".html".__ne__)  # as dialogs for files take them; the page first
 READ_ONLY = (
     Format(".splat", splat.refuse, splat.read_splat, lambda name: None),
     Format(".ksplat", splat.refuse, splat.refuse, lambda name: None),

@@ -24,7 +24,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
     """Read a transfer function; a file's format is recognised by its content.
 
     Args:
-        source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room list the
+        source: path of a file (``presets.json#Name`` picks one of several functions; its modules list the
             formats), or a name (`vvgt_cli.look.readers.names`): one of ours, or a matplotlib colour map with an opacity
             ramp, ``NAME[:LO,HI[:MAX]]``, or ``iso:LEVEL``; or the parsed content of such a JSON file.
 

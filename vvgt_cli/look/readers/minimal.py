@@ -30,14 +30,14 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.function import BY, PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.isosurfaces import isosurfaces
 from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
 from vvgt_cli.look.readers.fields import named, number, rgb
 
 KEYS = {"name", "range", "points", "color_space", "hsv_wrap", "opacity_unit_distance", "opacity_unit_share"}
 KEYS |= {"lighting", "otherwise"}
-DOMAINS = ("percentile", "foreground", "sigma", "mean")
+RANGES = [domain for domain in BY if domain != "level"]
 POINT_KEYS = {"x", "rgb", "opacity"}
 
 
@@ -113,10 +113,10 @@ def _range(value: Any, what: str) -> tuple[str, float, float]:
     """Return the domain of the points and the range that they are fractions of ((0, 0): none)."""
     if value is None:
         return "data", 0.0, 0.0
-    if value in DOMAINS:
+    if value in RANGES:
         return str(value), 0.0, 0.0
     if not isinstance(value, list) or len(value) != 2:
-        raise DataError(f"{what}: range {value!r}; expected [lo, hi] or one of {', '.join(DOMAINS)}")
+        raise DataError(f"{what}: range {value!r}; expected [lo, hi] or one of {', '.join(RANGES)}")
     lo, hi = (number(f"{what}: range", v) for v in value)
     if not lo < hi:
         raise DataError(f"{what}: range [{lo:g}, {hi:g}]; expected lo below hi")

@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.components import choose, listed
-from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.labelled import Axis, axis, even
-from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.reading import choose, listed, metres, text_of
 
 GROUPS = re.compile(r"coord(inate)?s?|grid|axes|mesh|dim(ension)?s?", re.I)  # that hold coordinates
 _LETTER = re.compile(r"(?:(?:coord(?:inate)?s?|grid|axis)_?)?([xyzt])[ _([]*(\w*)[)\]]*", re.I)
@@ -139,13 +137,8 @@ def choose_grid(
 ) -> str:  # fmt: skip
     """Return the name of the array asked for, else of the only one with three axes (with two, if none has three).
 
-    Args:
-        arrays: shape and type of each, by name.
-        wanted: one of the names, or None.
-        source: for messages.
-        what: word for an array, in the singular, for messages.
-        how: how to choose one, for messages.
-        rows: description of each, for messages; by default shape and type.
+    ``arrays`` has the shape and the type of each by name; ``rows`` describe them otherwise. ``what`` and ``how`` are
+    those of `choose`.
 
     Raises:
         DataError: there are none, or places and vectors of particles in place of any.

@@ -10,13 +10,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import ArrayInfo, choose_array
 from vvgt_cli.volume.labelled import Axis, labelled_volume
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, need, volume_name
 
 GRIB = "GRIB"  # in the place of a program of `vtk_child`
 MISSING = -1e100

@@ -18,7 +18,6 @@ from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import GROUPS, Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
-from vvgt_cli.volume.headers import printable, text_of
 from vvgt_cli.volume.labelled import (
     CF_ATTRIBUTES,
     DESCRIBES,
@@ -32,9 +31,7 @@ from vvgt_cli.volume.labelled import (
 from vvgt_cli.volume.libraries import library_errors, need, read_part
 from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, printable, text_of, volume_name
 
 MAX_VISITED = 100_000
 MAX_BESIDE = 1000  # members of a group that are looked at for coordinates

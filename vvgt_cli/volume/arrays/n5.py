@@ -25,12 +25,10 @@ from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import choose_grid
 from vvgt_cli.volume.arrays.zarr import inside, json_object, name_in
 from vvgt_cli.volume.labelled import Axis, labelled_volume
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy import bigdataviewer
 from vvgt_cli.volume.microscopy.image import EXTRA
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need
 from vvgt_cli.volume.stored import put_overlap
-from vvgt_cli.volume.types import Volume
 
 METADATA = "attributes.json"
 TYPES = {f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64)} | {"float32", "float64"}

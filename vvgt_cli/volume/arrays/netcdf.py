@@ -20,12 +20,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
-from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.labelled import DESCRIBES, axis, described_by, labelled_volume
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, load_block, need, volume_name
 
 _TURN = Lock()  # the library is not for several threads
 

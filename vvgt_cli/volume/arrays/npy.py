@@ -20,11 +20,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
-from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, choose, volume_name
 
 _HEADER = 1 << 16
 MAX_BESIDE = 1 << 23  # bytes of an array of coordinates

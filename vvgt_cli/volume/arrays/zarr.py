@@ -22,11 +22,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.beside import Neighbour, choose_grid, with_neighbours
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import hex_color
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.segments import Segment, segments_in
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, library_errors, need, segments_in
 
 _CODECS = {
     *("blosc", "zstd", "gzip", "zlib", "lz4", "bz2", "lzma", "shuffle", "delta", "fixedscaleoffset", "quantize"),

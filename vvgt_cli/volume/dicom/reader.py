@@ -17,16 +17,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.dicom.pet import in_suv
 from vvgt_cli.volume.dicom.segmentation import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom.series import Files, Source, choose_series, headers_in, one_stack, read_file
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES, one_volume
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, need, printable, select_component
 
 HOUNSFIELD = "HU"  # Rescale Type (0028,1054), and what CT's is where it is absent (PS3.3, C.8.2.1.1.5)
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other

@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, library_errors, listed, need, triple
 from vvgt_cli.volume.segments import Segment, segments_in
-from vvgt_cli.volume.types import Volume, triple
 
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
 EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"

@@ -23,14 +23,12 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom import is_dicom
 from vvgt_cli.volume.dicom.pet import TAGS as PET
 from vvgt_cli.volume.dicom.segmentation import is_segmentation
 from vvgt_cli.volume.dicom.volumes import ATTRIBUTES
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.microscopy.image import Bounded
+from vvgt_cli.volume.reading import check_memory, listed, printable
 
 Source = Path | zipfile.Path
 
@@ -144,11 +142,8 @@ Files = list[tuple[Source, Any]]
 def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, path: Path) -> tuple[str, Files, str]:
     """Choose the series asked for, or the only one.
 
-    Args:
-        headers: files and their headers.
-        wanted: number, UID or description of a series; after it, or alone where there is one series, ``/K``, the number
-            of a stack in it from 1, and the name of one of its volumes.
-        path: for messages.
+    ``wanted`` is number, UID or description of a series; after it, or alone where there is one series, ``/K``, the
+    number of a stack in it from 1, and the name of one of its volumes.
 
     Returns:
         The suffix of the volume's name, the files of the series, and the part of ``wanted`` that names a stack or a

@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, listed, printable
 
 FEW = 2  # slices: fewer than make a volume, beside one that has more
 NEAR = 0.01  # share of the largest distance of neighbouring slices within which two are in one place
@@ -48,12 +46,8 @@ _PARTS = {"M": "magnitude", "P": "phase", "R": "real", "I": "imaginary", "MAGNIT
 def one_volume(slices: list[Any], options: ReadOptions, name: str, path: Path) -> list[Any]:
     """Return the slices of the volume asked for, or of the only one.
 
-    Args:
-        slices: of one size and orientation; each with ``position`` (3,), ``rows`` (2, 3), ``facts`` (the values of
-            `ATTRIBUTES`), ``source`` and ``instance``.
-        options: ``time`` is the number of the volume.
-        name: of the volume, "" for none.
-        path: for messages.
+    The slices have one size and orientation. ``options.time`` is the number of the volume; ``name`` its name, "" for
+    none.
 
     Raises:
         DataError: places that have different numbers of images, and nothing tells volumes apart.

@@ -16,14 +16,10 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, read_head
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.maps import MRC_HEADER, MRC_STAMPS, is_mrc
 from vvgt_cli.volume.medical.nifti import other_of_pair
 from vvgt_cli.volume.medical.pairs import read_pair
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import DENSITY, FLAT, Volume
+from vvgt_cli.volume.reading import DENSITY, FLAT, ReadOptions, Volume, placed, select_component, volume_name
 
 _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 _OTHERS = {3: "complex integers", 4: "complex numbers", 101: "4-bit integers"}

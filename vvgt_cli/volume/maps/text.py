@@ -17,13 +17,8 @@ from typing import IO
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import listed, select_component
-from vvgt_cli.volume.headers import type_of
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import DENSITY, Volume
+from vvgt_cli.volume.reading import DENSITY, ReadOptions, Volume, load_block, placed, type_of, volume_name
 
 BOHR = 0.529177210903  # angstroms (CODATA 2018)
 LINE, LINES = 4096, 100_000  # bytes of a line of a header, and lines

@@ -15,17 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, VvgtError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import READERS, is_glob, volume_name
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, check_memory, listed
 from vvgt_cli.volume.registry import read_volume
-from vvgt_cli.volume.segments import Segment
 from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.tiff import PICTURES, SUFFIXES
 from vvgt_cli.volume.tiff.pages import check_pages
 from vvgt_cli.volume.tiff.slices import by_number, matching
-from vvgt_cli.volume.types import Volume
 
 VALUES = (".img", ".img.gz", ".brik", ".brik.gz")  # of a header that is beside them
 

@@ -12,13 +12,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import data_file, load_block
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, data_file, load_block, select_component, volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, unit_rows
-from vvgt_cli.volume.types import Volume
 
 _SCALING = (("slope", 1), ("offset", 0))
 

@@ -17,14 +17,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import read_head
-from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.medical import MGH_HEADER, MGH_TYPES, is_mgh
 from vvgt_cli.volume.medical.nifti import Frames, load_frames
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.segments import Segment, segments_in
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import FLAT, Volume
+from vvgt_cli.volume.reading import FLAT, MAX_HEADER, ReadOptions, Segment, Volume, placed, segments_in, volume_name
 
 DATA = 284  # where values begin
 COLOR_TABLE = struct.pack(">ii", 1, -2)  # behind them: the tag of a colour table, and its version

@@ -17,15 +17,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.arrays.netcdf import check_header
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import magnitude, select_component
-from vvgt_cli.volume.headers import text_of
 from vvgt_cli.volume.libraries import library_errors, need, read_part
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, volume_name
-from vvgt_cli.volume.space import placed
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, magnitude, placed, select_component, text_of
 from vvgt_cli.volume.stored import Slices, give_back, stored_or_loaded
-from vvgt_cli.volume.types import Volume
 
 IMAGE, DIMENSIONS = "minc-2.0/image/0/", "minc-2.0/dimensions/"
 SLAB = 1 << 22  # voxels that are scaled at once, in float64
@@ -150,7 +145,7 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
     read = [_scaled(image, spatial, fixed | dict.fromkeys(parts, k), path) for k in chosen]
 
     def norm(slices: Slices) -> np.ndarray:
-        return magnitude(np.stack([part(slices) for part in read], -1))
+        return magnitude([part(slices) for part in read])
 
     one = norm if len(read) > 1 else read[0]
     field = stored_or_loaded(one, np.dtype(np.float32), shape, (1, *shape[1:]), str(path), options.stored)

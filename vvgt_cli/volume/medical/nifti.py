@@ -19,13 +19,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, load_block, read_head
-from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.medical import NIFTI_MAGIC, byte_order, is_analyze, is_nifti
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import MAX_HEADER, ReadOptions, select_component, unit_rows, volume_name
 from vvgt_cli.volume.segments import segments_in, segments_of_xml
-from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
 _DTYPES = {

@@ -21,13 +21,9 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.blocks import Packed, check_memory, count, data_file, load_block
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MARK, MAX_HEADER, HeaderFields
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.segments import Segment, segments_in
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, segments_in, select_component, triple, volume_name
 from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed, unit_rows
-from vvgt_cli.volume.types import Volume, triple
 
 _ENCODINGS = {
     "raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2", "text": "text", "txt": "text",

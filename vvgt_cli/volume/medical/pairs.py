@@ -10,12 +10,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.labelled import Axis, labelled_volume
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.medical.nifti import other_of_pair
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, need, unit_rows, volume_name
 
 _UNITS = {77001: "ms", 77002: "s"}  # of TAXIS_NUMS (AFNI, README.attributes)
 

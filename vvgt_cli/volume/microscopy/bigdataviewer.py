@@ -18,16 +18,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError, VvgtError
-from vvgt_cli.volume.components import magnitude
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.libraries import need
 from vvgt_cli.volume.microscopy import imaris
 from vvgt_cli.volume.microscopy.image import MAX_XML, choose_channel, choose_image, safe_xml
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import lazy
+from vvgt_cli.volume.reading import ReadOptions, Volume, magnitude, need, printable
 from vvgt_cli.volume.space import metres, placed, unit_name
 from vvgt_cli.volume.stored import loaded
-from vvgt_cli.volume.types import Volume
 
 READ = {  # by the XML element that names the data: reader, and the array of time t, setup s and level l
     "hdf5": (lazy("arrays.hdf5.read_dataset"), "t{t:05d}/s{s:02d}/{l}/cells"),
@@ -180,7 +176,7 @@ def _read(bdv: _Dataset, options: ReadOptions) -> Volume:
     parts = [loaded(_view(bdv, time, one, options)) for one in setups]
     for part in parts[1:]:
         part.check_grid(part.name, parts[0], parts[0].name, "choose one channel (--channel), not their magnitude")
-    return replace(parts[0], data=magnitude(np.stack([part.data for part in parts], axis=-1)))
+    return replace(parts[0], data=magnitude([part.data for part in parts]))
 
 
 def _view(bdv: _Dataset, time: int, setup: _Setup, options: ReadOptions) -> Volume:

@@ -19,9 +19,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, listed, magnitude
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, Volume
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
-from vvgt_cli.volume.types import Volume
 
 EXTRA = "microscopy"
 MAX_XML = 64 << 20
@@ -44,6 +43,7 @@ class Micrograph:
         names: of the channels, where the file has any.
         colors: RGB in [0, 1] of the channels, where the file has any.
         rgb: the channels are red, green, blue and perhaps opacity.
+        samples: the channels are samples of pixels, not channels of their own, as those of ``rgb`` are.
         mapped: ``read`` gives views of the file, which take no memory.
     """
 
@@ -58,6 +58,7 @@ class Micrograph:
     names: Sequence[str] = ()
     colors: Sequence[Color] = ()
     rgb: bool = False
+    samples: bool = False
     mapped: bool = False
 
 
@@ -66,33 +67,34 @@ def picture_volume(picture: Micrograph, options: ReadOptions, source: str, name:
 
     Errors are those of `Reader.read`.
     """
-    if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
+    if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iufb":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
     channel = choose_channel(
         picture.channels, picture.names, picture.dtype, options.component, source, picture.colors, picture.rgb,
-        not picture.rgb,
+        not (picture.rgb or picture.samples),
     )  # fmt: skip
-    time = options.step(picture.times, source)
+    what = "time steps" if picture.shape[0] > 1 else "time steps of one slice each"
+    time = options.step(picture.times, source, what)
     box = tuple(slice(0, n) for n in picture.shape)
     size = math.prod(picture.shape)
     field: Any
     if channel is None:
         if options.stored:
             raise UsageError(f"{source}: a magnitude cannot be read block by block; choose one channel")
-        check_memory((picture.dtype.itemsize * picture.channels + 4) * size, source, IN_BLOCKS)
-        bands = [picture.read(time, c, box) for c in range(picture.channels)]
-        field = magnitude(np.stack(bands, axis=-1))
+        loaded = 0 if picture.mapped else picture.dtype.itemsize * picture.channels
+        check_memory((loaded + 4) * size, source, IN_BLOCKS)
+        field = magnitude([picture.read(time, c, box) for c in range(picture.channels)])
     elif not picture.mapped:
         read = partial(picture.read, time, channel)
         field = stored_or_loaded(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
     else:
         field = picture.read(time, channel, box)
-        if not field.flags.c_contiguous:
+        if not field.flags.c_contiguous and not options.stored:
             check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
-        field = contiguous(field)
+            field = contiguous(field)
     unit = "" if picture.spacing == (None, None, None) else "um"
     x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
-    across = x or y or z or 1.0  # of an axis without a size, as in `Facts.voxel` of TIFF
+    across = x or y or z or 1.0  # of an axis without a size
     spacing = options.spacing_or((x or across, y or across, z or across))
     return Volume(field, spacing, picture.origin, name=name, unit=unit)
 
@@ -103,15 +105,8 @@ def choose_channel(
 ) -> int | None:  # fmt: skip
     """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
 
-    Args:
-        n: how many there are.
-        names: of the channels, where they have any.
-        dtype: of their values.
-        wanted: number, name, ``magnitude``, or None.
-        source: for messages.
-        colors: RGB in [0, 1] of the channels, where they have any.
-        rgb: they are red, green, blue and perhaps opacity.
-        separate: they are channels of their own, not samples of pixels.
+    The channels may have names and ``colors``, RGB in [0, 1]. ``rgb``: they are red, green, blue and perhaps opacity;
+    ``separate``: they are channels of their own, not samples of pixels.
 
     Raises:
         SeveralComponents: several and none chosen.
@@ -144,16 +139,9 @@ def choose_image(
 ) -> int:  # fmt: skip
     """Return the index of the image, scene or position asked for by number or name, or of the only one.
 
-    The only one of several slices is taken where none is asked for, with a warning.
-
-    Args:
-        names: of all of them.
-        facts: description of each, for messages.
-        wanted: number or name; None for the only one.
-        what: word for them, in the plural, for messages.
-        source: for messages.
-        deep: which ones have several slices, where they differ.
-        keys: their numbers; from 0 on where they are not given.
+    The only one of several slices (``deep``, where they differ) is taken with a warning where none is asked for.
+    ``facts`` describe them, ``what`` is the word for them in the plural, and ``keys`` are their numbers, by default
+    from 0 on.
 
     Raises:
         DataError: there are none.

@@ -13,13 +13,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.libraries import read_part
 from vvgt_cli.volume.microscopy.image import Color, Micrograph, picture_volume
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, read_part, volume_name
 from vvgt_cli.volume.space import MICROMETRE, metres
-from vvgt_cli.volume.stored import Slices
-from vvgt_cli.volume.types import Volume
 
 MAX_COUNT = 1_000_000  # time steps or channels
 

@@ -13,13 +13,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume, safe_xml
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
 from vvgt_cli.volume.space import MICROMETRE, metres
-from vvgt_cli.volume.stored import Slices
-from vvgt_cli.volume.types import Volume
 
 LUTS: dict[str, Color] = {
     "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "cyan": (0, 1, 1), "magenta": (1, 0, 1),

@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import EXTRA, Bounded, Color, Micrograph, choose_image, picture_volume
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.stored import Slices
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
 
 CHUNK_MAGIC = 0x0ABECEDA
 MAP_END = b"ND2 CHUNK MAP SIGNATURE 0000001!"

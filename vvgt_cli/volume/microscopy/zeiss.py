@@ -22,7 +22,6 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, size_text
-from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import (
     EXTRA,
     MAX_XML,
@@ -34,11 +33,8 @@ from vvgt_cli.volume.microscopy.image import (
     picture_volume,
     safe_xml,
 )
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, need, volume_name
 from vvgt_cli.volume.space import MICROMETRE
-from vvgt_cli.volume.stored import Slices
-from vvgt_cli.volume.types import Volume
 
 SEGMENT = struct.Struct("<16sqq")  # name, bytes set aside, bytes used
 HEADER = struct.Struct("<iiii16s16siqqiq")  # the 8th and 9th: where directory and metadata are

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP, Cursor
-from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.types import FLAT
+from vvgt_cli.volume.reading import FLAT, printable, unit_rows
 
 VERSIONS = range(222, 225)
 _UUID = 36
@@ -131,22 +129,10 @@ def skip_metadata(cursor: Cursor) -> dict[str, bytes]:
     return found
 
 
-@dataclass(frozen=True)
-class Placement:
-    """A grid's transform: voxel edges, direction (row-major) and the world position of index (0, 0, 0)."""
-
-    spacing: tuple[float, ...]
-    direction: tuple[float, ...]
-    axes: np.ndarray  # (3, 3) rows: world vectors of a step along x, y, z
-    translation: np.ndarray
-
-    def at(self, index: np.ndarray) -> tuple[float, ...]:
-        """Return the world position of a voxel centre (x, y, z)."""
-        return tuple(float(v) for v in index @ self.axes + self.translation)
-
-
-def read_grid_head(cursor: Cursor) -> tuple[int, bool, Placement]:
+def read_grid_head(cursor: Cursor) -> tuple[int, bool, np.ndarray]:
     """Read compression flags, whether floats have 16 bits, and the transform; the cursor stands at a grid's start.
+
+    The transform is (4, 3): world vectors of a step along x, y and z, and the position of index (0, 0, 0).
 
     Raises:
         DataError: unknown flags, a transform that does not take boxes to boxes, or damage.
@@ -155,10 +141,10 @@ def read_grid_head(cursor: Cursor) -> tuple[int, bool, Placement]:
     if compression & ~(ZIP | ACTIVE_MASK | BLOSC):
         raise cursor.bad(f"compression flags {compression:#x}; expected ZIP, Blosc and active masks")
     half = skip_metadata(cursor).get("is_saved_as_half_float", b"\0")[:1] == b"\1"
-    return compression, half, _placement(cursor)
+    return compression, half, _transform(cursor)
 
 
-def _placement(cursor: Cursor) -> Placement:
+def _transform(cursor: Cursor) -> np.ndarray:
     kind = cursor.text()
     axes, translation = np.eye(3), np.zeros(3)
     if kind in ("UniformScaleMap", "ScaleMap"):
@@ -179,10 +165,10 @@ def _placement(cursor: Cursor) -> Placement:
         )
     if not np.isfinite(axes).all() or not np.isfinite(translation).all():
         raise cursor.bad("a transform that is not finite")
-    lengths, direction = unit_rows(axes.tolist())
+    lengths, direction = unit_rows(axes)
     if min(lengths) <= 0 or abs(np.linalg.det(np.array(direction).reshape(3, 3))) < FLAT:
         raise DataError(
             f"{cursor.name}: the grid's transform flattens; expected scale, translation, rotation and shear: "
             "resample it first"
         )
-    return Placement(lengths, direction, axes, translation)
+    return np.vstack([axes, translation])

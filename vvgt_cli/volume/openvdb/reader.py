@@ -19,15 +19,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import choose, listed, select_component
-from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.codec import Cursor
 from vvgt_cli.volume.openvdb.tree import Node, Tree, TreeReader
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, placed, printable, volume_name
 
 LOOKS = dict.fromkeys(("density", "smoke"), "smoke") | dict.fromkeys(("flame", "flames", "temperature", "heat"), "fire")
 
@@ -87,19 +83,13 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     grids = read_header(cursor)
     grid = choose_grid(grids, options.array, str(path))
     cursor.seek(grid.start)
-    placement = read_grid_head(cursor)[2]
+    transform = read_grid_head(cursor)[2]
     tree = read_tree(cursor, grids, grid)
     lo, hi = bounding_box(tree, f"{path}: grid {grid}")
     values = brick_array(tree, lo, hi, options.component, str(path), f"grid {grid.label!r}")
-    return Volume(
-        values,  # type: ignore[arg-type]  # a BrickArray, which is read where it is indexed
-        options.spacing_or(placement.spacing),
-        placement.at(lo),
-        placement.direction,
-        volume_name(path),
-        quantity=printable(grid.name),
-        preset=LOOKS.get(grid.name, ""),
-    )
+    origin = lo @ transform[:3] + transform[3]
+    facts = {"quantity": printable(grid.name), "preset": LOOKS.get(grid.name, "")}
+    return placed(values, transform[:3], origin, options, volume_name(path), **facts)
 
 
 def bounding_box(tree: Tree, name: str) -> tuple[np.ndarray, np.ndarray]:

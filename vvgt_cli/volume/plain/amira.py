@@ -18,11 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.segments import Segment, segments_in
-from vvgt_cli.volume.space import one_unit, placed
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.reading import ReadOptions, Segment, Volume, one_unit, placed, segments_in, triple, volume_name
 
 _TYPES = ("byte", "short", "ushort", "int", "float", "double")
 _STREAM = re.compile(  # place, type, components, name, number, encoding, length

@@ -13,12 +13,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, HeaderFields, type_of
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.reading import IDENTITY, ReadOptions, Volume, select_component, unit_rows, volume_name
 
 
 def _fields(path: Path) -> HeaderFields:

@@ -16,10 +16,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import Packed, check_memory, fill, load_block, size_text
-from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions, parse_dtype
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import Volume, select_component, volume_name
 
 _NAME = re.compile(r"(?:^|_)(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32|64)|float(?:16|32|64))\.raw(?:\.gz)?$", re.IGNORECASE)
 RUNS, LENGTH = 64, 512  # runs of neighbouring values that are sampled for the order of axes, and values in each
@@ -63,8 +61,7 @@ def guess_dims(data: np.ndarray) -> tuple[int, int, int] | None:
 
     Neighbouring rows and slices of a volume are alike; read in another order than they were written they are not.
 
-    Args:
-        data: (nz, ny, nx), contiguous; memory-mapped data are read in a few places only.
+    ``data`` are (nz, ny, nx), contiguous; mapped ones are read in a few places only.
 
     Returns:
         The order in which neighbours differ least, or None where that given is no worse, or nothing can be inferred.

@@ -14,10 +14,6 @@ def decode_runs(packed: np.ndarray, out: np.ndarray) -> int:
     Each run is a byte: 7 bits of count (0 ends the runs), and the top bit set if that many literal bytes follow,
     else one byte follows that repeats.
 
-    Args:
-        packed: (m,) uint8.
-        out: (n,) uint8, written.
-
     Returns:
         Voxels written, or -1 if the runs leave ``packed`` or ``out``.
     """

@@ -12,11 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, load_block
-from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, load_block, select_component, volume_name
 
 # magic, sizes, bits, spacing, (unit, data origin, modification), coding, icon size
 _HEADER = re.compile(rb"\s*11111" + rb"\s+(\d+)" * 4 + rb"\s+(\S+)" * 3 + rb"\s+\d+" * 3 + rb"\s+(\d+)" * 3 + rb" X")

@@ -13,13 +13,8 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import data_file, load_block
-from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.headers import HeaderFields, fields_of_sections
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import one_unit
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, choose, data_file, load_block, one_unit, volume_name
 
 _KINDS = {"float": "f", "unsigned integer": "u", "signed integer": "i"}
 _BYTES = {"f": (4, 8), "u": (1, 2, 4, 8), "i": (1, 2, 4, 8)}

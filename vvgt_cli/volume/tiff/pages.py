@@ -1,21 +1,14 @@
-"""Checks of the directories of a TIFF file, before a library reads them, and slices that stay in TIFF files."""
+"""Checks of the directories of a TIFF file, before a library reads them."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from threading import Lock
-from typing import Any, BinaryIO
-
-import numpy as np
+from typing import BinaryIO
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import size_text
-from vvgt_cli.volume.stored import Stored, slice_by_slice
-from vvgt_cli.volume.tiff.decode import Pages
 
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _DEPTH = 256, 257, 258, 277, 32997
 _FIELD = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q"}
@@ -93,64 +86,3 @@ def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
             f"{layout.path}: page {page} of {width} x {height} pixels with {samples} samples; expected at least 1"
         )
     return width * height * samples * max(tags.get(_DEPTH, 1), 1) * max(bits, 1) // 8
-
-
-def lazy_pages(
-    open_file: Callable[[Path], Any],
-    path: Path,
-    number: int,
-    lead: tuple[int, ...],
-    inner: tuple[int, ...],
-    index: tuple[int | slice, ...],
-    dtype: np.dtype,
-    turned: bool,
-) -> Stored:
-    """Wrap the slices of a series that are pages, as (z, y, x).
-
-    Args:
-        open_file: makes a `tifffile.TiffFile` of the path.
-        path: the file.
-        number: of the series.
-        lead: sizes of the axes that count pages.
-        inner: sizes of the axes within a page.
-        index: along all of them: slices along that of z in ``lead``, and x and y in ``inner``.
-        dtype: of the values.
-        turned: x comes before y in a page.
-    """
-    axis = next(k for k, i in enumerate(index) if isinstance(i, slice))
-    rows, columns = [n for n, i in zip(inner, index[len(lead) :], strict=True) if isinstance(i, slice)][
-        :: -1 if turned else 1
-    ]
-
-    turn = Lock()  # one file, one reader: workers may have threads
-
-    @cache
-    def opened() -> tuple[Any, Any, Pages]:
-        file = open_file(path)
-        return file, file.series[number], Pages(path)  # the file to keep it open
-
-    def read(k: int) -> np.ndarray:
-        place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
-        with turn:
-            _, series, pages = opened()
-            page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)
-        kept: np.ndarray = page.reshape(inner)[index[len(lead) :]]
-        return kept.T if turned else kept
-
-    return slice_by_slice(read, dtype, (lead[axis], rows, columns), str(path))
-
-
-def lazy_files(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Return slices that stay in their files; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
-
-    def read(k: int) -> np.ndarray:
-        values = load(files[k])
-        if values.shape != plane.shape or values.dtype != plane.dtype:
-            raise DataError(
-                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
-                f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
-            )
-        only: np.ndarray = values[0]
-        return only
-
-    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)

@@ -15,27 +15,23 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import check_memory, size_text
-from vvgt_cli.volume.components import contiguous, magnitude
-from vvgt_cli.volume.libraries import library_errors
-from vvgt_cli.volume.microscopy.image import choose_channel, choose_image
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import metres
+from vvgt_cli.volume.microscopy.image import Micrograph, choose_image, picture_volume
+from vvgt_cli.volume.reading import ReadOptions, Slices, Volume, library_errors, metres, size_text, triple, volume_name
 from vvgt_cli.volume.tiff.decode import Pages
 from vvgt_cli.volume.tiff.ome import ome_tag, open_tiff
-from vvgt_cli.volume.tiff.pages import check_pages, lazy_pages
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.tiff.pages import check_pages
 
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 
@@ -60,61 +56,89 @@ class SeriesAxes:
         """Return the positions of axes of more than one value."""
         return [k for k, a in enumerate(self.axes) if a in letters and self.shape[k] > 1]
 
+    def count(self, letters: str) -> int:
+        """Return the number of values along axes together."""
+        return math.prod(self.shape[k] for k in self.of(letters))
+
+    @property
+    def paged(self) -> bool:
+        """Whether slices are pages of rows and columns."""
+        space = self.of("XYZ")
+        return len(space) == 3 and [self.axes[k] for k in space if k < self.lead] == ["Z"]
+
+    def index(self, time: int, channel: int, box: Slices) -> tuple[int | slice, ...]:
+        """Return the index of a box (z, y, x) along every axis; samples of a pixel count faster than channels."""
+        places: dict[str, int | slice] = {"T": time, **dict(zip("ZYX", box, strict=True))}
+        index = [places.get(a, 0) if n > 1 else 0 for a, n in zip(self.axes, self.shape, strict=True)]
+        for k in reversed(self.of("CS")):
+            channel, index[k] = divmod(channel, self.shape[k])
+        return tuple(index)
+
+    def zyx(self, values: np.ndarray) -> np.ndarray:
+        """Return what was read at an `index` as (z, y, x)."""
+        kept = [self.axes[k] for k in self.of("XYZ")]
+        field = values.transpose([kept.index(a) for a in "ZYX" if a in kept])
+        return field[tuple(slice(None) if a in kept else None for a in "ZYX")]
+
 
 def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     """Read a volume from a TIFF file; rows from the top are y. Resolution tags alone are not spacing.
 
     Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
 
-    Args:
-        path: the file.
-        options: see `ReadOptions`.
-        slices: how many slices a volume has, if the file is one of them.
+    A volume has so many ``slices`` if the file is one of them.
     """
     check_pages(path)
-    with library_errors(str(path), "TIFF"), _silent(), open_tiff(path) as file:
+    with library_errors(str(path), "TIFF"), _silent(), open_tiff(path) as file, Pages(path) as pages:
         root = ElementTree.fromstring(file.ome_metadata) if file.is_ome and file.ome_metadata else None
         count_planes(file)
         series, number = _series(file, options.array, path)
         facts = _facts(file, root, series, number, path)
         layout = _layout(series, path)
-        index, several = _choose(layout, facts, options, path, series.dtype)
-        mapped = _mappable(series)
-        if options.stored and _paged(layout, index, several) and not mapped:
+        mapped = _mapped(file, series, layout, path) if _mappable(series) else None
+        stored = options.stored and options.component != "magnitude" and (mapped is not None or layout.paged)
+        again = partial(_opened, path, number) if stored else lambda: (series, pages)
+        sizes = triple(map(layout.count, "ZYX"))
+        picture = Micrograph(
+            layout.count("T"), layout.count("CS"), sizes, np.dtype(series.dtype),
+            partial(_read, layout, np.dtype(series.dtype), cache(again), Lock(), mapped), (1, *sizes[1:]),
+            facts.spacing, names=facts.channels, colors=facts.colors, rgb=layout.color, samples=bool(layout.of("S")),
+            mapped=mapped is not None,
+        )  # fmt: skip
+        if mapped is None:
             _whole(series, path)
-            lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
-            turned = layout.axes.index("X") < layout.axes.index("Y")
-            field: Any = lazy_pages(open_tiff, path, number, lead, inner, index, np.dtype(series.dtype), turned)
-        else:
-            values = _values(file, series, layout, index, path)
-            field = _arranged(values, layout, index, several, path, options.stored and mapped)
-    spacing, doubts = facts.voxel(options, max(slices, field.shape[0]), str(path))
-    if doubts:
+        volume = picture_volume(picture, replace(options, stored=stored), str(path), volume_name(path))
+    if doubts := facts.doubts(options, max(slices, len(volume.data)), str(path)):
         warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
-    return Volume(field, spacing, name=volume_name(path), unit=facts.length)
+    return replace(volume, unit=facts.length)
 
 
-def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], all_channels: bool) -> bool:
-    """Tell whether slices are pages of which nothing but rows and columns is kept."""
-    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
-    ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
-    return not all_channels and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
+def _opened(path: Path, number: int) -> tuple[Any, Pages, Any]:
+    """Open a series for as long as its volume lives; return it, its pages, and the file to keep it open."""
+    file = open_tiff(path)
+    return file.series[number], Pages(path), file
 
 
-def _arranged(
-    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], all_channels: bool, path: Path, view: bool
-) -> np.ndarray:
-    """Return (z, y, x) of what was read, the magnitude of several channels; ``view``: one of the file will do."""
-    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
-    field = values.transpose([kept.index(a) for a in "ZYXCS" if a in kept])
-    field = field[tuple(slice(None) if a in kept else None for a in "ZYX")]
-    if all_channels:
-        check_memory(field[..., 0].size * 4, str(path))
-        return magnitude(field.reshape(*field.shape[:3], -1))
-    if view or field.flags.c_contiguous:
-        return field
-    check_memory(field.nbytes, str(path))
-    return contiguous(field)
+def _read(
+    layout: SeriesAxes, dtype: np.dtype, opened: Callable[[], Any], turn: Lock, mapped: np.ndarray | None,
+    time: int, channel: int, box: Slices,
+) -> np.ndarray:  # fmt: skip
+    """Read a box (z, y, x): of the map, where there is one, else page by page."""
+    index = layout.index(time, channel, box)
+    if mapped is not None:
+        return layout.zyx(mapped[index])
+    out = np.empty([i.stop - i.start for i in index if isinstance(i, slice)], dtype)
+    lead, inner, within = layout.shape[: layout.lead], layout.shape[layout.lead :], index[layout.lead :]
+    rows = out.reshape(-1, *(i.stop - i.start for i in within if isinstance(i, slice)))
+    places = itertools.product(
+        *(range(i.start, i.stop) if isinstance(i, slice) else (i,) for i in index[: layout.lead])
+    )
+    with turn:  # one file, one reader: workers may have threads
+        series, pages, *_ = opened()
+        for row, place in zip(rows, places, strict=True):
+            number = int(np.ravel_multi_index(place, lead)) if place else 0
+            row[...] = pages.decoded(series[number], series).reshape(inner)[within]
+    return layout.zyx(out)
 
 
 @contextmanager
@@ -193,54 +217,13 @@ def _described(axes: str, shape: tuple[int, ...]) -> str:
     return ", ".join(f"{n} {_AXES.get(a, a)}" for a, n in zip(axes, shape, strict=True) if n > 1) or "of one value each"
 
 
-def _choose(
-    layout: SeriesAxes, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
-) -> tuple[tuple[int | slice, ...], bool]:
-    """Return an index along every axis of a series (whole along spatial ones), and whether all channels are wanted."""
-    space = layout.of("XYZ")
-    index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
-    channels = layout.of("CS")
-    several = options.component == "magnitude" and bool(channels)
-    sizes, own = [layout.shape[k] for k in channels], not layout.of("S")
-    n = math.prod(sizes)
-    number = (
-        choose_channel(n, facts.channels, dtype, options.component, str(path), facts.colors, layout.color, own) or 0
-    )
-    for k in reversed(channels):  # the samples of a pixel count faster than the channels
-        index[k] = slice(None) if several else number % layout.shape[k]
-        number //= layout.shape[k]
-    times = layout.of("T")
-    what = "time steps" if layout.of("Z") else "time steps of one slice each"
-    step = options.step(layout.shape[times[0]] if times else 1, str(path), what)
-    for k in times:
-        index[k] = step
-    return tuple(index), several
-
-
-def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
-    """Read the values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
-    if _mappable(series):
-        offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
-        size = path.stat().st_size
-        if offset + need > size:
-            raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
-        dtype = series.dtype.newbyteorder(file.byteorder)
-        return np.memmap(path, dtype, "r", offset, layout.shape)[index]
-    _whole(series, path)
-    whole = [isinstance(i, slice) for i in index]
-    sizes = [n for n, kept in zip(layout.shape, whole, strict=True) if kept]
-    check_memory(math.prod(sizes) * series.dtype.itemsize, str(path))
-    out = np.empty(sizes, series.dtype)
-    lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
-    rows = out.reshape(-1, *(n for n, kept in zip(inner, whole[layout.lead :], strict=True) if kept))
-    wanted = itertools.product(
-        *(range(n) if isinstance(i, slice) else (i,) for n, i in zip(lead, index[: layout.lead], strict=True))
-    )
-    with Pages(path) as pages:
-        for row, place in zip(rows, wanted, strict=True):
-            number = int(np.ravel_multi_index(place, lead)) if place else 0
-            row[...] = pages.decoded(series[number], series).reshape(inner)[index[layout.lead :]]
-    return out
+def _mapped(file: Any, series: Any, layout: SeriesAxes, path: Path) -> np.ndarray:
+    """Map the values of a series that lie together plainly."""
+    offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
+    size = path.stat().st_size
+    if offset + need > size:
+        raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
+    return np.memmap(path, series.dtype.newbyteorder(file.byteorder), "r", offset, layout.shape)
 
 
 def _mappable(series: Any) -> bool:
@@ -286,17 +269,16 @@ class Facts:
     assumed: tuple[str, ...] = ()
     length: str = ""
 
-    def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], list[str]]:
-        """Return the spacing (x, y, z) and what was assumed for it; raise UsageError if unusable and none is given."""
-        if self.trouble and options.spacing is None:
-            raise UsageError(f"{source}: {self.trouble}; try --spacing X Y Z")
+    def doubts(self, options: ReadOptions, slices: int, source: str) -> list[str]:
+        """Return what is assumed for the spacing; raise UsageError if it is unusable and none is given."""
         if options.spacing is not None or self.spacing == (None, None, None):
-            return options.spacing_or((1.0, 1.0, 1.0)), []
+            return []
+        if self.trouble:
+            raise UsageError(f"{source}: {self.trouble}; try --spacing X Y Z")
         x, y, z = self.spacing
-        across = x or y or z or 1.0
-        width = [] if x and y else [f"no width or no height of its pixels; taken as {across:g}"]
+        width = [] if x and y else [f"no width or no height of its pixels; taken as {x or y or z or 1.0:g}"]
         depth = [] if z or slices == 1 else ["no distance between its slices; taken as wide as its pixels"]
-        return (x or across, y or across, z or across), [*self.assumed, *width, *depth]
+        return [*self.assumed, *width, *depth]
 
 
 def ome_facts(root: ElementTree.Element, series: int, name: str, count: int, path: Path) -> Facts:

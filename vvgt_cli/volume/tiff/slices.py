@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory
-from vvgt_cli.volume.components import listed, select_component
 from vvgt_cli.volume.headers import fields_of_sections
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, listed, select_component, volume_name
+from vvgt_cli.volume.stored import Stored, slice_by_slice
 from vvgt_cli.volume.tiff import KINDS, SUFFIXES, TIFF
-from vvgt_cli.volume.tiff.pages import lazy_files
 from vvgt_cli.volume.tiff.reader import read_tiff
-from vvgt_cli.volume.types import Volume
 
 MAX_FILES = 100_000  # files
 
@@ -83,11 +79,27 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     if not unit and spacing == options.spacing_or((1.0, 1.0, 1.0)):
         size = (plane.shape[2], plane.shape[1])
         spacing, unit = log_spacing(files[0], size, step, options.spacing) or (spacing, unit)
-    field: Any = lazy_files(files, plane, read, source)
+    field: Any = _lazy(files, plane, read, source)
     if not options.stored:
         check_memory(field.nbytes, source)
         field = field[:]
     return Volume(field, spacing, name=name, unit=unit)
+
+
+def _lazy(files: list[Path], plane: np.ndarray, load: Callable[[Path], np.ndarray], source: str) -> Stored:
+    """Return slices that stay in their files; ``load`` reads one as (1, y, x), all as ``plane``, the first of them."""
+
+    def read(k: int) -> np.ndarray:
+        values = load(files[k])
+        if values.shape != plane.shape or values.dtype != plane.dtype:
+            raise DataError(
+                f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
+                f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
+            )
+        only: np.ndarray = values[0]
+        return only
+
+    return slice_by_slice(read, plane.dtype, (len(files), *plane.shape[1:]), source)
 
 
 def read_glob(pattern: str, options: ReadOptions) -> Volume | None:

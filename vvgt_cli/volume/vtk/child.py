@@ -24,11 +24,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.arrays.grib import GRIB, grib_volume
-from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.components import ArrayInfo
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HDF5, HEAD_BYTES, volume_name
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ArrayInfo, ReadOptions, Volume, check_memory, count
 from vvgt_cli.volume.vtk import GRIDS, INDEX, INDEXES, SINGLE, is_index, is_legacy, xml_kind
 from vvgt_cli.volume.vtk.grids import arrays_of, check_legacy_grid, check_xml_grid, values_of
 from vvgt_cli.volume.vtk.index import PIECES, Index, files_of, read_index

@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, placed, printable, size_text
 from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.blocks import check_blocks
 from vvgt_cli.volume.vtk.legacy import Parser

@@ -13,12 +13,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.headers import printable, text_of
-from vvgt_cli.volume.libraries import library_errors, read_part
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, library_errors, printable, read_part, text_of, volume_name
 from vvgt_cli.volume.stored import Slices, stored_or_loaded
-from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk.child import volume_by_child
 from vvgt_cli.volume.vtk.index import chosen_time
 from vvgt_cli.volume.vtk.xml import GHOSTS, image_grid

@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import data_file
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.reading import ReadOptions, data_file
 from vvgt_cli.volume.vtk.blocks import walk_xml
 
 MAX_FILES = 100_000  # files that an index may name

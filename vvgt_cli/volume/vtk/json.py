@@ -11,11 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import MAX_HEADER
-from vvgt_cli.volume.libraries import library_errors
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.reading import IDENTITY, MAX_HEADER, ReadOptions, Volume, library_errors, placed
 
 INDEX, MARK = "index.json", b'"vtkClass"'
 _TYPES = {f"{kind}{8 * n}Array": f"{code}{n}" for kind, code in (("Int", "i"), ("Uint", "u")) for n in (1, 2, 4, 8)}

@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume, float_dtype, triple
+from vvgt_cli.volume.reading import ReadOptions, Volume, check_memory, count, float_dtype, printable, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
 from vvgt_cli.volume.vtk.resample import MAX_EDGE, Samples, grid_of, probe, sampled_volume
 

@@ -16,11 +16,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, parse_numbers, tokens
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import placed
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.reading import ReadOptions, Volume, placed, printable, volume_name
 
 # vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.
 _TYPES = {

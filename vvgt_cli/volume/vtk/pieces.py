@@ -18,11 +18,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import SHARE, check_memory, data_file
 from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
-from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.reading import ReadOptions, Volume, float_dtype, printable, triple, volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
-from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.xml import GHOSTS, HIDDEN, Scan, extent_dims, extent_of, image_grid, image_values, scan
 
 MAX_KEPT = 256 << 20  # bytes of unpacked pieces that a process keeps

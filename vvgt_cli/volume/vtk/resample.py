@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.types import Volume, float_dtype, triple
+from vvgt_cli.volume.reading import Volume, check_memory, count, float_dtype, triple
 
 MAX_EDGE = 512  # voxels along an axis, where nobody said how many
 
@@ -36,13 +35,8 @@ def resample(
     Point data are interpolated as the cells do, cell data are constant in a cell. Samples are voxel centres: the first
     lies half a voxel inside the box. The volume's name says how many there are.
 
-    Args:
-        mesh: a vtkDataSet.
-        values: (n,) scalars of its points or cells.
-        where: ``point`` or ``cell``.
-        dims: voxels along (x, y, z); None: cubic ones, about as many as the mesh has cells, `MAX_EDGE` along an axis.
-        source: for messages.
-        name: of the volume.
+    ``values`` (n,) are scalars of the points or cells (``where``) of the mesh. Without ``dims`` (x, y, z) voxels are
+    cubes, about as many as the mesh has cells, and at most `MAX_EDGE` along an axis.
 
     Raises:
         DataError: an empty mesh, or memory that does not suffice.

@@ -22,11 +22,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array, selected_dtype
-from vvgt_cli.volume.headers import printable, type_of
-from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, volume_name
-from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.stored import Slices, Stored
+from vvgt_cli.volume.reading import ReadOptions, Slices, Stored, printable, type_of, unit_rows
 from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
 from vvgt_cli.volume.vtk import xml_kind
 from vvgt_cli.volume.vtk.blocks import block_table, check_blocks, walk_xml
@@ -352,16 +349,9 @@ def packed_array(
 ) -> Stored:  # fmt: skip
     """Wrap a component of an array that stays in its file.
 
-    Args:
-        path: the file.
-        compressor: as VTKFile names it.
-        word: type of the words before the blocks.
-        coded: in base64.
-        start: byte of the first word.
-        dtype: of the values, as stored.
-        shape: (nz, ny, nx, components).
-        component: of them.
-        info: the array.
+    ``compressor`` is as VTKFile names it, ``word`` the type of the words before the blocks, ``coded`` whether they are
+    in base64, ``start`` the byte of the first word, ``dtype`` that of the values as stored; ``shape`` is (nz, ny, nx,
+    components).
 
     Raises:
         DataError: no whole table of blocks, or one of other sizes.

@@ -22,7 +22,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 from mathutils import Vector
 
 FOLDER = Path(__file__).resolve().parent
-NAMES = "*.ply;*.spz;*.sog;*.glb;*.usdc;*.usdz;*.html"
+NAMES = "*.html;*.ply;*.spz;*.sog;*.glb;*.usdc;*.usdz"
 
 
 def _load(path: Path) -> Any:
