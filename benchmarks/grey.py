@@ -69,7 +69,7 @@ def main(
         source = (data / volume, *shlex.split(options), "--tf", functions / function)
         made = ("--opacity-unit-distance", "mean-spacing", "--live", "--max-gaussians", gaussians)
         do("convert", *source, *made, "-o", file)
-        do("view", file, "-o", page)
+        do("convert", *source, "--steps", "0", "-o", page)
         for presses, rule in enumerate(RULES, 1):
             out = folder / f"{name}-{rule}-{size}"
             own = drawn(out.with_suffix(".volume.png"), rule, size, *source)

@@ -18,7 +18,6 @@ import click
 import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
-from tests.live_stream import from_bytes
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.file_layout import degree_of
 from vvgt_cli.conversion.fitting import fit, work_of
@@ -33,9 +32,7 @@ from vvgt_cli.field.field import Resident
 from vvgt_cli.field.layered import Content
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.live import apply_look, baked
-from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import background_bins
 from vvgt_cli.look.lighting import LightOptions
@@ -120,15 +117,13 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     live = placed(field, gaussians)
     seconds = time.process_time() - start
     assert isinstance(source.tf, TransferFunction)
-    facts = LiveFacts.of(source.volume, source.statistics, source.tf)
-    packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json([live], facts, [1.0])))
     rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
         shown = field.with_look(source.with_function(replace(tf, opacity_unit_distance=spacing)))
         table = function_table(shown.source)
         looks = {
-            "live": apply_look(live, table, pixel), "bytes": apply_look(packed, table, pixel),
+            "live": apply_look(live, table, pixel),
             "other viewers": baked(live, table, pixel),
         }  # fmt: skip
         if beside:

@@ -19,7 +19,7 @@ from vvgt_cli.resources import set_memory
 
 SLOWEST = (
     *("jit", "volume_vtk_family", "scale_workers", "matrix", "stiff", "certificate", "report", "previous_frame"),
-    *("cli_streams", "page_slices", "field_rays", "splat_backward", "fuzz"),
+    *("cli_streams", "page_values", "field_rays", "splat_backward", "fuzz"),
     *("nodes", "conversion_plan", "dask", "layers", "previous_look", "cli_convert", "volume_grib", "closed_form"),
 )  # files' names, a minute to ten seconds of processor
 

@@ -44,7 +44,6 @@ TABLES = [
     ("light_vtk", VTK, "SCENES -o a.csv --size 50", "gpu_db", 15),
     ("live", {"SIZE": SIZE}, "SCENES -o a.csv --gaussians 200 --direct", "live", 15),
     ("live", {"SIZE": SIZE}, "SCENES -o a.csv --gaussians 200 --lit", "closed form", 15),
-    ("live_page", {}, "SCENES -o a.csv --scene blob --gaussians 200 --rounds 1", "MB", 0.5),
     ("network", {"default_views": default_views, "CASES": [("lines", 64, 2, 1)]}, "measure MODEL -o a.csv --repeats 1",
      "peak_gib", 0.05),
     ("parts", {}, f"SCENES -o a.csv -- {PARTS}", "psnr", 10),

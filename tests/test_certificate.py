@@ -328,9 +328,9 @@ def test_a_page_is_whole_before_it_is_scored(vvgt, folder, tmp_path, monkeypatch
     monkeypatch.setattr(TestViews, "run", lambda *args: seen.append(page.read_text("utf-8")))
     command = ("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", page)
     result = vvgt.ok(*command)
-    for held in ("slices-0", "splats-0", "live-0"):
+    for held in ("values-0", "splats-0"):
         assert f'id="{held}"' in seen[0], held
-    assert result.err.count("\nslices") == result.err.count("\nvalues") == 1
+    assert result.err.count("\nvalues") == 1
 
 
 def test_no_view_is_rendered_twice_to_be_scored(vvgt, folder, tmp_path, monkeypatch) -> None:

@@ -55,4 +55,3 @@ def test_an_option_of_one_value_is_given_once(command, vvgt):
         if one:
             assert result.code == 2
             assert "\n" not in result.error
-    assert "--live/--no-live: given 2 times" in vvgt("convert", "v", "--live", "--no-live").error

@@ -10,7 +10,6 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
-from tests.live_stream import from_bytes
 from tests.refused import refused
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
@@ -27,7 +26,6 @@ from vvgt_cli.conversion.recolored import FunctionRequest, resolve_look
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats.live import BYTES, live_bytes, live_json
 from vvgt_cli.gaussians.frames import rotations, transform, turn
 from vvgt_cli.gaussians.live import (
     AMOUNT,
@@ -40,9 +38,7 @@ from vvgt_cli.gaussians.live import (
 )
 from vvgt_cli.gaussians.live_facts import AXIS, COLUMNS, LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
-from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import Statistics, edges_of
 
@@ -263,20 +259,6 @@ def test_what_the_fog_hides_is_there() -> None:
     assert found < 10 / 24 < nearest
 
 
-def test_bytes_for_pages_lose_little() -> None:
-    """About 0.1 dB at most, of a file that is 34 dB from its volume."""
-    some = cloud(400, 3)
-    stream, known = live_bytes(some, facts()), live_json([some], facts(), [0.05])
-    assert stream.shape == (400, BYTES)
-    assert json.loads(json.dumps(known)) == known
-    back = replace(some, live=from_bytes(stream, known))
-    camera = default_views("test", size=200)[0]
-    for tf in (RAMP, WINDOW):
-        table = Table.of_function(tf, LO, HI, 0.05, GRAIN)
-        images = [render(apply_look(g, table), camera)[..., :3] for g in (some, back)]
-        assert psnr(*images) > 50  # at 34 dB from the volume 10 log10(1 + 10^-1.6) = 0.1 dB
-
-
 @pytest.fixture(scope="module")
 def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vvgt_cli.commands.main import run
@@ -324,13 +306,6 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
     assert next((tmp_path / "c").glob("*.png")).read_bytes() not in pictures  # of its own function
     with pytest.warns(UserWarning, match="cannot store values for other functions"):
         vvgt.ok("view", live_file, "-o", tmp_path / "one.spz")
-
-
-def test_a_live_page_is_not_read_back(vvgt, tmp_path) -> None:
-    """It computes look and light anew: its columns alone are another picture."""
-    for name, told in (("a.html", False), ("a.spz", True)):
-        done = vvgt.ok("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
-        assert ("read back" in done.err) == told
 
 
 def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:

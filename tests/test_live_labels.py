@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.live_stream import from_bytes
 from tests.refused import refused
 from tests.test_live import SMALL, cloud
-from tests.test_page_live import options, page_of
+from tests.test_page_look import options, page_of
 from vvgt_cli.closed_form.labelled import labels_and_gradients
 from vvgt_cli.conversion.live import label_fog
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.gaussians.live import Palette, apply_look, baked, opacities, visible_under
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LiveFacts
@@ -116,8 +114,8 @@ def test_names_of_labels_are_kept_whole(tmp_path: Path) -> None:
             assert given is known or layer.name == own.name
     text = legend_text(LabelTable("t", labels), 0.0, 0.0, "") or ""
     assert [name for name, _ in json.loads(text)["labels"]] == list(NAMES)
-    scene = page_of(some, options(live=known))[1]
-    assert [label["name"] for label in scene["live"]["layers"][0]["labels"]] == list(NAMES)
+    scene = page_of(known, options())[1]
+    assert [label["name"] for label in scene["look"]["layers"][0]["labels"]] == list(NAMES)
 
 
 def test_a_name_that_is_too_long_is_cut_with_a_word(tmp_path: Path) -> None:
@@ -126,23 +124,11 @@ def test_a_name_that_is_too_long_is_cut_with_a_word(tmp_path: Path) -> None:
         assert read_labels(str(tmp_path / "t.json")).labels[0].name == "n" * 200
 
 
-def test_bytes_for_pages_hold_the_label() -> None:
-    many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
-    some = labels_cloud(many)
-    live = some.live.copy()  # type: ignore[union-attr]
-    live[:, LABEL_ROW] = np.linspace(0, 299, len(live)).round()
-    some = replace(some, live=live)
-    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), [0.05])
-    np.testing.assert_array_equal(from_bytes(stream, known)[:, LABEL_ROW], live[:, LABEL_ROW])
-    assert json.loads(json.dumps(known)) == known
-
-
 def test_names_of_labels_are_no_markup_in_the_page() -> None:
-    some = baked(labels_cloud(), Palette.of_labels(LABELS, 0.05))
-    content, scene = page_of(some, options(live=facts()))
+    content, scene = page_of(facts(), options())
     assert b"</script><b>x" not in content
-    assert [label["name"] for label in scene["live"]["layers"][0]["labels"]] == [label.name for label in LABELS]
-    assert scene["live"]["layers"][0]["nodes"] == []
+    assert [label["name"] for label in scene["look"]["layers"][0]["labels"]] == [label.name for label in LABELS]
+    assert scene["look"]["layers"][0]["nodes"] == []
 
 
 def test_labels_under_gaussians_and_the_way_they_end() -> None:

@@ -1,7 +1,6 @@
 """Live files of several layers or channels: each Gaussian carries its layer's number, and its value or label."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +9,13 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.refused import refused
-from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, WINDOW, cloud
+from tests.test_live import GRAIN, LO, RAMP, SMALL, WINDOW, cloud
 from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
-from tests.test_page_live import compare, options
-from vvgt_cli.commands.live_site import ServedCloud
 from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
+from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look
 from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.volume import Volume
 
@@ -48,24 +45,6 @@ def test_each_layer_is_looked_up_in_its_own_table() -> None:
         np.testing.assert_array_equal(alone.means, together.means[own])
         np.testing.assert_array_equal(alone.opacity_logits, together.opacity_logits[own])
         np.testing.assert_array_equal(alone.colors, together.colors[own])
-
-
-def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None:
-    """Values over one range, values over another one, and labels."""
-    some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
-    some.live[:, LAYER_ID] = np.arange(60) % 3
-    some.live[some.live[:, LAYER_ID] < 2, LABEL_ROW] = 0
-    some.live[:, LABEL_ROW] %= len(LABELS)
-    first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
-    table = LayerTables(
-        (
-            Table.of_function(WINDOW, LO, HI, 0.05, GRAIN),
-            Table.of_function(values().tf("pet"), -5, 160, 0.025, GRAIN),
-            Palette.of_labels(organs.labels, 0.02),
-        )
-    )
-    laid = options(live=replace(first, others=(other, organs)), up="none", screen_size=300)
-    compare(baked(some, table), laid, table, tmp_path)
 
 
 def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
@@ -220,37 +199,6 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
         assert (np.bincount(number.astype(int)) > 40).all()
     every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
     assert "nothing is visible" in vvgt.fails(1, "evaluate", pair / "live.ply", "--volume", *every)
-
-
-def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
-    vvgt.ok("view", pair / "live.ply", "-o", tmp_path / "a.html")
-    found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)
-    layers = json.loads(found[1])["live"]["layers"]
-    assert [(layer["title"], layer["row"], len(layer["labels"])) for layer in layers] == [
-        ("left", 0, 0),
-        ("right", 1, 0),
-        ("top_label", 2, 1),
-    ]
-
-
-def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
-    """As `recolor` shows the file under the same looks: what the page sends is of each layer."""
-    cloud = ServedCloud.of((pair / "live.ply").read_bytes(), "live")
-    other = TF | {"opacity_unit_distance": 2.0}
-    labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
-    sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
-    saved = cloud.with_looks(sent)
-    facts = saved.options.live
-    assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
-    assert facts.layers[2].labels[0].opacity == 0.25
-    assert facts.layers[2].labels[0].name == "top"
-    number = saved.gaussians.live[:, LAYER_ID]  # type: ignore[index]
-    assert (np.abs(saved.gaussians.colors[number == 2] - (0, 1, 1)) < 1e-3).all()
-    thinner = saved.gaussians.opacity_logits[number == 0] < cloud.gaussians.opacity_logits[number == 0]
-    assert thinner.mean() > 0.4  # opacity is per twice the distance
-    for wrong in (sent[:2], [labels, *sent[1:]], [*sent[:2], {"function": other}], None):
-        with pytest.raises(vvgt_library.DataError):
-            cloud.with_looks(wrong)
 
 
 def test_channels_in_python(tmp_path) -> None:

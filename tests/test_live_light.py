@@ -9,14 +9,14 @@ import pytest
 
 import vvgt_cli as vvgt_library
 from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
-from tests.test_page_live import options, page_of
+from tests.test_page_look import options, page_of
 from vvgt_cli.closed_form.relight import relight
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.frames import basis, rotations, turn, up_matrix, view_colors
-from vvgt_cli.gaussians.live import MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
+from vvgt_cli.gaussians.live import MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, directions, spreads
 from vvgt_cli.gaussians.live_facts import AXIS
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import Volume
@@ -131,15 +131,14 @@ def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> Non
 
 
 def test_a_page_begins_with_the_files_light() -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     for light, kind in ((None, "none"), (HEAD, "headlight"), (SIDE, "direction")):
-        _, scene = page_of(some, options(live=facts(), light=light))
-        assert scene["live"]["light"]["kind"] == kind
+        _, scene = page_of(facts(), options(light=light))
+        assert scene["look"]["light"]["kind"] == kind
     there = (up_matrix("y") @ np.array(SIDE.directions[0])) * (-1, -1, 1)
-    np.testing.assert_allclose(scene["live"]["light"]["from"], there, atol=1e-12)
-    assert scene["live"]["light"]["power"] == 4.0
+    np.testing.assert_allclose(scene["look"]["light"]["from"], there, atol=1e-12)
+    assert scene["look"]["light"]["power"] == 4.0
     with pytest.warns(UserWarning, match="one light at a time"):
-        page_of(some, options(live=facts(), light=replace(SIDE, headlight=True)))
+        page_of(facts(), options(light=replace(SIDE, headlight=True)))
 
 
 def test_what_is_opaque_lies_flat_in_its_surface() -> None:

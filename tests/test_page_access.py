@@ -30,7 +30,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory, marked: str) -> dict[str, st
     quick = ["--max-gaussians", "1000", "--quiet"]
     given = {
         "series": ["series.nii", "--live"], "labels": ["labels.nii", "--labels", "auto", "--live"],
-        "fixed": ["labels.nii", "--no-live", "--no-slices", "--steps", "0"],
+        "fixed": ["labels.nii", "--no-values", "--steps", "0"],
     }  # fmt: skip
     for name, (file, *options) in given.items():
         assert run(["convert", str(folder / file), *options, *quick, "-o", str(folder / f"{name}.html")]) == 0
@@ -181,23 +181,9 @@ def test_no_serious_finding_and_no_trap(name: str, person: Person, pages: dict[s
 def test_facts_say_what_a_page_holds_and_its_light(person: Person, pages: dict[str, str]) -> None:
     rows = "[...document.querySelectorAll('#about dt')].map((one) => [one.textContent, one.nextSibling.textContent])"
     person("open", pages["labels"])
-    assert dict(person("eval", rows))["contains"].startswith("Gaussians, names of labels, slices of the volume")
+    assert dict(person("eval", rows))["contains"].startswith("Gaussians, values of the volume, names of labels")
     person("open", pages["fixed"])
     assert dict(person("eval", rows))["light"] == "headlight; ambient 0.4, diffuse 0.6, gloss 0.0"
-
-
-def test_a_page_that_is_far_from_its_volume_says_so_until_it_is_closed(person: Person, pages: dict[str, str]) -> None:
-    seen = "(({ hidden, textContent }) => (hidden ? '' : textContent))(document.querySelector('#notice'))"
-    person("open", pages["slices"])
-    assert person("eval", seen) == ""
-    far = Path(pages["slices"].removeprefix("file://")).with_name("far.html")
-    line = ["convert", str(far.with_name("marked.nii.gz")), "--live", "--max-gaussians", "60", "--quiet", "--overwrite"]
-    assert run([*line, "-o", str(far)]) == 0
-    person("open", far.as_uri())
-    assert " dB" in person("eval", seen)
-    person("eval", "document.querySelector('#notice button').focus()")
-    person("press", "Enter")
-    assert person("eval", seen) == ""
 
 
 def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, pages: dict[str, str]) -> None:

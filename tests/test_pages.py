@@ -125,10 +125,9 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert "with one file of several clouds" in done.error
     done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
     assert "--max-size with one file of several clouds" in done
-    for without in ("--no-live", "--no-slices"):
-        done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", without, *how)
-        assert f"{without} with one file of several clouds" in done
-        assert "are for a page" in vvgt.fails(2, "convert", "four.nii", "-o", "four_{}.ply", without, *how)
+    done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--no-values", *how)
+    assert "--no-values with one file of several clouds" in done
+    assert "is for a page" in vvgt.fails(2, "convert", "four.nii", "-o", "four_{}.ply", "--no-values", *how)
     white = {"rgb": [1, 1, 1]}
     dark = json.dumps({"points": [{"x": 900, "opacity": 0, **white}, {"x": 901, "opacity": 1, **white}]})
     Path("dark.json").write_text(dark)
@@ -149,7 +148,7 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
 def held_bytes(page: Path) -> bytes:
     """A page with everything it holds in base64."""
     content = page.read_bytes()
-    return content + b"".join(map(base64.b64decode, re.findall(rb'id="(?:splats|live)-\d">([^<]+)<', content)))
+    return content + b"".join(map(base64.b64decode, re.findall(rb'id="(?:splats|values)-\d">([^<]+)<', content)))
 
 
 def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, monkeypatch):
@@ -160,9 +159,7 @@ def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, monkeypatc
     source = tmp_path / "Mueller_Hans.npy"
     vvgt.ok("convert", source, "-o", tmp_path / "a.ply", *HOW)
     done = vvgt("convert", source, "-o", tmp_path / "a.html", *HOW)
-    assert (
-        "a.html holds Gaussians, data values, their histogram, slices of the volume (14 x 14 x 14 voxels)" in done.err
-    )
+    assert "a.html holds Gaussians, values of the volume (14 x 14 x 14 voxels)" in done.err
     assert "a checksum of the volume; its title is" in done.err
     vvgt.ok("view", source, "-o", tmp_path / "b.html")
     vvgt.ok("convert", tmp_path / "Mueller_*.npy", "-o", tmp_path / "c.html", *HOW)
@@ -177,27 +174,24 @@ def test_no_file_names_the_volume_that_it_was_made_of(vvgt, tmp_path, monkeypatc
     assert b"<title>other</title>" in (tmp_path / "e.html").read_bytes()
 
 
-def test_the_page_of_one_volume_holds_both_forms_unless_it_cannot(vvgt, tmp_path):
+def test_the_page_of_one_volume_holds_its_values_and_look_unless_it_cannot(vvgt, tmp_path):
     values = np.random.default_rng(1).uniform(size=(10, 11, 12)).astype(np.float32)
     np.save(tmp_path / "v.npy", values)
     np.save(tmp_path / "rgb.npy", np.stack([values] * 3, axis=-1))
 
-    def scene(name: str, *args: str) -> dict:
-        done = vvgt.ok("convert", tmp_path / args[0], "-o", tmp_path / name, "--overwrite", *HOW, *args[1:])
-        text = (tmp_path / name).read_text("utf-8")
-        assert ("no function editor" in done.err) == ("why" in name)
+    def scene(*args: str) -> dict:
+        vvgt.ok("convert", tmp_path / args[0], "-o", tmp_path / "a.html", "--overwrite", *HOW, *args[1:])
+        text = (tmp_path / "a.html").read_text("utf-8")
         return dict(json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1]))
 
-    both = scene("both.html", "v.npy")
-    assert both["converted"]["element"] == "splats-0"
-    assert both["frames"][0]["element"] == "live-0"
-    assert len(both["live"]["layers"][0]["nodes"]) > 1
+    both = scene("v.npy")
+    assert both["frames"][0]["element"] == "splats-0"
+    assert len(both["look"]["layers"][0]["nodes"]) > 1
+    assert both["values"][0]["dims"] == [12, 11, 10]
     vvgt.ok("convert", tmp_path / "v.npy", "-o", tmp_path / "v.ply", *HOW)
-    assert same(np.sort(read_splats(tmp_path / "both.html")[0].opacity_logits), tmp_path / "v.ply")
-    assert not {"live", "converted"} & set(scene("no.html", "v.npy", "--no-live"))
-    lit = ("--light", "1,0,0", "--shadows")
-    assert "live" not in scene("why-shadows.html", "v.npy", *lit)
-    assert "live" not in scene("why-time.html", "v.npy", "--time-budget", "5")
-    assert "live" not in scene("why-rgb.html", "rgb.npy", "--component", "color")
+    assert same(np.sort(read_splats(tmp_path / "a.html")[0].opacity_logits), tmp_path / "v.ply")
+    assert {"look", "values"} <= set(scene("v.npy", "--light", "1,0,0", "--shadows", "--time-budget", "5"))
+    assert not {"look", "values"} & set(scene("v.npy", "--no-values"))
+    assert not {"look", "values"} & set(scene("rgb.npy", "--component", "color"))
     np.save(tmp_path / "many.npy", np.arange(512, dtype=np.uint16).reshape(8, 8, 8))
-    assert "live" not in scene("why-many.html", "many.npy", "--labels", "auto")
+    assert "look" not in scene("many.npy", "--labels", "auto")  # of so many labels

@@ -1,4 +1,4 @@
-"""`vvgt view VOLUME` in a browser: live at once, better when it is converted, saved; a page within a notebook's."""
+"""`vvgt view VOLUME` in a browser: the volume at once, its conversion, saved; a page within a notebook's."""
 
 import json
 import re
@@ -35,7 +35,7 @@ SHELL = {
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids="{0[0]}".format)
-def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tuple[int, int], tmp_path: Path) -> None:
+def test_a_function_that_is_dragged_is_seen_at_once_and_then_converted(size: tuple[int, int], tmp_path: Path) -> None:
     (tmp_path / "shell.json").write_text(json.dumps(SHELL))
     with shown("example:blob:24", "--tf", "shell.json", folder=tmp_path) as (_, url):
         job = {"browser": browser(), "url": url, "size": size, "folder": str(tmp_path), "note": NOTE}
@@ -44,15 +44,15 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
         done = subprocess.run(command, capture_output=True, text=True, timeout=2400)
     assert done.returncode == 0, done.stderr
     noted = json.loads(done.stdout.splitlines()[-1])
-    assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == (*["preview"] * 3, "")
+    assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == (*["volume"] * 3, "")
     assert noted["better"].startswith("converted, ")
     assert float(noted["better"].split()[1]) > 30
     assert max(noted["moved"]) < 2e-3  # it may still glide
-    assert (noted["cut"], noted["uncut"], noted["changed"]) == ("preview", noted["better"], "preview")
-    assert (noted["lit"][0], noted["lit"][1].split()[0]) == ("preview", "converted,")
+    assert (noted["cut"], noted["uncut"], noted["changed"]) == ("volume", noted["better"], "volume")
+    assert (noted["lit"][0], noted["lit"][1].split()[0]) == ("volume", "converted,")
     assert noted["refused"] == "not now"
     assert noted["slices"] == [24, 24, 24]
-    assert b'id="slices-0"' in (tmp_path / "blob-24.html").read_bytes()
+    assert b'id="values-0"' in (tmp_path / "blob-24.html").read_bytes()
     assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', (tmp_path / "blob-24.html").read_text("utf-8"), re.S)[1])
     link = dict(part.split("=", 1) for part in scene["link"].split("&"))
@@ -65,8 +65,8 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     camera = orbit_views(1, size=edge)[0]
     _, (volume,) = vvgt.render_views("example:blob:24", function, cameras=[camera])
     live, better = (psnr(volume[..., :3], pictures[name]) for name in ("live", "better"))
-    print(f"{size}: against the volume at {edge} px: live {live:.2f} dB, converted {better:.2f} dB")
-    assert better > live + 2
+    print(f"{size}: against the volume at {edge} px: rays {live:.2f} dB, converted {better:.2f} dB")
+    assert live > max(38, better)
     saved = render(read_ply(tmp_path / "blob-24.ply")[0], camera, rule="inria")[..., :3]
     assert psnr(saved, pictures["better"]) > 38
     assert len(read_splats(tmp_path / "blob-24.html")[0]) == len(read_ply(tmp_path / "blob-24.ply")[0])

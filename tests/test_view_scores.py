@@ -47,7 +47,7 @@ def test_what_is_converted_stays_without_scores(
     assert "not scored: no memory" in capsys.readouterr().err
 
 
-def test_the_console_hears_that_what_has_no_live_form_is_not_scored(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_console_hears_that_a_first_conversion_is_not_scored(capsys: pytest.CaptureFixture[str]) -> None:
     site = Site({}, print)
     of = PageController(site.resources, site.posts, "x", Console())
     of.on_message(1, Converted(b"unscored", {"": b"page"}))

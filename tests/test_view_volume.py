@@ -1,4 +1,4 @@
-"""`vvgt view` of volumes and live files: the page of the live form, conversions for its function, files to save."""
+"""`vvgt view` of volumes and live files: the page, conversions for its look, files to save."""
 
 import http.client
 import io
@@ -23,23 +23,24 @@ import pytest
 from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
-from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands import viewer as view
-from vvgt_cli.commands.converter import Converter, Failed, Setup
-from vvgt_cli.commands.live_site import PageController, ServedCloud, parse_function, plain_name
+from vvgt_cli.commands.converter import Converted, Converter, Failed, Setup
+from vvgt_cli.commands.converter_process import hidden
+from vvgt_cli.commands.live_site import PageController, ServedCloud, page_files, plain_name
 from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.conversion import convert_batch
-from vvgt_cli.conversion.live import apply_light
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians import PlyOptions, as_ply, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.gaussians.formats.page_live import live_page_data
+from vvgt_cli.gaussians.formats.page_look import look_entry, parse_light
+from vvgt_cli.gaussians.formats.page_values import Layer, values_of
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console
+from vvgt_cli.volume import Volume
 
 FUNCTION = {
     "name": "mine",
@@ -93,17 +94,18 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: Path, temporary: Path) -> None:
+def test_a_volume_is_shown_and_converted_for_the_pages_function(tmp_path: Path, temporary: Path) -> None:
     folder = tmp_path / "here"
     folder.mkdir()
     with shown("example:blob:12", "--tf", "viridis", folder=folder) as (child, url):
         until(lambda: not scene_of(url).get("waits"))
         scene = scene_of(url)
         assert scene["server"] == {"converts": True, "name": "blob-12"}
-        assert scene["slices"] == {"from": "slices.json"}
-        assert scene["live"]["layers"][0]["values"][1] == pytest.approx(0.9, abs=0.1)
+        assert scene["values"] == {"from": "values.json"}
+        assert json.loads(ask(url, urlsplit(url).path + "values.json")[1])["facts"][0]["dims"] == [12, 12, 12]
+        assert scene["look"]["layers"][0]["values"][1] == pytest.approx(0.9, abs=0.1)
         path = urlsplit(url).path
-        assert len(ServedCloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
+        assert "not converted" in send(url, "save", {"file": "ply"})[1].decode()
         # a function: the next one ends the work for it
         assert send(url, "function", {**FUNCTION, "name": "first"}) == (200, b'{"number": 2}')
         first = set(workers(child.pid))
@@ -131,12 +133,9 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         assert len(kept.gaussians) == len(shown_now) > 10
         assert kept.options.certificate is not None
         assert len(read_html(send(url, "save", {"file": "html", "number": 4})[1], "x")) == len(shown_now)
-        # the live form under the function, as a file that is live
-        status, saved = send(url, "save", {"file": "ply", "function": FUNCTION})
-        live = ServedCloud.of(saved, "x")
-        assert live.live
-        assert live.options.live.baked()["name"] == "mine"
-        assert b'"live"' in send(url, "save", {"file": "html", "function": FUNCTION})[1]
+        page = send(url, "save", {"file": "html", "number": 4, "function": FUNCTION})[1].decode()
+        look = json.loads(re.search(r'id="scene">(.*?)</script>', page, re.S)[1])["look"]
+        assert look["layers"][0]["name"] == "mine"
         # no function: nothing is at work, and what was made is gone
         assert send(url, "function", None)[0] == 200
         assert ask(url, path + state["file"])[0] == 404
@@ -148,14 +147,14 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
     assert list(temporary.iterdir()) == list(folder.iterdir()) == []
 
 
-def test_colours_are_offered_no_slices(tmp_path: Path, temporary: Path) -> None:
+def test_colours_are_offered_no_values(tmp_path: Path, temporary: Path) -> None:
     nib = pytest.importorskip("nibabel")
     data = np.zeros((8, 8, 8), np.dtype([(c, np.uint8) for c in "RGB"]))
     data["R"][2:6, 2:6, 2:6] = 200
     nib.save(nib.Nifti1Image(data, np.eye(4)), tmp_path / "rgb.nii")
     with shown(str(tmp_path / "rgb.nii"), folder=tmp_path) as (_, url):
         until(lambda: not scene_of(url).get("waits"))
-        assert "slices" not in scene_of(url)
+        assert not {"values", "look"} & set(scene_of(url))
 
 
 def test_what_is_cancelled_stops_and_an_interrupt_leaves_nothing(tmp_path: Path, temporary: Path) -> None:
@@ -211,7 +210,7 @@ def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Pat
 
 @pytest.fixture
 def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
-    """The site of a live file, which says that it converts, without a process."""
+    """The site of a volume, which says that it converts, without a process."""
 
     class Still(Converter):
         def submit(self, job: Any) -> int:
@@ -220,10 +219,14 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
 
     site = Site({}, print)
     found = PageController(site.resources, site.posts, "x", Console(quiet=True))
-    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
+    values = values_of([Layer(Volume(np.zeros((2, 3, 4), np.uint8)), RAMP, 0.5)])
+    assert values is not None
+    values = values._replace(look=replace(facts(), distance=0.5))
+    cloud = ServedCloud.of(as_ply(hidden((1, 1, 1)), PlyOptions(up="y", scale=0.1, unit_distance=0.5)), "x")
     found.converter = Still(SourceRequest("none"), "x", found.on_message)
     found.resources["state"] = Resource("application/json", found._state_json)
-    found.show(ServedCloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
+    found.on_message(0, Converted(cloud.ply or b"", page_files(cloud, values), values))
+    found.state = {"number": 0, "state": "none", "said": ""}
     with served(site) as url:
         yield url, found
 
@@ -282,20 +285,7 @@ def test_the_page_says_why_a_conversion_failed(controller: tuple[str, PageContro
     of.on_message(1, Failed(DataError("mine: nothing is visible")))
     assert state_of(url) == {"number": 1, "state": "failed", "said": "mine: nothing is visible"}
     assert of.error is None
-    assert "live" in scene_of(url)
-
-
-def test_a_saved_live_file_has_the_colours_of_the_function(controller: tuple[str, PageController]) -> None:
-    function = {
-        "points": [{"x": LO, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": HI, "rgb": [0, 0, 1], "opacity": 0.4}],
-        "opacity_unit_distance": 0.5,
-    }
-    saved = ServedCloud.of(send(controller[0], "save", {"file": "ply", "function": function})[1], "x")
-    wanted = baked(live_cloud(), Table.of_function(parse_function(function), LO, HI, 0.05, GRAIN), pixel_width(SIZE))
-    np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
-    np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
-    plain = ServedCloud.of(send(controller[0], "save", {"file": "ply"})[1], "x")
-    assert np.abs(plain.gaussians.colors - wanted.colors).max() > 0.1
+    assert "look" in scene_of(url)
 
 
 def test_a_long_function_is_taken(controller: tuple[str, PageController]) -> None:
@@ -303,33 +293,21 @@ def test_a_long_function_is_taken(controller: tuple[str, PageController]) -> Non
     assert send(controller[0], "function", {**FUNCTION, "points": points})[0] == 200
 
 
-def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(controller: tuple[str, PageController]) -> None:
-    url, of = controller
+def test_a_light_of_a_page_is_that_of_a_file(controller: tuple[str, PageController]) -> None:
+    _, of = controller
     assert of.first is not None
-    plain, side = of.first(), Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
-    lit_file = replace(plain, options=replace(plain.options, light=side))
-    of.first = lambda: lit_file
-    table = Table.of_function(parse_function(FUNCTION), LO, HI, 0.1 * 0.1, GRAIN)
-    dark = baked(live_cloud(), table, pixel_width(SIZE))
-
-    def saved(**more: Any) -> ServedCloud:
-        return ServedCloud.of(send(url, "save", {"file": "ply", "function": FUNCTION, **more})[1], "x")
-
-    kept = saved()
-    assert kept.options.light == side
-    assert kept.options.function == "mine"
-    np.testing.assert_allclose(kept.gaussians.colors, apply_light(dark, side).colors, atol=1e-5)
-    base = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
-    again = saved(light=base).options.light
+    assert of.values is not None
+    options, side = of.first().options, Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
+    base = look_entry(of.values, replace(options, light=side))["light"]
+    again = parse_light(base, options)
+    assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)
     assert replace(again, directions=side.directions) == side
-    assert saved(light=base | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
-    none = saved(light=base | {"kind": "none"})
-    assert none.options.light is None
-    np.testing.assert_allclose(none.gaussians.colors, dark.colors, atol=1e-5)
+    assert parse_light(base | {"kind": "headlight"}, options) == replace(side, headlight=True, directions=())
+    assert parse_light(base | {"kind": "none"}, options) is None
     for wrong in ([], {}, {"kind": "sun"}, base | {"from": [0, 0, 0]}, base | {"from": 1}, base | {"ambient": "x"},
                   base | {"power": None}, base | {"diffuse": -1}, base | {"from": [1e999, 0, 0]}):  # fmt: skip
-        assert send(url, "save", {"file": "ply", "function": FUNCTION, "light": wrong})[0] == 400
+        assert send(controller[0], "function", {**FUNCTION, "light": wrong})[0] == 400
 
 
 def test_a_conversion_has_the_light_of_the_file_or_of_the_page(
@@ -349,19 +327,16 @@ def test_a_conversion_has_the_light_of_the_file_or_of_the_page(
     np.testing.assert_allclose(np.array(other.directions) @ up_matrix("y").T * (-1, -1, 1), [[0.6, 0, 0.8]], atol=1e-12)
 
 
-def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:
+def test_a_live_file_and_an_ordinary_one_are_shown_as_they_are(tmp_path: Path) -> None:
     some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     write_ply(tmp_path / "live.ply", some, PlyOptions(scale=0.1, unit_distance=0.5, live=facts()))
     write_ply(tmp_path / "plain.ply", cloud())
     with shown("live.ply", folder=tmp_path) as (_, url):
         scene = scene_of(url)
-        assert scene["server"] == {"converts": False, "name": "live"}
-        assert scene["live"]["layers"][0]["values"] == [LO, HI]
-        assert ask(url, urlsplit(url).path + scene["frames"][0]["file"])[1].count(b"element chunk")
+        assert not {"look", "server"} & set(scene)
         assert send(url, "function", FUNCTION)[0] == 405  # there is no volume
-        assert send(url, "save", {"file": "html"})[0] == 200
     with shown("plain.ply", folder=tmp_path) as (_, url):
-        assert "live" not in scene_of(url)
+        assert "look" not in scene_of(url)
 
 
 def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Path) -> None:
@@ -371,7 +346,7 @@ def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Pat
         served(site) as url,
         Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", controller.on_message) as converter,
     ):
-        controller.await_volume(converter, lambda: None)
+        controller.await_volume(converter)
         assert scene_of(url)["waits"]
         assert state_of(url)["state"] in ("first", "failed")
         assert controller.shown.wait(120)
@@ -427,9 +402,8 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     assert means[2] - means[0] > 0.6  # 12 voxels of 24, whose box is 2 wide, in haze
     assert not list(temporary.glob("vvgt-*"))
     assert "holds one frame" in vvgt("view", tmp_path / "run_*.npy", "-o", tmp_path / "a.ply").error
-    for without in ("--no-live", "--no-slices"):
-        left = vvgt.fails(2, "view", tmp_path / "run_*.npy", without, "-o", tmp_path / "a.html")
-        assert f"{without} with one file of several clouds" in left
+    left = vvgt.fails(2, "view", tmp_path / "run_*.npy", "--no-values", "-o", tmp_path / "a.html")
+    assert "--no-values with one file of several clouds" in left
     wrong = vvgt("view", tmp_path / "run_*.npy", "--crop", "30:,:,:")
     assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []

@@ -14,7 +14,7 @@ const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core'
 const job = JSON.parse(fs.readFileSync(jobFile));
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist',
   '--disable-background-networking', '--disable-component-update', '--disable-sync', '--no-first-run',
-  '--force-color-profile=srgb'];
+  '--force-color-profile=srgb', '--disable-gpu-watchdog'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.window ?? [job.size, job.size];
 const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1 });
@@ -70,6 +70,13 @@ const shoot = async ({ camera, frame }) => {
     entity.camera.projectionOffset = { x: 0, y: 0 };
     entity.translateLocal(shift, 0, 0);
   });
+  const { look } = window.vvgt.live ?? {};
+  if (look?.wanted && !look.said) {  // the volume itself, in a canvas of its own
+    lens.middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+    for (let still = 0; still < 3; still = look.rested ? still + 1 : 0) await new Promise((done) => setTimeout(done, 300));
+    if (look.said) throw new Error(look.said);
+    return look.canvas.toDataURL('image/png');
+  }
   if (frame !== null) await show(frame);
   document.querySelectorAll('#series, #live').forEach((element) => { element.style.display = 'none'; });
   return settled((by) => { shift = by; }, () => new Promise((done) => {

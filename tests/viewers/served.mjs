@@ -1,4 +1,4 @@
-// served.mjs JOB.json MODULES: the page of `vvgt view VOLUME` in headless Chromium, by mouse: it waits, is live, a node is
+// served.mjs JOB.json MODULES: the page of `vvgt view VOLUME` in headless Chromium, by mouse: it waits, shows the volume, a node is
 // dragged, the better form comes, another change goes back, files are saved. JOB: {"browser", "url", "size": [w, h], "folder"};
 // pictures live.png and better.png (square, where the page begins) and what is saved go to the folder; prints what the page
 // said: {"began", "dragging", "live", "better", "cut", "uncut", "lit", "changed", "moved", "saved", "refused"}.
@@ -48,6 +48,13 @@ const shoot = async (name) => {
       camera.translateLocal(shift, 0, 0);
     };
     app.on('update', put);
+    const { look } = window.vvgt.live;
+    if (look.wanted) {  // the volume itself, in a canvas of its own
+      put();
+      for (let still = 0; still < 3; still = look.rested ? still + 1 : 0) await new Promise((done) => setTimeout(done, 300));
+      app.off('update', put);
+      return look.canvas.toDataURL('image/png');
+    }
     const url = await settled((by) => { shift = by; }, () => new Promise((done) => {
       app.renderNextFrame = true;
       app.once('frameend', () => done(canvas.toDataURL('image/png')));
@@ -104,7 +111,7 @@ noted.lit = [await shown()];
 await until('document.querySelector("#live .named i").textContent.startsWith("converted, ")');
 noted.lit.push(await shown());
 await page.keyboard.press('Control+z');
-await page.evaluate(() => {  // the same function, of the live form
+await page.evaluate(() => {  // the same function, of the volume itself
   const post = window.fetch;
   window.fetch = (to, how) => (to === 'function' ? Promise.reject(new Error('not now')) : post(to, how));
   window.vvgt.live.set(window.vvgt.live.nodes());

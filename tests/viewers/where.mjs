@@ -40,7 +40,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #notice, .listed { opacity: 0 !important; transition: none !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
   refused: async (url) => {

@@ -37,11 +37,10 @@ from vvgt_cli.progress import Console
     "or time budget.",
 )  # fmt: skip
 @click.option(
-    "--live/--no-live", default=None,
-    help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function. By default, a "
-    "page (.html) of one volume holds this form as well, for its editor of the function; --no-live omits it.",
+    "--live", is_flag=True,
+    help="Store data values with the Gaussians, so that 'vvgt recolor' can show them under any function.",
 )  # fmt: skip
-@shared.slices_option
+@shared.values_option
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @shared.ply_options
 @shared.placed_read_options
@@ -60,7 +59,7 @@ from vvgt_cli.progress import Console
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @shared.common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool | None, slices: bool,
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool, values: bool,
     title: str | None, console: Console, blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
@@ -105,11 +104,10 @@ def command(
     line = command_line(click.get_current_context(), ASIDE, folders=False)
     request = shared.convert_request(volume, **options)
     functions = options["optics"]["tf"] or tuple(filter(None, [request.source.tf]))
-    if not is_page(request.output) and not (slices and live is not False):
-        raise UsageError(f"--no-live and --no-slices are for a page; got -o {request.output}; expected -o OUT.html")
-    editor = live is None and is_page(request.output)
+    if not is_page(request.output) and not values:
+        raise UsageError(f"--no-values is for a page; got -o {request.output}; expected -o OUT.html")
     request = replace(
-        request, blocks=shared.block_options_of(blocks), live=bool(live), editor=editor, slices=slices,
+        request, blocks=shared.block_options_of(blocks), live=live, values=values,
         command=line, title=title,
     )  # fmt: skip
     plan = convert_files(

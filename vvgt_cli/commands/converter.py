@@ -24,6 +24,7 @@ from typing import IO, Any, cast
 
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
@@ -51,12 +52,12 @@ class Converted:
     Attributes:
         ply: the file that `vvgt convert` would write, without a certificate.
         files: of the first job the page's text, named "", and the file it loads; of later jobs the `.ply` to swap in.
-        live: whether they can be shown under any function.
+        values: of the volume, with its look if the page can change that.
     """
 
     ply: bytes
     files: dict[str, bytes]
-    live: bool = False
+    values: Values | None = None
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class Setup:
     memory: int | None
 
 
-# the look to convert for, and its light, by default that of the first look; None: the live form
-Job = tuple[TransferFunction | LabelTable, LightOptions | None] | None
+# the look to convert for and its light, by default the first ones; None: the page
+Job = tuple[TransferFunction | LabelTable | None, LightOptions | None] | None
 
 
 class Converter:
@@ -219,5 +220,5 @@ class Converter:
                 if number != self._number:
                     continue
                 if isinstance(message, Converted | Scored | Failed):
-                    self._busy, self._scoring = False, isinstance(message, Converted) and not message.live
+                    self._busy, self._scoring = False, isinstance(message, Converted) and not message.values
                 self._on_message(number, message)

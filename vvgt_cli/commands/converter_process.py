@@ -1,4 +1,4 @@
-"""Process of `converter`: reads a volume once, makes its live form, and converts it for one look after the other."""
+"""Process of `converter`: reads a volume once, makes its page, and converts it for one look after the other."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import IO, Any, NoReturn
 
+import numpy as np
+
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Failed, Job, Message, Progress, Scored, Setup
 from vvgt_cli.commands.live_site import ServedCloud, page_files, stored
-from vvgt_cli.conversion.convert import convert, convert_field
-from vvgt_cli.conversion.live import live_refusal
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.file_layout import ply_options
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
@@ -25,9 +27,8 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.layered import open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import as_ply
+from vvgt_cli.gaussians import Gaussians, as_ply
 from vvgt_cli.gaussians.formats import ready
-from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console, ProgressCallback
@@ -77,25 +78,28 @@ class LoadedVolume:
             content = open_content(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
 
-    def send_live(self, console: MessageConsole) -> None:
-        """Send the live form, or an ordinary conversion if the volume has none."""
-        run = Run(console, ConversionReport("init"))
-        request = ConvertRequest(self.source, live=True, scored=False)
-        with open_field(run, request, INIT) as field:
-            why = live_refusal(request, field.source) or _missing()
-            if why is None:
-                self.lighting = field.source.tf.lighting
-                console.send(self._with_page(convert_field(run, request, field)))
+    def send_page(self, console: MessageConsole) -> None:
+        """Send the page of the volume without Gaussians, or with a conversion if its look cannot be changed."""
+        request = ConvertRequest(self.source)
+        with open_field(Run(console, ConversionReport("view")), request, ()) as field:
+            values, self.lighting = field.source.values(), field.source.tf.lighting
+            if values is not None and values.look is not None and _missing() is None:
+                ply, corners = ply_options(request, field.source), field.source.volume.unit_frame().half
+                cloud = ServedCloud.of(as_ply(hidden(corners), ply), self.name)
+                console.send(Converted(cloud.ply or b"", page_files(cloud, values), values))
                 return
-        console.message(f"converted without a live form: {why}")
-        self._converted(ConvertRequest(self.source), console, self._with_page)
+        why = _missing() or "its look cannot be changed: colours, or too many labels"
+        console.message(f"converted first: {why}")
+        self._converted(request, console, self._with_page)
 
     def convert(self, job: Job, console: MessageConsole) -> None:
-        """Send a conversion for labels, or for a function on data values with an opacity unit distance."""
+        """Send a conversion for labels, a function on data values with an opacity unit distance, or the first look."""
         assert job is not None
         look, light = job
         source = replace(self.source, light=light or self.source.light)
-        if isinstance(look, LabelTable):
+        if look is None:
+            pass
+        elif isinstance(look, LabelTable):
             source = replace(source, labels=look)
         else:
             lit = replace(look, lighting=self.lighting)
@@ -117,12 +121,21 @@ class LoadedVolume:
         """Return a conversion with its page: the libraries that a page needs are loaded here already."""
         cloud = ServedCloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
-        sliced = not all(layer.colors for layer in conversion.field.source.layers)
-        return Converted(cloud.ply, page_files(cloud, converts=True, sliced=sliced), cloud.live)
+        return Converted(cloud.ply, page_files(cloud, None))
+
+
+def hidden(half: Sequence[float]) -> Gaussians:
+    """Return two invisible Gaussians (unit frame) at the ends of a box, for a page that has no others yet."""
+    ends = np.array([half, half], np.float32) * [[-1], [1]]
+    turned = np.tile(np.float32([1, 0, 0, 0]), (2, 1))
+    return Gaussians(
+        ends.astype(np.float32), np.full((2, 3), -9, np.float32), turned, np.full(2, -20, np.float32),
+        np.zeros((2, 3), np.float32),
+    )  # fmt: skip
 
 
 def _missing() -> str | None:
-    """Return why pages of live Gaussians cannot be written, None if they can."""
+    """Return why pages with values cannot be written, None if they can."""
     try:
         ready("the page.html")
     except DataError as error:
@@ -166,7 +179,7 @@ def main() -> None:
         try:
             volume = volume or LoadedVolume(start.source, start.name, console)
             if job is None:
-                volume.send_live(console)
+                volume.send_page(console)
             else:
                 volume.convert(job, console)
         except VvgtError as error:

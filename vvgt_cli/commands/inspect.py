@@ -23,7 +23,7 @@ from vvgt_cli.gaussians import as_ply, describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
-from vvgt_cli.gaussians.formats.page_live import VALUES_ID
+from vvgt_cli.gaussians.formats.page_values import ELEMENT
 from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import is_table, labels_of, read_labels
@@ -320,7 +320,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
     text = Path(file).read_text("utf-8") if page else ""
-    live = bool(layers) or f'id="{VALUES_ID}-0"' in text
+    held = f'id="{ELEMENT}-0"' in text and "of the volume, also of what its look hides"
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
     scanned = header.space in ("RAS", "LPS")
@@ -331,11 +331,10 @@ def what_leaves(file: str) -> dict[str, Any]:
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
         "place": header.affine and f"position and directions in the {'scanner' if scanned else 'world'}",
         "camera": header.camera and "eye and target in the world",
-        "values": live and "data values under each Gaussian, and their histogram",
-        "slices": 'id="slices-0"' in text and "of the volume, also of what its look hides",
+        "values": held or (layers and "data values under each Gaussian, and their histogram"),
         "other": [line for line in header.comments if not line.startswith(OURS)],
     }  # fmt: skip
     facts |= {key: value for key, value in found.items() if value}
-    facts["picture"] = FACE + LATER * live
+    facts["picture"] = FACE + LATER * bool(held or layers)
     remove = "--no-comments omits all but the picture and the values, --title names it otherwise"
     return facts | {"remove": f"{remove}; positions of --frame world stay"}

@@ -228,9 +228,9 @@ title_option = click.option(
     help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
 )  # fmt: skip
 
-slices_option = click.option(
-    "--no-slices", "slices", is_flag=True, default=True, flag_value=False,
-    help="Omit the volume's slices from the page (.html) of one volume.",
+values_option = click.option(
+    "--no-values", "values", is_flag=True, default=True, flag_value=False,
+    help="Omit the volume's values from the page (.html) of one volume, and with them slices and changes of its look.",
 )  # fmt: skip
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")
@@ -438,7 +438,7 @@ limit_options = group(
     ),
     max_megabytes=click.option(
         "--max-size", "max_megabytes", type=Measure("file size", MEGABYTES), metavar="MB",
-        help="Maximum file size in 10^6 bytes, also as 5MB or 800kB, of a .ply or a page; coarsens slices, then "
+        help="Maximum file size in 10^6 bytes, also as 5MB or 800kB, of a .ply or a page; coarsens values, then "
         "reduces the number of Gaussians.",
     ),
 )  # fmt: skip

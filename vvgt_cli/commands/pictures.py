@@ -35,8 +35,8 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.formats.levels import by_view
-from vvgt_cli.gaussians.formats.page_live import shared_facts
 from vvgt_cli.gaussians.frames import upright_matrix
+from vvgt_cli.gaussians.live_facts import shared_facts
 from vvgt_cli.gaussians.outputs import Output, check_folder, check_outputs, write_text
 from vvgt_cli.images.compose import BLACK
 from vvgt_cli.jit.ahead import DRAW, GREATEST, GREY, RAYCAST, for_blocks, for_degree

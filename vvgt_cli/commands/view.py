@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def view(
     files: PathLike | Sequence[PathLike], look: LookLike = None, *, output: PathLike | None = None,
-    port: int | None = None, browser: bool = True, live: bool = True, slices: bool = True, title: str | None = None,
+    port: int | None = None, browser: bool = True, values: bool = True, title: str | None = None,
     overwrite: bool = False, progress: bool | Console = False, **reading: Unpack[Reading],
 ) -> None:  # fmt: skip
     """Show files of Gaussians or a volume in a browser until an interrupt, or write them: ``vvgt view``.
@@ -30,8 +30,7 @@ def view(
         output: file to write instead of showing.
         port: of the server; None takes a free one. Its address is printed.
         browser: open one, if there is a display.
-        live: let a page of a volume have a function editor.
-        slices: let it have slices.
+        values: let a page of a volume hold its values, for slices and other looks.
         title: of the page; None: the file's own.
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
@@ -49,16 +48,15 @@ def view(
 
     if output is not None and (port is not None or not browser):
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
-    if output is None and not (live and slices):
-        raise UsageError("--no-live and --no-slices are for a page that is saved; give -o OUT.html, or omit them")
+    if output is None and not values:
+        raise UsageError("--no-values is for a page that is saved; give -o OUT.html, or omit it")
     names = [files] if isinstance(files, str | os.PathLike) else files
     clouds, run = named_files([os.fspath(name) for name in names]), Run(console_of(progress), ConversionReport("view"))
     source = source_of(clouds[0][1], look, reading)
     if output is None:
         viewer.show(run, clouds, source, title, port or 0, browser, click.echo)
     else:
-        how = {"live": live, "slices": slices, "overwrite": overwrite}
-        viewer.save(run, clouds, source, os.fspath(output), title=title, **how)
+        viewer.save(run, clouds, source, os.fspath(output), values=values, title=title, overwrite=overwrite)
 
 
 @shared.command("view", short_help="Show Gaussians or a volume in a browser, or save a page.")
@@ -74,11 +72,7 @@ def view(
     "--no-browser", "browser", is_flag=True, default=True, flag_value=False,
     help="Print the address without opening a browser.",
 )  # fmt: skip
-@click.option(
-    "--no-live", "live", is_flag=True, default=True, flag_value=False,
-    help="With -o OUT.html and a volume: omit the function editor, for a page half as large.",
-)  # fmt: skip
-@shared.slices_option
+@shared.values_option
 @shared.title_option
 @shared.tf_options
 @shared.light_options

@@ -27,21 +27,18 @@ from vvgt_cli.conversion.gaussian_files import (
     write_page,
 )
 from vvgt_cli.conversion.index import named_files
-from vvgt_cli.errors import DataError, NoLiveForm, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
-from vvgt_cli.gaussians.formats.page_live import Extras
-from vvgt_cli.gaussians.formats.page_slices import Slices
+from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
@@ -55,24 +52,24 @@ Clouds = Sequence[tuple[str, str]]  # name and file of each
 
 
 def save(
-    run: Run, clouds: Clouds, source: SourceRequest, output: str, *, live: bool, slices: bool, title: str | None,
+    run: Run, clouds: Clouds, source: SourceRequest, output: str, *, values: bool, title: str | None,
     overwrite: bool,
 ) -> None:  # fmt: skip
     """Write Gaussians, or a volume that is converted, as `vvgt_cli.view` does."""
     from vvgt_cli.conversion.convert_batch import convert_files
     from vvgt_cli.conversion.request import ConvertRequest
 
-    file, request = clouds[0][1], ConvertRequest(source, editor=live and is_page(output), title=title)
+    file, request = clouds[0][1], ConvertRequest(source, title=title)
     if len(clouds) > 1:
         _join(run, output, clouds, source, overwrite)
     elif _is_series(source):
         if not is_page(output):
             raise UsageError(f"-o {output}: holds one frame; expected a page (.html), or --time N")
-        convert_files(replace(request, output=output, overwrite=overwrite, slices=slices), console=run.console)
+        convert_files(replace(request, output=output, overwrite=overwrite, values=values), console=run.console)
     else:
         with claimed([Output("-o", output, SUFFIXES, splats=True)], [file], overwrite):
-            gaussians, options, extras = _opened(run, file, request, slices and is_page(output))
-            write_gaussians(run, output, gaussians, options, overwrite, extras=extras)
+            gaussians, options, held = _opened(run, file, request, values and is_page(output))
+            write_gaussians(run, output, gaussians, options, overwrite, values=held)
             run.compile(for_degree(DRAW, gaussians.degree))
             report_agreement(run, output, gaussians, options)
 
@@ -92,12 +89,8 @@ def show(
         _serve(run, clouds, source, port, browser, announce)
         return
     with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), live=True, title=title)
-        try:
-            convert_files(quick, console=run.console)
-        except NoLiveForm as error:  # takes longer
-            run.console.message(f"converted without a live form: {error}")
-            convert_files(replace(quick, live=False, fit=FitOptions(steps=0), overwrite=True), console=run.console)
+        quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), FitOptions(steps=0), title=title)
+        convert_files(quick, console=run.console)
         frames = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
         _serve(run, frames, SourceRequest(source.path), port, browser, announce)
 
@@ -152,18 +145,17 @@ def _only_gaussians(files: Sequence[str]) -> None:
         )
 
 
-def _opened(run: Run, name: str, request: ConvertRequest, slices: bool) -> tuple[Gaussians, PlyOptions, Extras]:
-    """Return Gaussians in the unit frame, how to write them, and more for a page; a volume is converted."""
+def _opened(run: Run, name: str, request: ConvertRequest, values: bool) -> tuple[Gaussians, PlyOptions, Values | None]:
+    """Return Gaussians in the unit frame, how to write them, and values for a page; a volume is converted."""
     from vvgt_cli.conversion.convert import convert
 
     if name == STDIN or is_splats(name):
         _refuse_reading(request.source, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
-        return gaussians, replace(options, title=request.title or options.title), NO_EXTRAS
+        return gaussians, replace(options, title=request.title or options.title), None
     conversion = convert(request, run.console)
-    extras = conversion.extras(request.editor, slices, run)
-    return conversion.gaussians, conversion.ply, extras
+    return conversion.gaussians, conversion.ply, conversion.values(run) if values else None
 
 
 def _serve(
@@ -189,7 +181,7 @@ def _serve(
         url = stack.enter_context(served(site, port))
         if not resources.get(""):
             converter = stack.enter_context(Converter(source, controller.name, controller.on_message))
-            controller.await_volume(converter, partial(slices_in, source))
+            controller.await_volume(converter)
             controller.ready.wait(SOON)
         if controller.error is None:
             announce(url)
@@ -213,15 +205,6 @@ def _series(clouds: Clouds) -> dict[str, Resource]:
     text = page(clouds[0][0], columns_of(first, clouds[0][1]), frames, SCRIPT)
     resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
     return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
-
-
-def slices_in(request: SourceRequest) -> Slices | None:
-    """Return the slices of a volume, which is read again, in blocks if it is large; None if it has colours."""
-    from vvgt_cli.conversion.opened import open_field
-    from vvgt_cli.conversion.request import ConvertRequest
-
-    with open_field(Run(Console(quiet=True), ConversionReport("view")), ConvertRequest(request), ()) as field:
-        return field.source.slices()
 
 
 def display() -> bool:

@@ -72,8 +72,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
         "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
         "--max-size": WHOLE,
-        "--no-slices": "it holds none, for each cloud has its own volume; remove it",
-        "--no-live": "it has no function editor, unless with --live; remove it",
+        "--no-values": "it holds none, for each cloud has its own volume; remove it",
     },
 }
 CANNOT[LAYERS] = {option: why for option, why in CANNOT[LABELS].items() if option not in ("--tf", "--labels none")} | {

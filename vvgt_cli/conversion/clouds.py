@@ -184,7 +184,7 @@ class Clouds(Mapping[str, Result]):
 
     def _html(self, name: str) -> bytes:
         """Return one page of all clouds."""
-        from vvgt_cli.gaussians.formats.page_live import page_of_several
+        from vvgt_cli.gaussians.formats.page_look import page_of_several
 
         return page_of_several([(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 
 from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.fitting import check_request, fit, work_of
 from vvgt_cli.conversion.gaussian_files import levels_in_box
-from vvgt_cli.conversion.live import editor_form
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.place import to_unit_frame
 from vvgt_cli.conversion.request import ConvertRequest
@@ -89,5 +87,4 @@ def convert_field(
 def _conversion(request: ConvertRequest, work: Work) -> Conversion:
     """Return a conversion without scores; its Gaussians are none where they are only on disk."""
     gaussians = NOTHING if work.gaussians is None else to_unit_frame(work.gaussians, work.field.source.volume)
-    live = None if request.live else partial(editor_form, request)
-    return Conversion(gaussians, work.run.report, work.ply, work.field, live)
+    return Conversion(gaussians, work.run.report, work.ply, work.field)

@@ -49,7 +49,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
-from vvgt_cli.gaussians.formats.page_live import contents
+from vvgt_cli.gaussians.formats.page_look import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
 from vvgt_cli.gaussians.targets import check_opened
@@ -291,7 +291,7 @@ def convert_files(
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "a file each": numbered}
     if is_page(output) and request.scored:
-        flags |= {"--no-slices": not request.slices, "--no-live": not (request.editor or request.live)}
+        flags |= {"--no-values": not request.values}
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind
@@ -319,9 +319,9 @@ def convert_files(
         kind, together = FRAMES, True
         check_options(ONE_FILE, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
-    request = replace(request, editor=request.editor and not together, shares_output=together)
+    request = replace(request, shares_output=together)
     looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, looks, share, together)
+    batch = _batch(kind, request, looks, share)
     if together:
         _save_one_file(batch, request, output, console)
     else:
@@ -381,10 +381,9 @@ def convert_to_memory(
 
 
 def _batch(
-    kind: str, request: ConvertRequest, functions: Sequence[tuple[str, ConvertRequest, str]], shard: Shard = WHOLE_RUN,
-    page: bool = False,
+    kind: str, request: ConvertRequest, functions: Sequence[tuple[str, ConvertRequest, str]], shard: Shard = WHOLE_RUN
 ) -> Batch:  # fmt: skip
     """Return the batch of a kind."""
     if kind == FRAMES:
-        return FrameSeries(request, shard, page)
+        return FrameSeries(request, shard)
     return Labels(request) if kind == LABELS else Functions(functions)

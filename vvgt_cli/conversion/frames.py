@@ -36,8 +36,6 @@ from vvgt_cli.volume.tiff.slices import matching
 if TYPE_CHECKING:
     from vvgt_cli.look import TransferFunction
 
-MAX_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
-
 
 @dataclass(frozen=True)
 class Step:
@@ -110,8 +108,8 @@ class FrameSeries(Batch):
 
     kind, resumes = FRAMES, True
 
-    def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
-        """List the frames; ``page`` limits the Gaussians of live frames."""
+    def __init__(self, request: ConvertRequest, shard: Shard) -> None:
+        """List the frames."""
         from vvgt_cli.conversion.previous_frame import previous_frame
 
         outputs = (request.output, request.report, request.preview)
@@ -121,7 +119,6 @@ class FrameSeries(Batch):
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
         self.previous = previous_frame(request, shard.count)
-        self._most = max(MAX_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
 
     def prepare(self, run: Run) -> None:
         """Read all frames once, for what they share.
@@ -131,9 +128,6 @@ class FrameSeries(Batch):
             UsageError: see `survey`.
         """
         request, steps, console = self.request, self._steps, run.console
-        if self._most < request.fit.max_gaussians:
-            console.message(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
-            request = replace(request, fit=replace(request.fit, max_gaussians=self._most))
         if request.blocks is None:
             request = replace(request, blocks=automatic(self.sources()[0], console))
         source = request.source

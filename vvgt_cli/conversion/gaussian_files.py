@@ -24,9 +24,9 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
-from vvgt_cli.gaussians.formats.page_live import Extras, contents, page_of_several
+from vvgt_cli.gaussians.formats.page_look import contents, page_of_several
+from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -103,7 +103,7 @@ def write_gaussians(
     normals: np.ndarray | None = None,
     stage: str = "write",
     more: str = "",
-    extras: Extras = NO_EXTRAS,
+    values: Values | None = None,
 ) -> None:
     """Write Gaussians in the format of the name, or as a `.ply` to standard output, and record the size.
 
@@ -116,7 +116,7 @@ def write_gaussians(
         normals: (K, 3), for a `.ply`.
         stage: name of the stage.
         more: end of its message.
-        extras: further contents of a page.
+        values: of the volume, for a page.
     """
     report = run.report
     with run.stage(stage) as record:
@@ -124,11 +124,11 @@ def write_gaussians(
             report.bytes = write_ply(sys.stdout.buffer, gaussians, options, normals)
             sys.stdout.buffer.flush()
         else:
-            report.bytes = _write_file(output, gaussians, options, overwrite, normals, extras)
+            report.bytes = _write_file(output, gaussians, options, overwrite, normals, values)
         report.gaussians = len(gaussians)
         record.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB{more}"
     if is_page(output) and not more:
-        run.console.message(contents(extras.live[1] if extras.live else options, output, slices=extras.slices))
+        run.console.message(contents(options, output, values=values))
 
 
 def write_parts(run: Run, output: str, parts: FinishedParts, overwrite: bool) -> None:
@@ -218,7 +218,7 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
 
 def _write_file(
     output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None,
-    extras: Extras,
+    values: Values | None,
 ) -> int:  # fmt: skip
     """Write a file and return its bytes; if that fails, save a `.ply` elsewhere, since the run may have taken hours."""
     if is_stream(output):
@@ -229,7 +229,7 @@ def _write_file(
         with atomic_write(output, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, gaussians, options, normals)
-            return temporary.write_bytes(encoded(known, gaussians, options, output, extras))
+            return temporary.write_bytes(encoded(known, gaussians, options, output, values))
     except VvgtError as error:
         if known is None and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere
@@ -252,12 +252,6 @@ def _rescue(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np
     return None
 
 
-def _stores_pictures(output: str, options: PlyOptions) -> bool:
-    """Return whether a file of another format stores the look; a live page computes look and light itself."""
-    found = format_of(output)
-    return found is not None and (found.suffix != ".html" or options.live is None)
-
-
 def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
     """Report how close pictures of a written file are to those of the Gaussians, unless it is a `.ply`.
 
@@ -270,7 +264,7 @@ def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOp
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    if not _stores_pictures(output, options):
+    if format_of(output) is None:
         return
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
@@ -299,7 +293,7 @@ def report_format_cost(
     """
     from vvgt_cli.dvr import RenderSettings
 
-    if not _stores_pictures(output, options):
+    if format_of(output) is None:
         return
     with run.stage("read back") as stage:
         size, rule = options.screen_size or SIZE, options.rule or INRIA

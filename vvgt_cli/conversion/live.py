@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
-from vvgt_cli.conversion.file_layout import degree_of
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
@@ -23,15 +22,14 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages import ClosedFormStage, TestViews
 from vvgt_cli.conversion.stages.refinement import SMALLEST
-from vvgt_cli.errors import NoLiveForm, NothingVisible, UsageError
+from vvgt_cli.errors import NoLiveForm, NothingVisible
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import LENGTH, Looks, Table, baked, lengths
 from vvgt_cli.gaussians.live_facts import AXIS, LAYER_ID, LiveFacts, grain_of
 from vvgt_cli.gaussians.types import concatenate
-from vvgt_cli.jit.ahead import LIVE
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
 from vvgt_cli.look.labels import Label, LabelTable
@@ -44,9 +42,6 @@ from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.label_maps import extents_of
 from vvgt_cli.volume.stats import Statistics
 from vvgt_cli.volume.types import triple
-
-if TYPE_CHECKING:
-    from vvgt_cli.gaussians.formats import page_live
 
 FOG_NAME = "fog"
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
@@ -84,27 +79,6 @@ def live_refusal(request: ConvertRequest, source: Source) -> str | None:
         check_layers(source)
     except NoLiveForm as error:
         return str(error)
-    return None
-
-
-def editor_form(request: ConvertRequest, run: Run, field: Field, ply: PlyOptions) -> page_live.LiveForm | None:
-    """Return the live form of a converted volume under the same look, for the function editor of its page.
-
-    None, with a message, if the volume has no live form or the run a time limit.
-    """
-    source = field.source
-    fit = FitOptions(request.budget(degree_of(request, source)), request.fit.size, rule=request.fit.rule)
-    plain = ConvertRequest(request.source, fit=fit, ply=replace(request.ply, sh_degree=None), live=True)
-    why = "--time-budget" if request.limits.time_budget is not None else live_refusal(plain, source)
-    try:
-        if why is None:
-            run.compile(source.kernels(LIVE), source.kernel_type())
-            work = Work(run, field, fit, ply=ply)
-            LiveForm().run(work)
-            return to_unit_frame(as_stored(work.current()), source.volume), replace(work.ply, sh_degree=None)
-    except (UsageError, NothingVisible) as error:
-        why = str(error)
-    run.console.message(f"the page has no function editor: {why}")
     return None
 
 

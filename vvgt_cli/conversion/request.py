@@ -14,7 +14,7 @@ from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.formats.page_file import page_bytes
-from vvgt_cli.gaussians.formats.page_slices import SMALLEST as SMALLEST_SLICES
+from vvgt_cli.gaussians.formats.page_values import SMALLEST as SMALLEST_VALUES
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output
 from vvgt_cli.gaussians.targets import target_of
@@ -124,8 +124,7 @@ class ConvertRequest:
         checkpoint: folder for the results of stages until the output is written; None for none.
         blocks: how the volume is processed in blocks; None: blocks only where the volume is large.
         live: let the Gaussians carry values, so that they can be shown under any function (docs/live.md).
-        editor: a page also holds the live form, so that its function can be changed.
-        slices: a page also holds slices of the volume.
+        values: a page also holds the values of the volume.
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
         scored: score the result, for which views are rendered; without, it is the closed form alone.
@@ -144,8 +143,7 @@ class ConvertRequest:
     overwrite: bool = False
     checkpoint: str | None = None
     live: bool = False
-    editor: bool = False
-    slices: bool = False
+    values: bool = False
     scored: bool = True
     all_views: bool = False
     shares_output: bool = False
@@ -154,7 +152,7 @@ class ConvertRequest:
     blocks: BlockOptions | None = None
 
     def budget(self, degree: int | None = None) -> int:
-        """Return the number of Gaussians that the limits allow; slices of a page get what these leave.
+        """Return the number of Gaussians that the limits allow; values of a page get what these leave.
 
         Args:
             degree: of the harmonics; None: the degree that was asked for.
@@ -164,8 +162,8 @@ class ConvertRequest:
         """
         degree, known = (self.ply.sh_degree or 0) if degree is None else degree, format_of(self.output or "")
         if known is not None and known.suffix == ".html":
-            header, each = page_bytes(degree, self.live or self.editor, not self.live)
-            header += SMALLEST_SLICES if self.slices else 0
+            header, each = page_bytes(degree)
+            header += SMALLEST_VALUES if self.values else 0
         elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
             raise UsageError(
                 f"--max-size needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"

@@ -17,9 +17,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.page_file import iframe
-from vvgt_cli.gaussians.formats.page_live import Extras
+from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
@@ -30,12 +29,11 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
-    from vvgt_cli.gaussians.formats.page_live import LiveForm
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
 
 FROM_THE_SIDE = 4  # test view of pictures by default
-CERTIFICATES = 4096  # bytes of a page that are enough for those of the conversion and of the live form
+CERTIFICATES = 4096  # bytes of a page that are enough for its certificate
 
 
 @dataclass(repr=False)
@@ -76,8 +74,7 @@ class Result:
         up: str | None = None,
         sh_degree: int | None = None,
         comments: bool | None = None,
-        editor: bool = True,
-        slices: bool = True,
+        values: bool = True,
         overwrite: bool = True,
     ) -> int:
         """Write a standard ``.ply``, or another format by the ending of the name, atomically.
@@ -89,8 +86,7 @@ class Result:
                 unit frame of an anatomical space); None with another frame: "auto".
             sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
             comments: describe the file in its header.
-            editor: a page of a conversion also holds the live form, so that its function can be changed.
-            slices: a page of a conversion also holds slices of its volume.
+            values: a page of a conversion also holds the values of its volume, so that its look can be changed.
             overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:
@@ -110,8 +106,8 @@ class Result:
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            extras = self.extras(editor, slices) if known.suffix == ".html" and ply.comments else NO_EXTRAS
-            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), extras))
+            held = self.values() if values and known.suffix == ".html" and ply.comments else None
+            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), held))
 
     def layout(
         self, frame: str | None = None, up: str | None = None, sh_degree: int | None = None,
@@ -157,16 +153,9 @@ class Result:
         found = apply_function(self.gaussians, self.ply, function, options)
         return Result(found, ConversionReport("recolor"), options)
 
-    def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
-        """Return further contents of a page, as far as there is a volume.
-
-        Args:
-            live: with Gaussians that carry values under the same look.
-            slices: with slices.
-            run: times the stages.
-            limit: bytes of the page, which its slices must leave room for.
-        """
-        return NO_EXTRAS
+    def values(self, run: Run | None = None, limit: float | None = None) -> Values | None:
+        """Return the values of the volume for a page of at most ``limit`` bytes; None where there are none."""
+        return None
 
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
@@ -178,7 +167,7 @@ class Result:
         page = format_of("x.html")
         assert page is not None
         try:
-            return iframe(encoded(page, self.gaussians, self.ply, name, self.extras(False, True)), name)
+            return iframe(encoded(page, self.gaussians, self.ply, name, self.values()), name)
         except DataError:
             return None
 
@@ -213,41 +202,31 @@ class Conversion(Result):
 
     Attributes:
         field: the volume under its function, labels, layers and light.
-        make_live: makes the live form for a page's editor; None if the Gaussians carry values themselves.
         seen: returns what viewers show of levels to a camera in the box frame; None where all Gaussians are shown.
     """
 
     field: Field
-    make_live: Callable[[Run, Field, PlyOptions], LiveForm | None] | None = None
     seen: Callable[[Camera], Gaussians] | None = None
 
     @cached_property
-    def _extras(self) -> dict[str, Any]:
-        """Contents of a page, by name, that have been made."""
+    def _values(self) -> dict[float | None, Values | None]:
+        """Values by the limit of the page that they are for."""
         return {}
 
-    def extras(self, live: bool, slices: bool, run: Run | None = None, limit: float | None = None) -> Extras:
-        """Implement `Result.extras`, with a message if there is no live form."""
-        run = run or Run(Console(quiet=True), ConversionReport("init"))
-        if live and self.make_live is not None and "live" not in self._extras:
-            self._extras["live"] = self.make_live(run, self.field, self.ply)
-        form, name = self._extras.get("live") if live else None, f"slices within {limit}"
-        if slices and name not in self._extras:
-            with run.stage("slices") as stage:
-                room = None if limit is None else limit - self._page_bytes(form)
-                found = self._extras[name] = self.field.source.slices(room)
+    def values(self, run: Run | None = None, limit: float | None = None) -> Values | None:
+        """Implement `Result.values`."""
+        if limit not in self._values:
+            with (run or Run(Console(quiet=True), ConversionReport("init"))).stage("values") as stage:
+                page = format_of("x.html")
+                assert page is not None
+                bare = replace(self.gaussians, live=None), replace(self.ply, live=None)
+                taken = limit and len(encoded(page, *bare, "")) + CERTIFICATES
+                room = None if limit is None else limit - taken
+                found = self._values[limit] = self.field.source.values(room)
                 colours = all(layer.colors for layer in self.field.source.layers)
                 why = "the volume has colours" if colours else f"--max-size leaves {max(room or 0, 0) / 1e6:.2f} MB"
                 stage.note = str(found or f"none: {why}")
-        if form is not None:
-            form = form[0], replace(form[1], certificate=self.ply.certificate)
-        return Extras(form, self._extras[name] if slices else None)
-
-    def _page_bytes(self, form: LiveForm | None) -> int:
-        """Return the bytes of the page with a certificate, but without slices."""
-        page = format_of("x.html")
-        assert page is not None
-        return len(encoded(page, self.gaussians, self.ply, "", Extras(form))) + CERTIFICATES
+        return self._values[limit]
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""

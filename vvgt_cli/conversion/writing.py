@@ -14,7 +14,6 @@ from vvgt_cli.conversion.resume import Checkpoint, checkpoint_folder
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.gaussians.formats import format_of
-from vvgt_cli.gaussians.formats.choose import NO_EXTRAS
 from vvgt_cli.gaussians.formats.streamed import folder_of
 from vvgt_cli.gaussians.outputs import claimed, write_text
 from vvgt_cli.jit.ahead import EVALUATE
@@ -52,9 +51,9 @@ def write(
     else:
         page = is_page(output) and request.ply.comments
         limit = None if request.megabytes is None else 1e6 * request.megabytes
-        extras = conversion.extras(request.editor, request.slices, run, limit) if page else NO_EXTRAS
+        values = conversion.values(run, limit) if page and request.values else None
         write_gaussians(
-            run, output, conversion.gaussians, conversion.ply, overwrite, conversion.normals(), stage, more, extras
+            run, output, conversion.gaussians, conversion.ply, overwrite, conversion.normals(), stage, more, values
         )
 
 

@@ -23,7 +23,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.scene import PreparedVolume
-    from vvgt_cli.gaussians.formats.page_slices import Slices
+    from vvgt_cli.gaussians.formats.page_values import Values
 
 OPTICS = 12  # hexadecimal digits of `Source.optics`
 KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
@@ -184,14 +184,19 @@ class Source:
                 "field (try --labels none to read label numbers as values)"
             )
 
-    def slices(self, room: float | None = None) -> Slices | None:
+    def values(self, room: float | None = None) -> Values | None:
         """Return the grids of all layers for a page, read part by part; None if all layers have colours.
 
         ``room``: bytes that they may take there.
         """
-        from vvgt_cli.gaussians.formats.page_slices import slices_of
+        from vvgt_cli.gaussians.formats import page_values
 
-        return slices_of([None if layer.colors else (layer.volume, layer.tf) for layer in self.layers], room)
+        known = self.overall if len(self.layers) == 1 else None
+        layers = [
+            None if layer.colors else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known)
+            for layer in self.layers
+        ]
+        return page_values.values_of(layers, room)
 
     def with_function(self, tf: TransferFunction) -> Source:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""

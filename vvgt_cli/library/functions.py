@@ -79,7 +79,7 @@ def convert(
         raise UsageError("after: expected the result of convert for one volume and look")
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
-    request = replace(Goal.of(goal).request(source), blocks=blocks_of(blocks), live=live, editor=not live)
+    request = replace(Goal.of(goal).request(source), blocks=blocks_of(blocks), live=live)
     requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, as_clouds=several, split_labels=split_labels, after=after, console=console_of(progress)

@@ -13,10 +13,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
-from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
+from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_look, sog, splat, usd
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
 from vvgt_cli.gaussians.formats.nodes import Node
-from vvgt_cli.gaussians.formats.page_slices import Slices
+from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
@@ -24,7 +24,6 @@ from vvgt_cli.volume.blocks import check_memory
 
 _HEAD = 1024  # bytes that identify a compressed .ply
 _LARGEST = 1 << 32  # bytes of a file that is read whole
-NO_EXTRAS = page_live.Extras()
 
 
 @dataclass(frozen=True)
@@ -37,9 +36,6 @@ class Format:
         read: maps bytes and the file's name, for errors, to columns.
         needs: given a name for errors, raises DataError if a library is not installed.
         layout: maps the options for a `.ply` to those for this format.
-        write_live: like ``write`` for Gaussians that carry values (unit frame), with the options for a `.ply`, the form
-            without values to show first, or None, and slices of the volume, or None; None if the format cannot store
-            values.
         write_nodes: like ``write`` for several clouds as nodes of one file; None if the format has no nodes.
     """
 
@@ -48,7 +44,6 @@ class Format:
     read: Callable[[bytes, str], Splats]
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
-    write_live: Callable[[Gaussians, PlyOptions, str, Splats | None, Slices | None], bytes] | None = None
     write_nodes: Callable[[Sequence[Node], str], bytes] | None = None
 
 
@@ -65,7 +60,7 @@ FORMATS = (  # the first whose ending fits is taken: a longer ending stands befo
     Format(".glb", _one_of(gltf.glb), gltf.read_glb, lambda name: None, write_nodes=gltf.glb),
     Format(".usdc", _one_of(usd.usdc), usd.read_usdc, usd.library, write_nodes=usd.usdc),
     Format(".usdz", _one_of(usd.usdz), usd.read_usdz, usd.library, write_nodes=usd.usdz),
-    Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
+    Format(".html", page_look.html, page_file.read_html, gsply_files.gsply, page_file.upright),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
 _ENDINGS = dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in SUFFIXES)
@@ -91,7 +86,7 @@ def ready(path: str | Path) -> None:
 
 def encoded(
     known: Format, gaussians: Gaussians, options: PlyOptions, name: str,
-    extras: page_live.Extras = NO_EXTRAS,
+    values: Values | None = None,
 ) -> bytes:  # fmt: skip
     """Encode Gaussians (unit frame) in another format, with the layout of `PlyOptions`.
 
@@ -100,23 +95,18 @@ def encoded(
         gaussians: Gaussians, unit frame.
         options: layout.
         name: of the file, for errors and titles.
-        extras: further contents of a page.
+        values: of the volume, for a page.
 
     Raises:
         DataError: the format cannot hold the values, or a library is not installed or fails.
     """
-    if gaussians.live is not None and options.live is not None and known.write_live is not None:
-        return known.write_live(gaussians, options, name, None, extras.slices)
     if gaussians.live is not None:
         why = f"{known.suffix} cannot store values for other functions"
-        warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
+        if values is None:
+            warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     splats = splats_of(gaussians, known.layout(options))
-    if known.write_live is None:
-        return known.write(splats, name)
-    if extras.live is None:
-        return page_file.html(splats, name, extras.slices)
-    return known.write_live(*extras.live, name, splats, extras.slices)
+    return known.write(splats, name) if values is None else page_look.html(splats, name, values, options)
 
 
 def is_splats(path: str | Path) -> bool:

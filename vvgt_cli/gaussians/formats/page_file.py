@@ -26,7 +26,6 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_frames import stored_frames
-from vvgt_cli.gaussians.formats.page_slices import Slices
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.header import facts_in
@@ -48,18 +47,13 @@ _FAINT = 0.05  # share of all opacity that may be out of view where it is spread
 _DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
 
 
-def page_bytes(degree: int, live: bool, converted: bool) -> tuple[float, float]:
-    """Return the most bytes of a page without Gaussians and slices, and of each Gaussian.
-
-    Args:
-        degree: of the harmonics of the conversion.
-        live: it holds Gaussians that carry values.
-        converted: it holds the conversion.
-    """
+def page_bytes(degree: int) -> tuple[float, float]:
+    """Return the most bytes of a page without Gaussians and values, and of each Gaussian with harmonics of a degree."""
     header = sum(len(asset(name)) for name in ("page.html", "page.css", "inflate.js")) + TEXTS
     packed, harmonics = 16 + 72 / 256, {0: 0, 1: 9, 2: 24, 3: 45}[degree]  # of a .compressed.ply: chunks of 256
-    each = live * (packed + 11) + converted * (packed + harmonics)
-    return header + (len(asset(PROGRAM)) + 2 * 4096) * 4 / 3, each * 4 / 3  # base64; headers and what gzip adds
+    return header + (len(asset(PROGRAM)) + 2 * 4096) * 4 / 3, (
+        packed + harmonics
+    ) * 4 / 3  # base64; headers and what gzip adds
 
 
 def asset(name: str) -> bytes:
@@ -195,18 +189,11 @@ def _digest(content: bytes) -> str:
     return base64.b64encode(hashlib.sha256(content).digest()).decode("ascii")
 
 
-def html(splats: Splats, name: str, slices: Slices | None = None) -> bytes:
-    """Return the page of one cloud as a single file, with the slices of its volume."""
-    clouds = [(title_of(name, splats.comments), splats)]
-    return html_of_several(clouds, name, slices.elements, slices.scene) if slices else html_of_several(clouds, name)
-
-
 def html_of_several(
     clouds: Sequence[tuple[str, Splats]],
     name: str,
     embedded: Mapping[str, bytes] = MappingProxyType({}),
     more: Mapping[str, Any] = MappingProxyType({}),
-    prefix: str = "splats",
 ) -> bytes:
     """Return the page as a single file: the viewer by gzip, and each cloud as a `.compressed.ply`, in base64.
 
@@ -217,19 +204,18 @@ def html_of_several(
         name: name of the file.
         embedded: further content of the page, by element id.
         more: further entries of the scene for the viewer.
-        prefix: of the ids of the elements with the clouds; `read_html` finds "splats".
     """
     contents = [("program", "text/plain", asset(PROGRAM))]
     contents += [(key, "application/octet-stream", content) for key, content in embedded.items()]
     shown = stored_frames(clouds)
-    contents += [(f"{prefix}-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
+    contents += [(f"splats-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
         for key, kind, content in contents
     ]
     elements.append(f"<script>{asset('inflate.js').decode('utf-8')}</script>")
     frames: list[dict[str, Any]] = [
-        {"name": text, "file": f"{k}.compressed.ply", "element": f"{prefix}-{k}"} for k, (text, _) in enumerate(clouds)
+        {"name": text, "file": f"{k}.compressed.ply", "element": f"splats-{k}"} for k, (text, _) in enumerate(clouds)
     ]
     for frame, (_, whole) in zip(frames, shown, strict=True):
         frame |= {} if whole is None else {"whole": whole}

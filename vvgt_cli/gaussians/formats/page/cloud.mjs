@@ -1,7 +1,7 @@
 // The Gaussians that a page shows, and the place that is seen along a ray: where half of what the ray meets is in front.
 import { Quat, Vec3, Vec4 } from 'playcanvas';
 
-const REACH = 3, SHIFT = 3;  // standard deviations that a Gaussian is looked for in, and that a live one may move by
+const REACH = 3;  // standard deviations that a Gaussian is looked for in
 const FAINT = 0.05;  // opacity along a ray below which there is nothing
 const ROW = 14;  // numbers of a Gaussian: mean, three arms (standard deviations), opacity, the longest arm
 
@@ -39,16 +39,15 @@ const one = (numbers, i) => {
   return { center: [...at.subarray(0, 3)], arms: [0, 1, 2].map((k) => [...at.subarray(3 + 3 * k, 6 + 3 * k)]), opacity: at[12] };
 };
 
-// The place that is seen along a ray, null where there is nothing; `looks(i, gaussian)`: as the page shows it, of a live page
-export function seen(numbers, { origin, direction }, looks = null, flat = false) {
+// The place that is seen along a ray, null where there is nothing
+export function seen(numbers, { origin, direction }, flat = false) {
   const length = Math.hypot(...direction), d = direction.map((x) => x / length), hits = [];
-  const most = REACH + (looks ? SHIFT : 0);
   for (let i = 0; i < numbers.length / ROW; i++) {
     const at = i * ROW, x = numbers[at] - origin[0], y = numbers[at + 1] - origin[1], z = numbers[at + 2] - origin[2];
-    const along = x * d[0] + y * d[1] + z * d[2], reach = most * numbers[at + 13];
+    const along = x * d[0] + y * d[1] + z * d[2], reach = REACH * numbers[at + 13];
     if (x * x + y * y + z * z - along * along > reach * reach || (!flat && along < -reach)) continue;
-    const it = looks ? looks(i, one(numbers, i)) : one(numbers, i);
-    if (!it || it.opacity < 1 / 255) continue;
+    const it = one(numbers, i);
+    if (it.opacity < 1 / 255) continue;
     const rows = inverse(it.arms), o = own(rows, origin.map((v, k) => v - it.center[k])), e = own(rows, d);
     const t = -dot(o, e) / dot(e, e), q = o.map((v, k) => v + t * e[k]), alpha = it.opacity * Math.exp(-0.5 * dot(q, q));
     if (alpha > 1 / 255 && (flat || t > 0)) hits.push([t, Math.min(alpha, 0.99)]);
@@ -62,16 +61,4 @@ export function seen(numbers, { origin, direction }, looks = null, flat = false)
     if (1 - rest >= total / 2) return origin.map((v, k) => v + t * d[k]);
   }
   return null;
-}
-
-// Gaussians within reach of a place: {i, gaussian, q: the place in its own standard deviations}
-export function around(numbers, place) {
-  const found = [];
-  for (let i = 0; i < numbers.length / ROW; i++) {
-    const at = i * ROW, d = [place[0] - numbers[at], place[1] - numbers[at + 1], place[2] - numbers[at + 2]], reach = REACH * numbers[at + 13];
-    if (dot(d, d) > reach * reach) continue;
-    const gaussian = one(numbers, i), q = own(inverse(gaussian.arms), d);
-    if (dot(q, q) < REACH * REACH) found.push({ i, gaussian, q });
-  }
-  return found;
 }

@@ -1,6 +1,6 @@
 // The function of one layer of a live page over the histogram of its values: nodes to be dragged.
 import { hex, rgbOf } from './color.mjs';
-import { functionAt } from './live_table.mjs';
+import { functionAt } from './table.mjs';
 import { element, stops } from './svg.mjs';
 
 const WIDE = 276, HIGH = 92, NEAR = matchMedia('(pointer: coarse)').matches ? 22 : 16, TWICE = 350;  // px; milliseconds between the taps that add a node
@@ -227,7 +227,7 @@ export function editor(apply, layer, key, history) {
   function open(now) {
     menu.hidden = !now;
     opener.setAttribute('aria-expanded', String(now));
-    if (now) history.sketch(ready, (k, draw) => draw(pictures[k]), () => !menu.hidden);
+    if (now) history.sketch(ready, (k, picture) => pictures[k].drawImage(picture, 0, 0), () => !menu.hidden);
   }
   opener.addEventListener('click', () => open(menu.hidden));
   root.addEventListener('keydown', (event) => {

@@ -4,7 +4,6 @@ const UP = {  // world axes as PLY has them, rows, by the axis that is up (frame
   y: [[1, 0, 0], [0, -1, 0], [0, 0, -1]], '-y': [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
   z: [[1, 0, 0], [0, 0, -1], [0, 1, 0]], '-z': [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
 };
-const POOR = 28;  // dB; measured (docs/live.md, "Quality"): below, dots and pits are seen
 const OPPOSITE = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' };
 
 // The legend of a baked look, of JSON {values, unit, nodes} or {labels, of}; null where it is damaged
@@ -17,17 +16,15 @@ function legendOf(text) {
   } catch { return null; }
 }
 
-// How near the volume's the pictures are, as the conversion measured, of the JSON of a certificate (docs/certificate.md): {quality, far: what to say where it is below POOR}; {} where it is damaged
+// How near the volume's the pictures are, as the conversion measured, of the JSON of a certificate (docs/certificate.md); '' where it is damaged
 function qualityOf(text) {
   try {
     const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
-    if (!Number.isFinite(dB)) return {};
-    const quality = `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)${Number.isFinite(live) ? ', under its own function and light' : ''}`, better = Number.isFinite(live) ? 'convert the volume for this look, without --live' : 'use more Gaussians or steps';
-    return { quality, far: dB < POOR ? `Low quality (${dB.toFixed(1)} dB): dots and pits may not be in the data, and detail may be missing. For a closer picture, ${better}.` : '' };
-  } catch { return {}; }
+    return Number.isFinite(dB) ? `${dB.toFixed(1)} dB PSNR on test views of ${Number(size)} px (higher is better)${Number.isFinite(live) ? ', under its own function and light' : ''}` : '';
+  } catch { return ''; }
 }
 
-// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, quality, far}: text and numbers
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, quality}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {
@@ -40,7 +37,7 @@ export function factsOf(comments) {
     else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
     else if (key === 'function') facts.function = JSON.parse(text);
     else if (key === 'legend') facts.legend = legendOf(text);
-    else if (key === 'certificate') Object.assign(facts, qualityOf(text));
+    else if (key === 'certificate') facts.quality = qualityOf(text);
     else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
     else if (text) facts[key] = text;
     else facts.version = key;

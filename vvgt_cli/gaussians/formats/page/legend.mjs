@@ -1,7 +1,7 @@
 // The legend: values of the function's range with their colours, as wide as they are opaque; or labels with their colours.
 import { hex } from './color.mjs';
 import { shown } from './facts.mjs';
-import { functionAt } from './live_table.mjs';
+import { functionAt } from './table.mjs';
 import { round } from './scale.mjs';
 import { element, label, stops } from './svg.mjs';
 

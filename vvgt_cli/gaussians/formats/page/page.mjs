@@ -3,11 +3,11 @@
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { Damaged, unlessFailing, wholePly } from './damage.mjs';
-import { teach } from './grey.mjs';
-import { liveLook } from './live.mjs';
 import { panel, named } from './panel.mjs';
 import { patched } from './patch.mjs';
+import { raycaster } from './raycast.mjs';
 import { served, waiting } from './server.mjs';
+import { sharedGrids } from './volume.mjs';
 import { where } from './where.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
@@ -49,13 +49,12 @@ function draw(app, { dilation, shifted, reach }) {
     if (!text.includes(old)) throw new Error(`${name} of the engine is another one`);
     chunks.set(name, text.replaceAll(old, now));
   };
-  teach(app, change);
-  change('gsplatCornerVS', '+ 0.3', `+ (vvgtKind > 0.5 ? 0.3 : ${(4 * dilation).toFixed(6)})`);
-  if (reach < 4) change('gsplatPS', 'A > 1.0', `A > (vvgtKind > 0.5 ? 1.0 : ${(reach / 4).toFixed(6)})`);
+  change('gsplatCornerVS', '+ 0.3', `+ ${(4 * dilation).toFixed(6)}`);
+  if (reach < 4) change('gsplatPS', 'A > 1.0', `A > ${(reach / 4).toFixed(6)}`);
   if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
 }
 
-function series(viewer, live) {
+function series(viewer) {
   const { app } = viewer, entity = app.root.findByName('gsplat');
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
   const box = document.createElement('div');
@@ -99,7 +98,6 @@ function series(viewer, live) {
       try {
         const asset = await loaded(k);
         if (wanted !== k) continue;
-        if (live) await live.look.frame(k, asset.resource);
         entity.gsplat.asset = asset.id;
         app.renderNextFrame = true;
         said.textContent = '';
@@ -160,11 +158,10 @@ async function start() {
   deliver?.(response);
   if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
   Object.assign(viewer.state, { cameraMode: 'orbit', inputEnabled: false });  // the viewer would turn the object; keys are ours
-  if (scene.frames.length === 1 && !scene.live) document.body.append(named());
-  const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
-  const { converted } = scene;
-  if (live) await served(live, viewer, scene.server, converted && { ...converted, contents: await content(converted) });
-  const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
+  if (scene.frames.length === 1 && !scene.look) document.body.append(named());
+  const grids = scene.values ? sharedGrids(scene.values) : null, live = scene.look ? panel(raycaster(scene.look, grids, viewer), viewer, scene.look) : null;
+  if (live) served(live, viewer, scene.server);
+  const show = scene.frames.length > 1 ? series(viewer) : null, here = where(viewer, scene, live, show, grids);
   await here.restored;
   document.body.classList.remove('begins');
   said.textContent = '';

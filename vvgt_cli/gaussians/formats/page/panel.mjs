@@ -1,13 +1,12 @@
 // The panel of a live page: of each layer its function or the list of its labels; a cut, a light; what undo goes back to.
 import { cutOf } from './cut.mjs';
 import { editor } from './editor.mjs';
-import { KINDS } from './grey.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
-import { sketches } from './shot.mjs';
 
 const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
 <output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="draw as" title="draw as (k)"></select>`;
+const KINDS = ['colours', 'MIP', 'X-ray'];
 const STEPS = 200, SMALL = 84;  // that undo goes back; px of a small picture
 
 // the file's name and what kind it is
@@ -28,7 +27,7 @@ export function panel(look, viewer, live) {
   document.body.append(root);
   named('', root.querySelector('.named'));
   const find = (selector) => root.querySelector(selector), list = find('.layer'), undone = [], parts = [], layers = [];
-  let told = () => {}, chosen = 0, sketching = false;
+  let told = () => {}, chosen = 0;
 
   const enable = () => root.querySelectorAll('.undo').forEach((button) => { button.disabled = !undone.length; });
   const history = {
@@ -64,16 +63,12 @@ export function panel(look, viewer, live) {
     const now = lamp.state(), kind = to === undefined ? now.kind : to === null ? 'none' : to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
     return [begun, now].find((one) => JSON.stringify(one) === JSON.stringify(next)) ?? next;
   }
-  // small pictures of presets {nodes, light} of a layer, as shot.mjs draws them, while going()
-  function sketch(k, looks, done, going) {
-    const put = (nodes, light) => {
-      look.sketch(nodes, k);
-      look.light(light);
-      return look.ready();
-    };
-    const then = parts.map((part) => part.state()), same = () => parts.every((part, n) => part.state() === then[n]);  // or who looks has chosen meanwhile
-    const show = async (j) => going() && same() && (await put(looks[j].nodes, lit(looks[j].light)), true), begin = (now) => { sketching = now; told(true); };
-    return sketches(viewer, SMALL, looks.length, () => begin(true), show, (j, draw) => { if (same()) done(j, draw); }, () => { begin(false); return put(layers[k].nodes(), lamp.state()); });
+  // small pictures of presets {nodes, light} of a layer: done(number, canvas), while going()
+  async function sketch(k, looks, done, going) {
+    for (let j = 0; j < looks.length && going() && !look.said; j++) {
+      const picture = await look.sketch(k, looks[j].nodes, lit(looks[j].light), SMALL).catch(() => null);
+      if (picture) done(j, picture);
+    }
   }
 
   function choose(k) {
@@ -129,7 +124,7 @@ export function panel(look, viewer, live) {
   return {
     root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
     drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
-    alone: () => sketching || drawn > 0 || cut.planes().length > 0, lit: () => (lamp.state() === begun ? null : lamp.state()),
+    alone: () => drawn > 0 || cut.planes().length > 0, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };
 }

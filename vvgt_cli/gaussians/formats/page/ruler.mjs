@@ -1,6 +1,5 @@
 // Places that are clicked, with their values.
 import { cloudOf, seen } from './cloud.mjs';
-import { looksOf, valueAt } from './live_at.mjs';
 import { shown } from './facts.mjs';
 import { element, label } from './svg.mjs';
 
@@ -11,12 +10,16 @@ export function pickerOf(lens, worldNow, dataNow, look, picked) {
   const { canvas } = lens;
   let of = null, cloud = null, down = null;
 
-  function pick(x, y) {
-    const data = dataNow();
+  async function pick(x, y) {
+    const data = dataNow(), ray = lens.ray(x, y);
+    if (look && !look.said) {
+      const place = await look.pick(ray);
+      return picked(place && { place, world: worldNow().place(place), ...look.at(place) });
+    }
     if (!data.numSplats) return;  // streamed: not here
     if (of !== data) [of, cloud] = [data, cloudOf(data)];
-    const place = seen(cloud, lens.ray(x, y), look && looksOf(look), lens.flat);
-    picked(place && { place, world: worldNow().place(place), ...(look ? valueAt(look, cloud, place) : { value: null, in: '' }) });
+    const place = seen(cloud, ray, lens.flat);
+    picked(place && { place, world: worldNow().place(place), value: null, in: '' });
   }
 
   canvas.addEventListener('pointerdown', (event) => {
@@ -39,7 +42,7 @@ export const valueText = ({ value, in: of }) => (value === null ? '' : `${typeof
 export function placeText(place, { letters, anatomical, unit }) {
   const digits = (x) => shown(x, Math.abs(x) < 100 ? 3 : 5), text = valueText(place);
   const along = place.world.map((x, k) => (anatomical ? `${letters[k][x < 0 ? 0 : 1]} ${digits(Math.abs(x))}` : `${letters[k][1]} ${digits(x)}`));
-  return `${along.join(', ')}${unit && ` ${unit}`}${text && `: ${text}`}`;
+  return `${along.join(', ')}${unit && ` ${unit}`}${text && `: ${text}${place.mean ? ` (${place.mean})` : ''}`}`;
 }
 
 const LOOKS = [{ stroke: '#000', 'stroke-width': 4, 'stroke-opacity': 0.6, fill: 'none' }, { stroke: '#fc3', 'stroke-width': 1.5, fill: 'none' }];

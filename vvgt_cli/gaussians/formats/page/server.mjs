@@ -1,5 +1,4 @@
-// The better form of what a live page shows: the server converts the volume under the function and light of the page, or the file holds the
-// conversion under its own; it is swapped in. Files to save.
+// The look of a page: under its own the Gaussians are shown, under others the volume itself; a server converts it for these meanwhile. Files to save.
 import { Asset, Entity } from 'playcanvas';
 
 const QUIET = 300, ASK = 300;  // milliseconds without a change after which the server is asked; between two looks
@@ -46,57 +45,51 @@ function download(content, name) {
 const send = (to, what) => fetch(to, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(what) });
 const reason = async (answer) => (answer.status === 400 ? answer.text() : `the server answered ${answer.status}`);
 
-// What is shown in place of the first Gaussians, where they are.
-function substitute({ app }) {
+// The Gaussians: the page's own, and what the server has made since in their place.
+function gaussiansOf({ app }) {
   const first = app.root.findByName('gsplat');
-  let entity = null;
-  function put(there) {
-    if (entity) entity.enabled = there;
-    first.enabled = !(entity && there);
+  let entity = null, seen = true;
+  function put(now = seen) {
+    seen = now;
+    if (entity) entity.enabled = seen;
+    first.enabled = seen && !entity;
     app.renderNextFrame = true;
   }
-  function drop() {
-    put(false);
-    if (!entity) return;
-    const asset = app.assets.get(entity.gsplat.asset);
-    entity.destroy();
-    entity = null;
-    app.assets.remove(asset);
-    asset.unload();
-  }
-  async function load(file, still, contents) {
-    const asset = new Asset(file, 'gsplat', { url: file, filename: file, contents });
+  async function load(file, still) {
+    const asset = new Asset(file, 'gsplat', { url: file, filename: file });
     await new Promise((done, fail) => {
       asset.once('load', done);
       asset.once('error', fail);
       app.assets.add(asset);
       app.assets.load(asset);
     });
-    if (!still()) {
-      app.assets.remove(asset);
-      return asset.unload();
+    const old = still() ? entity && [entity, app.assets.get(entity.gsplat.asset)] : [null, asset];
+    if (still()) {
+      entity = new Entity('better', app);
+      entity.addComponent('gsplat', { asset: asset.id, unified: true });
+      entity.setLocalRotation(first.getLocalRotation());
+      first.parent.addChild(entity);
     }
-    entity = new Entity('better', app);
-    entity.addComponent('gsplat', { asset: asset.id, unified: true });
-    entity.setLocalRotation(first.getLocalRotation());
-    first.parent.addChild(entity);
+    old?.[0]?.destroy();
+    if (old) { app.assets.remove(old[1]); old[1].unload(); }
+    put();
   }
-  return { load, put, drop };
+  return { load, put };
 }
 
-// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut, MIP or X-ray, which the live form alone has; lit(): another light than the file's, or null}; server: {converts, name}, none of a page in a file;
-// converted: {file, contents, said} of the conversion under the file's own function, in a page in a file. Resolves once that is shown.
-export async function served(panel, viewer, server, converted) {
-  const { root, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
+// panel: {root, look, layers, at(): the chosen one of them, changed(f), alone(): a cut, MIP or X-ray, which the volume itself has alone; lit(): another light than the file's, or null}; server: {converts, name}, none of a page in a file.
+// The Gaussians are shown under the look that they were made for, else the volume itself.
+export function served(panel, viewer, server) {
+  const { root, look: volume, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
   row.textContent = 'Save';
   [kind, text].forEach((one) => one.setAttribute('role', 'status'));
   root.append(text, row);
-  const better = substitute(viewer);
+  const better = gaussiansOf(viewer);
   const look = ({ named, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), named()) });
   const shown = () => (layers.length > 1 ? { layers: layers.map(look) } : look(layers[0]));
-  let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
+  let number = server ? null : 0, told = server ? '' : 'Gaussians', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
   const say = (line, failed) => {
     text.textContent = line;
@@ -104,13 +97,18 @@ export async function served(panel, viewer, server, converted) {
   };
 
   const begun = JSON.stringify(shown());
-  const improved = () => number !== null && !panel.alone() && (!converted || (!panel.lit() && JSON.stringify(shown()) === begun));
+  const able = () => server?.converts || (!panel.lit() && JSON.stringify(shown()) === begun);  // there can be Gaussians under this look
+  const improved = () => Boolean(volume.said) || (number !== null && !panel.alone() && able());
   function put() {
-    better.put(improved());
-    const [what, why = ''] = (improved() ? told : 'preview').split(/: (.*)/s);
-    kind.textContent = server?.converts || converted ? what : '';
-    if (!busy) say(why);
+    volume.show(!improved());
+    const [what, why = ''] = (improved() ? told : 'volume').split(/: (.*)/s);
+    kind.textContent = what;
+    if (!busy) say(why || volume.said);
   }
+  panel.covering = (now) => {
+    better.put(!now);
+    if (volume.said) put();
+  };
 
   function end(line = '', failed = false) {
     busy = false;
@@ -151,7 +149,6 @@ export async function served(panel, viewer, server, converted) {
     if (busy) send('function', null).catch(() => {});  // what is being done ends
     change++;
     [number, busy] = [null, false];
-    better.drop();
     put();
     clearTimeout(timer);
     timer = setTimeout(ready, QUIET);
@@ -160,7 +157,7 @@ export async function served(panel, viewer, server, converted) {
   function ready() {
     clearTimeout(timer);
     if (down) timer = setTimeout(ready, QUIET);
-    else convert();
+    else if (able()) convert();
   }
 
   async function save(file) {
@@ -169,7 +166,7 @@ export async function served(panel, viewer, server, converted) {
       return download(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: 'application/json' }), rows ? 'labels.json' : 'tf.json');
     }
     try {
-      const answer = await send('save', { file, number: improved() ? number : null, ...shown(), light: panel.lit() });
+      const answer = await send('save', { file, number, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       const link = file === 'html' && panel.begins?.(), at = (found) => `${found}"link": ${JSON.stringify(link).replaceAll('<', '\\u003c')}, `;
       download(link ? new Blob([(await answer.text()).replace('id="scene">{', at)], { type: 'text/html' }) : await answer.blob(), `${name}.${file}`);
@@ -189,13 +186,9 @@ export async function served(panel, viewer, server, converted) {
     button.addEventListener('click', () => save(file));
     row.append(button);
   }
-  if (converted) {
-    await better.load(converted.file, () => true, converted.contents);
-    [number, told] = [0, converted.said];
-    panel.changed(put);
-    put();
-  }
-  if (server?.converts) {
+  panel.changed(put);
+  put();
+  if (server) {
     for (const event of ['pointerdown', 'pointerup', 'pointercancel']) {
       root.addEventListener(event, () => { down = event === 'pointerdown'; }, true);
     }

@@ -38,36 +38,13 @@ async function drawn(app, size) {
 }
 const tooLarge = (size) => new Error(`this browser cannot draw ${size.join(' × ')} px: choose a smaller picture`);
 
-// a PNG of `size`, by default the window's
-export const pictureOf = ({ app }, svg, size) => alone(async () => {
-  const { canvas } = app.graphicsDevice, all = size ?? [canvas.width, canvas.height], picture = await drawn(app, all);
+// a PNG of `size`, by default the window's, of the volume itself where that is shown
+export const pictureOf = ({ app }, svg, size, look) => alone(async () => {
+  const { canvas } = app.graphicsDevice, all = size ?? [canvas.width, canvas.height], picture = await (look?.shows ? look.picture(all) : drawn(app, all));
   picture.getContext('2d').drawImage(await drawingOf(svg, all[0] / canvas.clientWidth), 0, 0, ...all);
   const blob = await new Promise((done) => picture.toBlob(done, 'image/png'));
   if (!blob) throw tooLarge(all);
   return blob;
-});
-
-// The middle of the view, `edge` pixels wide, of each of several looks: begin() before the first; show(k) is done when the engine has look k, and says false to end;
-// done(k, draw(context)). What was seen stays in the window meanwhile; back() when all have been drawn.
-export const sketches = ({ app }, edge, count, begin, show, done, back) => alone(async () => {
-  const { canvas } = app.graphicsDevice, { clientWidth: wide, clientHeight: high } = canvas, { camera } = app.root.findComponent('camera');
-  const { x, y } = camera.projectionOffset, [left, top] = [((1 - x) * wide) / 2, ((1 + y) * high) / 2], half = Math.min(left, wide - left, top, high - top), scale = edge / (2 * half);
-  const still = await drawn(app, [canvas.width, canvas.height]), size = [wide, high].map((n) => Math.ceil(n * scale)), small = () => sized(canvas, size);
-  let seen = true;
-  for (const event of ['pointerdown', 'wheel']) canvas.addEventListener(event, () => { seen = false; }, { once: true });  // who turns the view wants to see it
-  canvas.after(still);
-  app.on('framerender', small);
-  try {
-    begin();
-    for (let k = 0; k < count && seen && await show(k); k++) {
-      const picture = await drawn(app, size);
-      done(k, (to) => to.drawImage(picture, (left - half) * scale, (top - half) * scale, edge, edge, 0, 0, edge, edge));
-    }
-  } finally {
-    app.off('framerender', small);
-    await back();
-    still.remove();
-  }
 });
 
 // this page as its file was, but that it begins with `link`

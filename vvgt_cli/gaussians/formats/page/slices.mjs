@@ -1,7 +1,7 @@
 // Slices of the volume beside the picture: three planes that cross at a place, windowed, with the value under the pointer.
 import { hide } from './keys.mjs';
 import { placeText } from './ruler.mjs';
-import { gridOf, viewsOf } from './volume.mjs';
+import { viewsOf } from './volume.mjs';
 
 const STILL = 6, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];  // px that a click stays within; of the axes x, y and z
 const CT = [['soft tissue', 400, 40], ['lung', 1500, -600], ['bone', 1800, 400], ['brain', 80, 40]];
@@ -10,23 +10,13 @@ const HTML = `<header><b>slices</b><select class="grid" aria-label="volume" titl
 <label title="window: width of the range of greys">W <input class="window" type="number" step="any" min="0"></label><label title="level: middle of the range of greys">L <input class="level" type="number" step="any"></label><button class="face" aria-pressed="false" title="show the slice on the faces of the cut">on the cut</button><button class="close" aria-label="close the slices" title="close the slices">✕</button></header><div></div><output></output>`;
 const FIGURE = '<canvas tabindex="0" role="application"></canvas><input type="range" min="1">';
 
-// facts of the grids; those of a server are fetched, and their contents put in elements as in a file
-async function factsOf(slices) {
-  if (!slices.from) return slices;
-  const answer = await fetch(slices.from);
-  if (!answer.ok) throw new Error(`vvgt view: ${await answer.text()}`);
-  const { facts, contents } = await answer.json();
-  for (const [id, textContent] of Object.entries(contents)) document.body.append(Object.assign(document.createElement('script'), { type: 'application/octet-stream', id, textContent }));
-  return facts;
-}
-
 // world(): of where.mjs; cuts: the picture has a cut; rows(layer): colours and opacities of its labels as they are shown, or null; moved(place): of the cross, picked(place): by a click
-export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
+export function slicesOf(gridsOf, { world, cuts, rows, moved, picked }) {
   const root = Object.assign(document.createElement('section'), { id: 'slices', hidden: true, innerHTML: HTML });
   root.setAttribute('aria-label', 'slices');
   document.body.append(root);
   const find = (selector) => root.querySelector(selector), fields = [find('.window'), find('.level')], said = find('output');
-  let grids = null, labels = [], views = [], base = null, at = [0, 0, 0], shades = null, window_ = [1, 0], version = 0;
+  let grids = null, labels = [], views = [], base = null, at = [0, 0, 0], shades = null, window_ = [1, 0];
 
   const presets = () => {
     const all = ['all values', base.window, base.level], ct = base.ct ? CT : [];
@@ -41,7 +31,6 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     });
     window_.forEach((x, k) => { fields[k].value = Number(x.toPrecision(4)); });
     find('.preset').value = String(presets().findIndex(([, w, l]) => w === window && l === level));
-    version++;
     draw();
     moved();
   }
@@ -143,7 +132,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     const place = base.toWorld(index.map(Math.round)), code = base.at(index);
     if (code < 0) return null;
     const value = base.labels ? NaN : base.value(code), named = labels.map((grid) => [grid, grid.labels[grid.at(grid.from(base)(index)) - 1]]).filter(([, label]) => label);
-    return { world: place, value: Number.isNaN(value) ? null : value, in: base.unit ?? '', layer: base.layer, names: named.map(([, { name }]) => name) };
+    return { world: place, value: Number.isNaN(value) ? null : value, in: base.unit ?? '', mean: base.mean, layer: base.layer, names: named.map(([, { name }]) => name) };
   }
   const text = (one) => (one ? `${placeText(one, world())}${one.names.map((name) => `, ${name}`).join('')}` : '');
 
@@ -198,9 +187,7 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   async function open() {
     if (grids) return;
     said.textContent = 'loading';
-    const read = [];
-    for (const facts of await factsOf(scene.slices)) read.push(await gridOf(facts));
-    grids = read;
+    grids = await gridsOf();
     labels = grids.filter((grid) => grid.labels);
     const valued = grids.filter((grid) => !grid.labels), bases = valued.length ? valued : labels.slice(0, 1), list = find('.grid');
     list.replaceChildren(...bases.map(({ title }, k) => new Option(title || `layer ${k}`)));
@@ -233,14 +220,8 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
   return {
     root, toggle, text, found: (place) => found(base.toIndex(place)),
     get open() { return Boolean(base) && !root.hidden; },
-    // 0: not on the cut; another number: another look
-    get face() { return base && !root.hidden && face.getAttribute('aria-pressed') === 'true' ? version + 1 : 0; },
-    // of places of the world, a pixel across and a pixel down
-    image(from, across, down, n, m) {
-      const [o, a, b] = [from, across, down].map(base.toIndex), minus = (p) => p.map((x, k) => x - o[k]);
-      return walked(o, minus(a), minus(b), n, m);
-    },
-    corners: () => Array.from({ length: 8 }, (_, i) => base.toWorld(base.dims.map((n, k) => ((i >> k) & 1 ? n - 0.5 : -0.5)))),
+    // {layer, low, high}: values on the cut, null: none
+    get face() { return base && !root.hidden && face.getAttribute('aria-pressed') === 'true' ? { layer: base.layer, low: window_[1] - window_[0] / 2, high: window_[1] + window_[0] / 2 } : null; },
     get state() { return { window: window_[0], level: window_[1], at: base.toWorld(at), views, frameOf, base }; },
     // the ends of the lines that cross, in the world
     lines: () => [0, 1, 2].map((k) => [-0.5, base.dims[k] - 0.5].map((x) => base.toWorld(at.map((y, j) => (j === k ? x : y))))),
@@ -249,7 +230,6 @@ export function slicesOf(scene, { world, cuts, rows, moved, picked }) {
     follow(now) {
       if (now.length === looks.length && now.every((one, k) => one === looks[k])) return;
       looks = [...now];
-      version++;
       draw();
       moved();
     },

@@ -1,6 +1,6 @@
 // Elements of the drawing over the picture. All looks are attributes: the drawing is also made part of a saved picture.
 import { hex } from './color.mjs';
-import { functionAt } from './live_table.mjs';
+import { functionAt } from './table.mjs';
 
 const SVG = 'http://www.w3.org/2000/svg';
 

@@ -1,5 +1,5 @@
-// Grids of the volume that a page holds (page_slices.py): decoded, placed in the world, looked up; and how slices of them lie.
-import { unpacked } from './live.mjs';
+// Grids of the volume that a page holds (page_values.py): decoded, placed in the world, looked up; and how slices of them lie.
+import { Damaged } from './damage.mjs';
 
 const BODY = [['axial', 'L', 'A'], ['coronal', 'L', 'S'], ['sagittal', 'P', 'S']], OTHER = [['z', 'x', 'y'], ['y', 'x', 'z'], ['x', 'y', 'z']];  // name, what is to the right, what is up
 const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
@@ -15,9 +15,20 @@ function inverted(m) {
 // the matrix of the one after the other
 const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 * r] * n[c] + m[4 * r + 1] * n[4 + c] + m[4 * r + 2] * n[8 + c] + (c === 3 ? m[4 * r + 3] : 0)));
 
+// what an element of the page holds (gzip in base64), `size` bytes
+async function unpacked(id, size) {
+  try {
+    const element = document.getElementById(id), stream = new Blob([Uint8Array.from(atob(element.textContent), (c) => c.charCodeAt(0))]).stream();
+    element.remove();
+    const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
+    if (bytes.length === size) return bytes;
+  } catch { /* said below */ }
+  throw new Damaged('its values are incomplete');
+}
+
 // {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, near(x, y, z): that between the eight around it, toWorld, toIndex, from(other): indices of another grid to its own}
-export async function gridOf(facts) {
-  const { dims: [nx, ny, nz], bits, element, affine, lo, step, missing } = facts, n = nx * ny * nz, bytes = await unpacked(element, true, (bits / 8) * n);
+async function gridOf(facts) {
+  const { dims: [nx, ny, nz], bits, element, affine, lo, step, missing, cell } = facts, n = nx * ny * nz, bytes = await unpacked(element, (bits / 8) * n);
   const codes = bits === 8 ? new Uint8Array(n) : new Uint16Array(n), high = bits === 8 ? null : bytes.subarray(n);
   for (let i = 0; i < n; i++) {
     const folded = high ? bytes[i] | (high[i] << 8) : bytes[i];
@@ -25,7 +36,7 @@ export async function gridOf(facts) {
   }
   const inverse = inverted(affine);
   return {
-    ...facts, codes,
+    ...facts, codes, mean: facts.labels || Math.max(...cell) === 1 ? '' : `mean of ${cell.join(' × ')} voxels`,
     value: (code) => (code < missing ? NaN : lo + step * (code - missing)),
     at(index) {
       const [x, y, z] = index.map(Math.round);
@@ -43,6 +54,25 @@ export async function gridOf(facts) {
     from: (other) => { const m = chained(inverse, other.affine); return (index) => through(m, index); },
     edges: [0, 1, 2].map((k) => Math.hypot(affine[k], affine[4 + k], affine[8 + k])),
   };
+}
+
+// a function that returns all grids, read at its first call; those of a server are fetched, and their contents put in elements as in a file
+export function sharedGrids(values) {
+  let read = null;
+  const all = async () => {
+    let facts = values;
+    if (values.from) {
+      const answer = await fetch(values.from);
+      if (!answer.ok) throw new Error(`vvgt view: ${await answer.text()}`);
+      const { contents, ...rest } = await answer.json();
+      ({ facts } = rest);
+      for (const [id, textContent] of Object.entries(contents)) document.body.append(Object.assign(document.createElement('script'), { type: 'application/octet-stream', id, textContent }));
+    }
+    const grids = [];
+    for (const one of facts) grids.push(await gridOf(one));
+    return grids;
+  };
+  return () => (read ??= all());
 }
 
 // The three slices along a grid's own axes, each named after the axis of the world that is nearest: {name, across, along, up: {axis, sign}, letters: of its four sides}

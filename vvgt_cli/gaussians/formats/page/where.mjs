@@ -1,8 +1,7 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
-import { notice, rowsOf } from './about.mjs';
+import { rowsOf } from './about.mjs';
 import { factsOf, worldOf } from './facts.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
-import { facesOf } from './face.mjs';
 import { firstAngles, stayFree } from './free.mjs';
 import { handlesOf } from './handles.mjs';
 import { helpRows, listed, listen } from './keys.mjs';
@@ -27,17 +26,16 @@ const ICONS = {
   slices: icon('M2.5 2.5h13v13h-13ZM9 2.5v13M2.5 9h13'), full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
 };
 
-export function where(viewer, scene, live, show) {
+export function where(viewer, scene, live, show, grids) {
   const lens = lensOf(viewer), { app } = viewer, svg = element('svg', { id: 'where', role: 'img' });
   const handles = live && handlesOf(lens, live.cut);
-  document.querySelector('#view .sse-viewer').append(svg, ...(handles ? [handles.svg] : []));
+  document.querySelector('#view .sse-viewer').append(...(live ? [live.look.canvas] : []), svg, ...(handles ? [handles.svg] : []));
   const values = live?.layers.some(({ nodes }) => nodes), box = document.createElement('nav'), buttons = [];
   box.id = 'tools';
   box.setAttribute('aria-label', 'view');
   const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []), sizes = listed('sizes', 'Save the picture as PNG');
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
-  const poor = notice();
-  document.body.append(poor.root, box, help.root, about.root, sizes.root, places);
+  document.body.append(box, help.root, about.root, sizes.root, places);
   places.setAttribute('role', 'status');
   let data, world, facts, drawn = '', stamp = 0, told = '';
   const state = {};
@@ -60,16 +58,15 @@ export function where(viewer, scene, live, show) {
     report(place, { label: place.row === undefined ? undefined : live.layers[place.layer].layer.labels[place.row].number });
   });
   const report = (place, more) => site.say('picked', { text: placeText(place, world), place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, ...more });
-  const labelled = (layer) => live && live.look.layers[layer].labels.map((_, k) => live.look.rows[live.look.layers[layer].row + k]);
-  const slices = scene.slices && slicesOf(scene, {
+  const labelled = (layer) => live?.look.rows[layer];
+  const slices = grids && slicesOf(grids, {
     world: () => world, cuts: Boolean(live), rows: labelled, moved: () => again(),
     picked(place) {
       if (place && marks.open) marks.take(place);
       if (place) report(place, { text: slices.text(place), value: place.value ?? place.names[0] ?? null });
     },
   });
-  const faces = slices && live && facesOf(viewer);
-  let faced = '[[],0]';
+  let faced = 'null';
   const parts = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   if (live) live.begins = () => saidBy(parts.filter(({ key }) => !/^(function|labels|light|drawn)/.test(key)));  // of a page that the server makes for the look
@@ -86,8 +83,7 @@ export function where(viewer, scene, live, show) {
       made.setAttribute('aria-label', `${made.textContent}: ${title}`);
     });
     live?.cut.name(world.letters);
-    poor.say(facts.far);
-    about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live, converted: scene.converted, slices: scene.slices }));
+    about.rows(rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, look: scene.look, values: scene.values }));
   }
 
   const button = (name, title, key, press) => {
@@ -127,7 +123,7 @@ export function where(viewer, scene, live, show) {
   const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(true));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume', 's', () => slices.toggle());
-  const picture = (size) => pictureOf(viewer, svg, size).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
+  const picture = (size) => pictureOf(viewer, svg, size, live?.look).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
   sizes.of(button('picture', 'save a picture (PNG)', 'p', () => {
     sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
       const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
@@ -164,7 +160,7 @@ export function where(viewer, scene, live, show) {
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
   const act = Object.fromEntries(buttons.filter(({ key, made }) => key && !made.hidden).map(({ key, press }) => [key, press]));
-  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => { poor.close(); measure(false); }, again);
+  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => measure(false), again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
   lens.canvas.addEventListener('dblclick', () => {
@@ -184,10 +180,11 @@ export function where(viewer, scene, live, show) {
   }
 
   function drawFaces() {
-    const now = slices.face, planes = now ? live.cut.planes() : [], said = JSON.stringify([planes, planes.length && now]);
+    const now = live.cut.planes().length ? slices.face : null, said = JSON.stringify(now);
     if (said === faced) return;
     faced = said;
-    faces(planes, planes.length ? slices.corners().map(world.at) : [], (from, across, down, n, m) => slices.image(...[from, across, down].map(world.place), n, m));
+    const [lo, hi] = now ? live.look.layers[now.layer].values : [], of = (x) => (x - lo) / (hi - lo || 1);
+    live.look.face(now && { layer: now.layer, from: of(now.low), to: of(now.high) });
   }
 
   function draw() {
@@ -202,7 +199,7 @@ export function where(viewer, scene, live, show) {
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
     handles?.draw(world);
-    if (faces) drawFaces();
+    if (slices && live) drawFaces();
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
     const lines = [...(clicked ? [placeText(clicked, world)] : []), ...(marks.open ? [marks.hint] : []), ...(told ? [told] : [])];
@@ -222,10 +219,11 @@ export function where(viewer, scene, live, show) {
     draw();
   });
   take(dataNow());
+  live?.look.begin(lens, () => world, live.covering);
   spread();
   addEventListener('resize', spread);
   const fit = stayFree(lens, scene, draw);
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size), get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size, live?.look), get world() { return world; }, get facts() { return facts; } });
   return state;
 }

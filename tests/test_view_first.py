@@ -1,4 +1,4 @@
-"""What `vvgt view` converts before a page is there: volumes that have no live form."""
+"""What `vvgt view` converts before a page is there: volumes whose look cannot be changed."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -7,23 +7,17 @@ import numpy as np
 import pytest
 
 from vvgt_cli.commands.converter import ConsoleLine, Converted, Message, Scored
-from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import Volume
 
 
-def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_labels_are_converted_first(monkeypatch: pytest.MonkeyPatch) -> None:
     from vvgt_cli.commands import converter_process
 
-    labels = Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), name="labels")
-    request = SourceRequest(labels, tf="viridis", light=LightOptions(lights=("0,0,1",), shadows=True))
-    why = live_refusal(ConvertRequest(request, live=True), load(request))
-    assert why is not None
-    for other in (SourceRequest(labels, tf="viridis"), SourceRequest(labels, labels="auto")):
-        assert live_refusal(ConvertRequest(other, live=True), load(other)) is None
+    labels = Volume(np.arange(512, dtype=np.uint16).reshape(8, 8, 8), name="labels")
+    request = SourceRequest(labels, labels="auto")
     asked = []
 
     def conversion(request: ConvertRequest, console: Console, start: Any, unscored: Any) -> Any:
@@ -37,10 +31,10 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
     messages: list[Message] = []
     volume = converter_process.LoadedVolume.__new__(converter_process.LoadedVolume)
     volume.source, volume.last = request, None
-    volume.send_live(converter_process.MessageConsole(messages.append))
+    volume.send_page(converter_process.MessageConsole(messages.append))
     assert [one for one in messages if isinstance(one, Converted | Scored)] == [
         Converted(b"", {}),
         Scored(b"scored", 40.0),
     ]
     assert asked == [False]
-    assert ConsoleLine(f"converted without a live form: {why}") in messages
+    assert any(isinstance(one, ConsoleLine) and "converted first: its look" in one.line for one in messages)

@@ -1,4 +1,4 @@
-"""Slices of the volume on its page: values and labels on coarser grids, which `page/volume.mjs` decodes.
+"""The volume's values and labels on its page, on grids that `page/volume.mjs` decodes.
 
 A grid is packed by gzip: its codes, each minus the one before it along x (modulo 2^bits), as planes of their low and,
 with 16 bits, high bytes. Differences are stored as `(d << 1) ^ (d >> bits - 1)`, so that small ones are small numbers.
@@ -11,40 +11,63 @@ import gzip
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from vvgt_cli.errors import NoLiveForm
+from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.recognise import in_hounsfield
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
+from vvgt_cli.volume.stats import BINS, Statistics, edges_of
 from vvgt_cli.volume.types import Volume
 
-MAX_CELLS = 1 << 22  # cells of all grids of a page
+ELEMENT = "values"  # prefix of the ids of elements, followed by the number of the layer
+MAX_CELLS = 1 << 24  # cells of all grids of a page: up to as many, all voxels
 FEWEST = 1 << 15  # where there is less room, none
 SMALLEST = FEWEST * 2 * 4 / 3 + 4096  # bytes that those take on a page at most
 CLOSER = 0.95  # of the room: grids that did not fit are made for this share of it
 LEVELS = 4096  # steps of the range of most values
 MOST_VALUES = (0.1, 99.9)  # percentiles that bound most values
 CODES = 1 << 16
+OF_LABELS = Statistics(0, 0, 0, 0, np.zeros(BINS, np.int64), edges_of(0, 0))
 EXACT = 1e-6  # steps by which rounding may move a mean of equal values
 
-Layer = tuple[Volume, TransferFunction | LabelTable | None]
 
-
-class Slices(NamedTuple):
-    """Grids of a page.
+class Layer(NamedTuple):
+    """A layer of a volume without colours of its own.
 
     Attributes:
-        facts: of each layer shown.
+        volume: scalars or a label map.
+        look: function, or table of a label map.
+        distance: world length that its opacity refers to.
+        statistics: of the scalars; None: those of the grid.
+    """
+
+    volume: Volume
+    look: TransferFunction | LabelTable
+    distance: float
+    statistics: Statistics | None = None
+
+
+class Values(NamedTuple):
+    """The values of a page.
+
+    Attributes:
+        facts: of the grid of each layer shown.
         contents: of each, the packed codes.
-        limited: they are coarser for want of room.
+        look: of all layers, which the page begins with; None where it cannot be changed there.
+        limited: grids are coarser for want of room.
     """
 
     facts: tuple[dict[str, Any], ...]
     contents: tuple[bytes, ...]
+    look: LiveFacts | None = None
     limited: bool = False
 
     @property
@@ -60,7 +83,7 @@ class Slices(NamedTuple):
     @property
     def scene(self) -> dict[str, Any]:
         """Entry of the page's scene."""
-        return {"slices": self.facts}
+        return {"values": self.facts}
 
     @property
     def elements(self) -> dict[str, bytes]:
@@ -70,15 +93,14 @@ class Slices(NamedTuple):
     def __str__(self) -> str:
         """Describe the grids for whoever sends the page."""
         grids = [" x ".join(map(str, one["dims"])) for one in self.facts]
-        return f"slices of the volume ({', '.join(grids)} voxels{', coarser for --max-size' if self.limited else ''})"
+        return f"values of the volume ({', '.join(grids)} voxels{', coarser for --max-size' if self.limited else ''})"
 
 
-def slices_of(layers: Sequence[Layer | None], room: float | None = None) -> Slices | None:
+def values_of(layers: Sequence[Layer | None], room: float | None = None) -> Values | None:
     """Return the grids of layers, read part by part.
 
     Args:
-        layers: of each its volume, and its function or the table of a label map; None for one with colours, which has
-            no grid.
+        layers: None for one with colours, which has no grid; the look of none can be changed then.
         room: bytes that they may take on a page.
 
     Returns:
@@ -94,34 +116,43 @@ def slices_of(layers: Sequence[Layer | None], room: float | None = None) -> Slic
     return found
 
 
-def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Slices | None:
-    """Return the grids of layers, of at most so many cells together, as `slices_of` does."""
-    shown = [(number, *layer) for number, layer in enumerate(layers) if layer is not None]
-    facts, contents = [], []
-    for number, volume, look in shown:
+def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Values | None:
+    """Return the grids of layers, of at most so many cells together, as `values_of` does."""
+    shown = [(number, layer) for number, layer in enumerate(layers) if layer is not None]
+    facts, contents, looks = [], [], []
+    for number, (volume, look, distance, statistics) in shown:
         dims = coarser(volume, most // len(shown))
-        own, codes = _labels(look, volume, dims) if isinstance(look, LabelTable) else _values(volume, look, dims)
+        if isinstance(look, LabelTable):
+            own, codes, known = *_labels(look, volume, dims), OF_LABELS
+        else:
+            own, codes, known = _values(volume, look, dims)
+        name = volume.name if len(layers) > 1 else ""
+        with suppress(NoLiveForm):  # of too many labels
+            one = LiveFacts.of(volume, statistics or known, look, len(layers))
+            looks.append(replace(one, name=name, distance=distance))
         stretch = np.array(volume.dims) / dims
         affine = volume.affine[:3] @ np.vstack([np.diag([*stretch, 1.0])[:3], [0, 0, 0, 1.0]])
         affine[:, 3] += volume.affine[:3, :3] @ ((stretch - 1) / 2)  # the middle of the first cell
-        title = volume.name if len(layers) > 1 else ""
         facts.append(
             {
-                "layer": number, "title": title, "dims": list(dims), "bits": 8 * codes.itemsize,
-                "affine": affine.ravel().tolist(), "element": f"slices-{number}",
+                "layer": number, "title": name, "dims": list(dims), "bits": 8 * codes.itemsize,
+                "affine": affine.ravel().tolist(), "cell": stretch.round(1).tolist(), "element": f"{ELEMENT}-{number}",
             } | own
         )  # fmt: skip
         contents.append(packed(codes))
-    return Slices(tuple(facts), tuple(contents), limited) if facts else None
+    look = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
+    return Values(tuple(facts), tuple(contents), look, limited) if facts else None
 
 
 def _values(
-    volume: Volume, tf: TransferFunction | None, dims: tuple[int, int, int]
-) -> tuple[dict[str, Any], np.ndarray]:
-    """Return facts and codes (nz, ny, nx) of the means of values."""
+    volume: Volume, tf: TransferFunction, dims: tuple[int, int, int]
+) -> tuple[dict[str, Any], np.ndarray, Statistics]:
+    """Return facts and codes (nz, ny, nx) of the means of values, and their statistics."""
     values = averaged(volume, dims)
     known = values[np.isfinite(values)]
     lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    edges = edges_of(lo, hi)
+    statistics = Statistics(lo, hi, 0, 0, np.histogram(known, edges)[0] if lo < hi else np.zeros(BINS, np.int64), edges)
     a, b = map(float, np.percentile(known, MOST_VALUES)) if len(known) else (0.0, 0.0)
     missing = int(len(known) < values.size)
     step = max(((b - a) or (hi - lo)) / LEVELS, (hi - lo) / (CODES - 3)) or 1.0
@@ -137,7 +168,7 @@ def _values(
         "lo": lo, "step": step, "missing": missing, "level": (a + b) / 2, "window": (b - a) or step,
         "unit": unit, "ct": ct, "quantity": volume.quantity,
     }  # fmt: skip
-    return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16)
+    return facts, codes.astype(np.uint8 if codes.max(initial=0) < 256 else np.uint16), statistics
 
 
 def _labels(

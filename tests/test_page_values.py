@@ -1,4 +1,4 @@
-"""Slices of the volume on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
+"""The volume's values on its page: grids averaged and packed, in memory and in blocks, without what is cut off."""
 
 import base64
 import gzip
@@ -12,12 +12,16 @@ import numpy as np
 import pytest
 
 from vvgt_cli.field.source import SourceRequest, load
-from vvgt_cli.gaussians.formats.page_slices import packed, slices_of
+from vvgt_cli.gaussians.formats.page_values import Layer, Values, packed, values_of
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
 from vvgt_cli.volume.stored import Stored
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
+SHOWN = TransferFunction(
+    "ramp", PiecewiseOpacity(np.array([0.0, 1]), np.array([0.0, 0.5])), ColorMap(np.array([0.0]), np.ones((1, 3)))
+)
 TURNED = (0.8, -0.6, 0.0, -0.6, -0.8, 0.0, 0.0, 0.0, 1.0)  # oblique, and mirrored
 
 
@@ -34,12 +38,19 @@ def unpacked(content: bytes, facts: dict[str, Any]) -> np.ndarray:
     return np.where(codes < 0, np.nan, facts["lo"] + facts["step"] * codes)
 
 
+def grids_of(volume: Volume, look: TransferFunction | LabelTable = SHOWN) -> Values:
+    """The grid of a volume."""
+    found = values_of([Layer(volume, look, 1.0)])
+    assert found is not None
+    return found
+
+
 def grids_in(page: Path) -> list[tuple[dict[str, Any], np.ndarray]]:
     """Facts and decoded values of each grid that a page holds."""
     text = page.read_text("utf-8")
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
     found = []
-    for facts in scene.get("slices", ()):
+    for facts in scene.get("values", ()):
         content = re.search(rf'id="{facts["element"]}">([^<]+)</script>', text)[1]
         found.append((facts, unpacked(base64.b64decode(content), facts)))
     return found
@@ -109,7 +120,7 @@ def test_cells_are_nearly_cubes_and_never_smaller_than_voxels():
 @pytest.mark.parametrize("missing", [False, True])
 def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monkeypatch):
     """A field that is linear in the world, so that a cell's mean is its value in the middle."""
-    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.coarser", lambda volume, most: (11, 5, 18))
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_values.coarser", lambda volume, most: (11, 5, 18))
     volume = Volume(np.zeros((18, 20, 22)), (1.0, 1.3, 2.0), (5.0, -7.0, 30.0), TURNED, value_unit="K")
     index = np.stack(np.meshgrid(*map(np.arange, volume.dims), indexing="ij"), -1).transpose(2, 1, 0, 3)
     place = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -124,7 +135,7 @@ def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monk
         np.rint(data).astype(kind) if whole else kept, volume.spacing, volume.origin, TURNED, value_unit="K",
         slope=slope, intercept=intercept,
     )  # fmt: skip
-    [facts], [content], _ = slices_of([(volume, None)])
+    [facts], [content], *_ = grids_of(volume)
     found = unpacked(content, facts)
     assert facts["bits"] == (8 if kind is np.uint8 else 16)
     from_world = np.linalg.lstsq(np.c_[place.reshape(-1, 3), np.ones(place.size // 3)], data.ravel())[0]
@@ -138,10 +149,10 @@ def test_values_come_back_within_half_a_step_at_their_places(kind, missing, monk
 
 def test_a_volume_of_few_voxels_is_exact():
     data = np.random.default_rng(2).integers(-1024, 3000, (5, 6, 7)).astype(np.int16)
-    [facts], [content], _ = slices_of([(Volume(data, hounsfield=True, space="LPS"), None)])
+    [facts], [content], *_ = grids_of(Volume(data, hounsfield=True, space="LPS"))
     np.testing.assert_array_equal(unpacked(content, facts), data)
     assert (facts["step"], facts["unit"]) == (1, "HU")
-    flat = slices_of([(Volume(np.full((2, 2, 2), 7, np.int16)), None)])
+    flat = grids_of(Volume(np.full((2, 2, 2), 7, np.int16)))
     np.testing.assert_array_equal(unpacked(flat.contents[0], flat.facts[0]), 7)
 
 
@@ -151,7 +162,7 @@ def test_values_are_hounsfield_units_where_a_function_of_those_says_so(stretched
     data = np.full((8, 8, 8), -1000, np.int16)
     data[4:] = np.linspace(20, 60, 64).reshape(8, 8)
     source = SourceRequest(Volume(data), tf="ct-soft-tissue", tf_range="rescale" if stretched else "data")
-    found = [load(one).slices() for one in (source, replace(source, tf=None, tf_range="data"))]
+    found = [load(one).values() for one in (source, replace(source, tf=None, tf_range="data"))]
     assert [one.facts[0]["unit"] for one in found] == ["" if stretched else "HU", ""]
     assert [one.facts[0]["ct"] for one in found] == [True, True]  # windows to choose from
 
@@ -159,13 +170,13 @@ def test_values_are_hounsfield_units_where_a_function_of_those_says_so(stretched
 def test_huge_ranges_fit_into_16_bits():
     data = np.random.default_rng(3).normal(size=(20, 20, 20))
     data[0, 0, 0], data[5, 5, 5] = -1e9, 1e9
-    [facts], [content], _ = slices_of([(Volume(data), None)])
+    [facts], [content], *_ = grids_of(Volume(data))
     assert not facts["ct"]
     assert np.abs(unpacked(content, facts) - data).max() <= 0.5001 * facts["step"] < 2e4
 
 
 def test_narrow_ranges_are_no_ct():
-    [facts], *_ = slices_of([(Volume(300 + 1e-13 * np.random.default_rng(3).normal(size=(8, 8, 8))), None)])
+    [facts], *_ = grids_of(Volume(300 + 1e-13 * np.random.default_rng(3).normal(size=(8, 8, 8))))
     assert not facts["ct"]
 
 
@@ -177,11 +188,11 @@ def test_codes_are_packed_without_loss(dtype):
 
 
 def test_labels_are_sampled_and_refer_to_their_list(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_slices.MAX_CELLS", 64)
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.page_values.MAX_CELLS", 64)
     data = np.zeros((8, 8, 8), np.uint16)
     data[3:5], data[5:7], data[7:] = 7, 300, 9  # 9 is not in the table
     table = LabelTable("t", (Label(0, "air", (0, 0, 0), 0.0), Label(7, "<b>", (1, 0, 0)), Label(300, "c", (0, 1, 0))))
-    [facts], [content], _ = slices_of([(Volume(data), table)])
+    [facts], [content], *_ = grids_of(Volume(data), table)
     assert [one["name"] for one in facts["labels"]] == ["<b>", "c"]
     assert (facts["dims"], facts["bits"]) == ([4, 4, 4], 8)
     np.testing.assert_array_equal(unpacked(content, facts)[:, 0, 0], [-1, 0, 1, -1])
@@ -205,7 +216,7 @@ def scan(tmp_path):
 def test_pages_hold_what_the_conversion_shows_in_memory_and_in_blocks(vvgt, scan):
     page = scan / "page.html"
     done = vvgt.ok("convert", scan / "scan.nii.gz", "-o", page, *HOW)
-    assert "slices of the volume (14 x 16 x 18 voxels)" in done.err
+    assert "values of the volume (14 x 16 x 18 voxels)" in done.err
     [(facts, values)] = grids_in(page)
     assert (values.max(), facts["dims"]) == (999, [14, 16, 18])
     vvgt.ok("convert", scan / "scan.nii.gz", "--blocks", "16", "-o", scan / "blocks.html", *HOW)
@@ -218,12 +229,12 @@ def test_pages_hold_what_the_conversion_shows_in_memory_and_in_blocks(vvgt, scan
             assert np.nanmax(values) < 200  # nothing from outside
             assert np.isfinite(values).sum() == 8 * 10 * 12
     assert facts["affine"][3] == -3  # where it was
-    none = vvgt("convert", scan / "scan.nii.gz", "--no-slices", "-o", page, *HOW)
-    assert (none.code, grids_in(page), "slices" in none.err) == (0, [], False)
+    none = vvgt("convert", scan / "scan.nii.gz", "--no-values", "-o", page, *HOW)
+    assert (none.code, grids_in(page), "values of" in none.err) == (0, [], False)
 
 
-@pytest.mark.parametrize("form", [(), ("--live",), ("--no-live",)])
-def test_a_page_within_its_size_has_coarser_slices_before_fewer_gaussians(vvgt, tmp_path, form):
+@pytest.mark.parametrize("form", [(), ("--live",)])
+def test_a_page_within_its_size_has_coarser_values_before_fewer_gaussians(vvgt, tmp_path, form):
     noise = np.random.default_rng(0).integers(0, 4096, (64, 64, 64)).astype(np.int16)  # hardly to be packed
     noise[:, :, 32:] = 0
     np.save(tmp_path / "noise.npy", noise)
@@ -251,7 +262,7 @@ def test_a_lit_page_within_its_size_counts_its_harmonics(vvgt, tmp_path):
     done = vvgt.ok("convert", tmp_path / "ball.npy", *how, "-o", page)
     assert page.stat().st_size <= 1.5e6
     counts = {int(count.replace(",", "")) for count in re.findall(r"([\d,]+) Gaussians", done.err)}
-    assert max(counts) < 1.1 * min(counts)  # the live form has no more of them
+    assert max(counts) < 1.1 * min(counts)
 
 
 def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
@@ -262,26 +273,26 @@ def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
     assert np.isfinite(values).all()
     assert (rows >= 0).sum() == 3 * 5 * 5
     assert len(facts["labels"]) == 1
-    alone = vvgt.ok("view", scan / "labels.nii.gz", "--labels", "auto", "-o", page, "--overwrite", "--no-live")
+    alone = vvgt.ok("view", scan / "labels.nii.gz", "--labels", "auto", "-o", page, "--overwrite")
     assert "names of 1 label," in alone.err
     assert [set(np.unique(rows)) for _, rows in grids_in(page)] == [{-1, 0}]
-    assert "--no-slices" in vvgt.fails(2, "view", scan / "scan.nii.gz", "--no-slices")
+    assert "--no-values" in vvgt.fails(2, "view", scan / "scan.nii.gz", "--no-values")
     live = vvgt.ok("convert", scan / "labels.nii.gz", "--labels", "auto", "--live", "--overwrite", "-o", page, *HOW[:4])
-    assert "both.html holds Gaussians, names of 1 label," in live.err
+    assert "names of 1 label," in live.err
     two = ("--tf", "gray", "--tf", "viridis")
     vvgt.ok("convert", scan / "scan.nii.gz", *two, "-o", page, *HOW)
     assert grids_in(page) == []
 
 
-def test_results_have_slices_in_files_and_cells(scan):
+def test_results_have_values_in_files_and_cells(scan):
     import vvgt_cli as vvgt
 
     result = vvgt.convert(str(scan / "scan.nii.gz"), goal={"max_gaussians": 60, "size": 32, "steps": 0})
-    result.save(scan / "result.html", editor=False)
+    result.save(scan / "result.html")
     [(facts, values)] = grids_in(scan / "result.html")
     assert values.shape == (18, 16, 14)
     assert facts["element"] in result._repr_html_()
-    result.save(scan / "result.html", slices=False)
+    result.save(scan / "result.html", values=False)
     assert grids_in(scan / "result.html") == []
     result.save(scan / "result.html", comments=False)
     assert grids_in(scan / "result.html") == []
