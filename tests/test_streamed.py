@@ -17,8 +17,9 @@ from vvgt_cli.commands.server import Site, served
 from vvgt_cli.commands.viewer import streamed_resources
 from vvgt_cli.conversion.cut import TileGaussians
 from vvgt_cli.conversion.index import named_files
-from vvgt_cli.conversion.levels import SEEN_FROM, VIEW_PIXELS, CutErrors, WrittenFiles, divide, level_errors
-from vvgt_cli.conversion.parts import StoredGaussians, save
+from vvgt_cli.conversion.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
+from vvgt_cli.conversion.levels import WrittenFiles, divide
+from vvgt_cli.conversion.stored import StoredGaussians, save
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
@@ -248,7 +249,7 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
     line = ("init", volume, *FIT, "--blocks", "32", "-o")
     vvgt.ok(*line, whole / "lod-meta.json")
     calls = {"level_errors": 0, "images_of": 0}
-    real = {"level_errors": level_errors, "images_of": images_of}
+    real = {"level_selection.level_errors": level_errors, "levels.images_of": images_of}
     stop = {"level_errors": 20, "images_of": 0}
 
     def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -260,8 +261,8 @@ def test_an_interrupted_run_resumes_with_the_same_bytes(vvgt, volume, folder, tm
 
         return call
 
-    for name, function in real.items():
-        monkeypatch.setattr(f"vvgt_cli.conversion.levels.{name}", counted(name, function))
+    for place, function in real.items():
+        monkeypatch.setattr(f"vvgt_cli.conversion.{place}", counted(place.partition(".")[2], function))
     assert vvgt(*line, out / "lod-meta.json").code == 130
     nodes, files = len(nodes_of(read_manifest(whole / "lod-meta.json"), "")), len(list(whole.glob("*/meta.json")))
     assert nodes > 20

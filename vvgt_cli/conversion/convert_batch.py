@@ -290,8 +290,7 @@ def convert_files(
     console, output = console or Console(), request.output or ""
     several, numbered = len(functions) > 1, is_pattern(output)
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "a file each": numbered}
-    if is_page(output) and request.scored:
-        flags |= {"--no-values": not request.values}
+    flags["--no-values"] = is_page(output) and request.scored and not request.values
     used = options_in(request) | {option for option, given in flags.items() if given}
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind

@@ -14,10 +14,10 @@ from vvgt_cli.closed_form.columns import COLUMNS
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.block_store import CELLS, COARSE, ROW, RUN, TREES, BlockStore
+from vvgt_cli.field.block_store import COARSE, ROW, RUN, TREES, BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, CellGrid
-from vvgt_cli.files import atomic_write, check_disk_space
+from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.ply import as_stored
 from vvgt_cli.jit.ahead import MERGE, SHADE, for_degree
@@ -26,8 +26,7 @@ from vvgt_cli.score.record import plain
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.tree import Leaves
-    from vvgt_cli.conversion.stage import Work
-    from vvgt_cli.field.blocked import Blocked, Pass
+    from vvgt_cli.field.blocked import Pass
     from vvgt_cli.field.tiles import TiledPyramid
     from vvgt_cli.gaussians import Gaussians
     from vvgt_cli.score.record import Run
@@ -312,32 +311,3 @@ def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool,
     coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
     row, vertex = ROW + A_SCORE + A_NORMAL * lit, VERTEX_BYTES + HARMONIC_BYTES[degree]
     return int(cells * row + coarse + met * A_RAY + KEPT * min(budget, cells) * vertex)
-
-
-def make_blocks(work: Work, field: Blocked) -> None:
-    """Integrate the blocks of a field, or reuse them, and save the plan of the file beside them.
-
-    Raises:
-        MissingBlocks: blocks of other shards are missing.
-        DataError: the disk is too small.
-    """
-    from vvgt_cli.closed_form.closed_form import most_cells
-
-    run, fit, source, store = work.run, work.fit, field.source, field.run_pass.store
-    cells = field.cells(fit.size, most_cells(fit.max_gaussians, on_disk=True))
-    CutPlan(
-        cells.grid, fit.max_gaussians, fit.size, source.volume.direction, work.ply, run.report.volume,
-        run.report.transfer_function, "" if cells.rays is None else cells.rays.kind, source.labels_alone, work.degree,
-        field.reader.voxel_bytes,
-    ).save(store, cells.light)  # fmt: skip
-    rays = 0 if cells.rays is None else sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
-    need = disk_bytes(cells.grid, field.visible, fit.max_gaussians, rays, cells.light is not None, work.degree)
-    need -= store.bytes(CELLS)
-    if need > 0 and store.missing(CELLS, range(len(cells))):
-        run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
-        check_disk_space(store.folder, need)
-    with run.stage("integrate") as stage:
-        done = field.run_pass(cells, "integrate")
-        workers = field.run_pass.runner.workers
-        stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
-    field.grid = cells.grid

@@ -37,7 +37,7 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.parts import FinishedParts
+    from vvgt_cli.conversion.stored import FinishedParts
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.volume import Volume

@@ -11,7 +11,7 @@ from vvgt_cli.conversion.fitting import fit, work_of
 from vvgt_cli.conversion.gaussian_files import write_parts
 from vvgt_cli.conversion.levels import write_levels
 from vvgt_cli.conversion.opened import open_field
-from vvgt_cli.conversion.parts import FinishedParts, Levels
+from vvgt_cli.conversion.parts import choose_levels, closed_form_parts
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.stages.parts import score_parts
 from vvgt_cli.errors import UsageError
@@ -81,9 +81,9 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
             "max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up
         }  # fmt: skip
         if is_streamed(output):
-            write_levels(run, run_pass, Levels.chosen(run, run_pass, cut), output, overwrite, plan.ply)
+            write_levels(run, run_pass, choose_levels(run, run_pass, cut), output, overwrite, plan.ply)
         else:
-            parts = FinishedParts.closed_form(run, run_pass, cut)
+            parts = closed_form_parts(run, run_pass, cut)
             write_parts(run, output, parts, overwrite)
             score_parts(run, parts)
     for kind in store.folder.iterdir():

@@ -8,7 +8,7 @@ parts can be fitted in any order, by any number of workers, without an exchange.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,16 +16,17 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import RADIUS, pixel_width
 from vvgt_cli.conversion.cut import Cut, Parts, TileGaussians
-from vvgt_cli.conversion.levels import CUTS, FIELDS, NEAREST, STEP, CutErrors, errors_of
+from vvgt_cli.conversion.level_selection import CUTS, STEP, CutErrors, errors_of
+from vvgt_cli.conversion.levels import NEAREST
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, NEARLY, TOO_FAINT, thin
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, thin
 from vvgt_cli.conversion.stages.network import Network
 from vvgt_cli.conversion.stages.refinement import Refinement
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
+from vvgt_cli.conversion.stored import FinishedParts, Levels, StoredGaussians, save
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame
-from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.part import VolumePart
 from vvgt_cli.field.reader import Layers, Scalars
@@ -114,127 +115,6 @@ class PartTask:
         ]
 
 
-def save(
-    store: BlockStore, kind: str, number: int, nodes: Sequence[TileGaussians], more: dict[str, np.ndarray]
-) -> None:
-    """Save nodes of one part."""
-    arrays: dict[str, np.ndarray] = {
-        "counts": np.array([[len(level) for level in node.levels] for node in nodes]),
-        "spreads": np.array([node.spreads for node in nodes]),
-    }
-    if nodes[0].normals is not None:
-        arrays["normals"] = np.concatenate([node.normals for node in nodes])
-    for k in range(len(nodes[0].levels)):
-        whole = concatenate([node.levels[k] for node in nodes]).arrays()
-        arrays |= {f"{name}-{k}": array for name, array in whole.items()}
-    store.save(kind, number, ".npz", **(more | arrays))
-
-
-@dataclass(frozen=True)
-class StoredGaussians:
-    """The Gaussians of a cut, in the store.
-
-    Attributes:
-        store: store of the parts.
-        kind: kind of the results.
-        ends: end of each part's range of nodes.
-    """
-
-    store: BlockStore
-    kind: str
-    ends: tuple[int, ...]
-
-    def level(self, k: int, begin: int, end: int) -> Iterator[Gaussians]:
-        """Yield the Gaussians of level ``k`` of nodes ``begin`` to ``end``; raise DataError if a part is damaged."""
-        for number in range(int(np.searchsorted(self.ends, begin, "right")), len(self.ends)):
-            first = self.ends[number - 1] if number else 0
-            if first >= end:
-                return
-            names = [one for one in self.store.names(self.kind, number) if one.endswith(f"-{k}")]
-            part = self.store.load(self.kind, number, names=["counts", *names])
-            whole, counts = Gaussians(**{name.rpartition("-")[0]: part[name] for name in names}), part["counts"][:, k]
-            for row, (n, e) in enumerate(zip(counts, np.cumsum(counts), strict=True), first):
-                if begin <= row < end:
-                    yield whole.take(np.arange(e - n, e))
-
-    def parts(self) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
-        """Yield the Gaussians of the first level and their normals, None without a light, part by part."""
-        for number in range(len(self.ends)):
-            part = self.store.load(self.kind, number)
-            named = {name.removesuffix("-0"): array for name, array in part.items() if name.endswith("-0")}
-            yield Gaussians(**named), part.get("normals")
-
-    def field(self, name: str) -> np.ndarray:
-        """Return an array of all parts: "counts" or "spreads" of nodes' levels, "opacity_logits-0" of Gaussians."""
-        parts = [self.store.load(self.kind, number, names=[name])[name] for number in range(len(self.ends))]
-        return np.concatenate(parts)
-
-    def errors(self) -> CutErrors:
-        """Return the errors of refined levels."""
-        found = {name: self.field(name) for name in FIELDS}
-        return CutErrors(np.zeros(found["counts"].shape[1]), **found)
-
-
-@dataclass(frozen=True)
-class FinishedParts:
-    """The Gaussians of a cut, on disk part by part.
-
-    Attributes:
-        cut: the cut.
-        threshold: threshold of scores of its cells.
-        stored: Gaussians of cells within tiles.
-        over: Gaussians and normals of cells that stand for several tiles each; None if there are none.
-        removed: how many Gaussians fewer than the budget there are because they would be faint.
-    """
-
-    cut: Cut
-    threshold: float
-    stored: StoredGaussians
-    over: tuple[Gaussians, np.ndarray | None] | None
-    removed: int = 0
-
-    @classmethod
-    def closed_form(cls, run: Run, run_pass: Pass, cut: Cut) -> FinishedParts:
-        """Make the Gaussians of a cut's budget, or fewer where most are faint; raise DataError for damaged blocks."""
-
-        def cut_for(budget: int) -> tuple[tuple[float, StoredGaussians], int, bool]:
-            threshold = cut.pyramid.threshold(budget)
-            stored = make_parts(run, run_pass, cut, cut.everywhere(threshold), least=False)
-            logits = stored.field("opacity_logits-0")
-            return (threshold, stored), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
-
-        (threshold, stored), removed = thin(cut.plan.budget, cut_for)
-        if removed:
-            run.skip(f"{removed} Gaussians", TOO_FAINT)
-        return cls(cut, threshold, stored, cut.over_tiles(threshold), removed)
-
-    def refined(self, run: Run, run_pass: Pass, refiner: Refiner) -> FinishedParts:
-        """Return the same cut with refined Gaussians; raise DataError for damaged blocks."""
-        thresholds = self.cut.everywhere(self.threshold)
-        return replace(self, stored=make_parts(run, run_pass, self.cut, thresholds, refiner, least=False))
-
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return int(self.stored.field("counts").sum()) + (0 if self.over is None else len(self.over[0]))
-
-    def __iter__(self) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
-        """Yield Gaussians, box frame, and normals, None without a light, of each part."""
-        yield from self.stored.parts()
-        if self.over is not None:
-            yield self.over
-
-    def gathered(self) -> Gaussians:
-        """Return all Gaussians, box frame."""
-        return concatenate([gaussians for gaussians, _ in self])
-
-    def why_fewer(self) -> str:
-        """Return the reason, to end a message with, why there are fewer Gaussians than the budget, if so."""
-        budget = self.cut.plan.budget
-        if self.removed or len(self) >= NEARLY * budget:
-            return ""
-        return f", no more: {self.cut.pyramid.base} cells suffice for the screen and {budget} Gaussians"
-
-
 def make_parts(
     run: Run, run_pass: Pass, cut: Cut, thresholds: np.ndarray, refiner: Refiner | None = None, least: bool = True
 ) -> StoredGaussians:
@@ -290,55 +170,57 @@ def measured_cuts(run_pass: Pass, cut: Cut, budget: int) -> tuple[CutErrors, int
     return replace(stored.errors(), thresholds=values), int(stored.field("faint").sum())
 
 
-@dataclass(frozen=True)
-class Levels:
-    """The levels of every tile, on disk part by part.
+def closed_form_parts(run: Run, run_pass: Pass, cut: Cut) -> FinishedParts:
+    """Make the Gaussians of a cut's budget, or fewer where most are faint; raise DataError for damaged blocks."""
 
-    Attributes:
-        cut: the pyramid that they are cut from.
-        stored: their Gaussians.
-        errors: errors of the cuts that they were chosen from, or their own where they are refined.
-        choices: (tiles, levels) columns of ``errors``.
-        removed: how many Gaussians fewer than the budget the finest has because they would be faint.
+    def cut_for(budget: int) -> tuple[tuple[float, StoredGaussians], int, bool]:
+        threshold = cut.pyramid.threshold(budget)
+        stored = make_parts(run, run_pass, cut, cut.everywhere(threshold), least=False)
+        logits = stored.field("opacity_logits-0")
+        return (threshold, stored), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
+
+    (threshold, stored), removed = thin(cut.plan.budget, cut_for)
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
+    return FinishedParts(cut, threshold, stored, cut.over_tiles(threshold), removed)
+
+
+def refined_parts(run: Run, run_pass: Pass, parts: FinishedParts, refiner: Refiner) -> FinishedParts:
+    """Return the same cut with refined Gaussians; raise DataError for damaged blocks."""
+    thresholds = parts.cut.everywhere(parts.threshold)
+    return replace(parts, stored=make_parts(run, run_pass, parts.cut, thresholds, refiner, least=False))
+
+
+def choose_levels(run: Run, run_pass: Pass, cut: Cut, refiner: Callable[[], Refiner | None] = lambda: None) -> Levels:
+    """Choose levels by measured errors, and make them; results of an interrupted run are reused.
+
+    Args:
+        run: gets the stages.
+        run_pass: runs passes over the blocks of the cut.
+        cut: pyramid to take the levels from.
+        refiner: returns what refines the levels, each at the distance at which it is shown, or None.
+
+    Raises:
+        DataError: a block is damaged.
     """
 
-    cut: Cut
-    stored: StoredGaussians
-    errors: CutErrors
-    choices: np.ndarray
-    removed: int = 0
+    def cut_for(budget: int) -> tuple[CutErrors, int, bool]:
+        errors, faint = measured_cuts(run_pass, cut, budget)
+        count = int(errors.counts[:, 0].sum())
+        return errors, count, 2 * faint > count
 
-    @classmethod
-    def chosen(cls, run: Run, run_pass: Pass, cut: Cut, refiner: Callable[[], Refiner | None] = lambda: None) -> Levels:
-        """Choose levels by measured errors, and make them; results of an interrupted run are reused.
-
-        Args:
-            run: gets the stages.
-            run_pass: runs passes over the blocks of the cut.
-            cut: pyramid to take the levels from.
-            refiner: returns what refines the levels, each at the distance at which it is shown, or None.
-
-        Raises:
-            DataError: a block is damaged.
-        """
-
-        def cut_for(budget: int) -> tuple[CutErrors, int, bool]:
-            errors, faint = measured_cuts(run_pass, cut, budget)
-            count = int(errors.counts[:, 0].sum())
-            return errors, count, 2 * faint > count
-
-        with run.stage("errors") as stage:
-            errors, removed = thin(cut.plan.budget, cut_for)
-            choices = np.stack(errors.levels(removed), axis=1)
-            stage.note = f"{choices.shape[1]} levels of {len(cut.pyramid)} nodes"
-        if removed:
-            run.skip(f"{removed} Gaussians", TOO_FAINT)
-        if (refine := refiner()) is not None:
-            refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
-        stored = make_parts(run, run_pass, cut, errors.thresholds[choices], refine)
-        if refine is not None:
-            errors, choices = stored.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
-        return cls(cut, stored, errors, choices, removed)
+    with run.stage("errors") as stage:
+        errors, removed = thin(cut.plan.budget, cut_for)
+        choices = np.stack(errors.levels(removed), axis=1)
+        stage.note = f"{choices.shape[1]} levels of {len(cut.pyramid)} nodes"
+    if removed:
+        run.skip(f"{removed} Gaussians", TOO_FAINT)
+    if (refine := refiner()) is not None:
+        refine = replace(refine, distances=tuple(NEAREST * 3 ** (k - 0.5) for k in range(choices.shape[1])))
+    stored = make_parts(run, run_pass, cut, errors.thresholds[choices], refine)
+    if refine is not None:
+        errors, choices = stored.errors(), np.tile(np.arange(choices.shape[1]), (len(choices), 1))
+    return Levels(cut, stored, errors, choices, removed)
 
 
 PIXEL = 2.0  # width of a pixel of the training views, in median standard deviations of the middle axis

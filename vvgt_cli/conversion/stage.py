@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from vvgt_cli.cameras import Camera
     from vvgt_cli.closed_form import Start
-    from vvgt_cli.conversion.parts import FinishedParts, Levels
+    from vvgt_cli.conversion.stored import FinishedParts, Levels
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
 

@@ -21,7 +21,6 @@ SECONDS = 0.4, 0.62, 0.03, 2.8  # fixed, per 10^6 cells, per 10^6 voxels of non-
 MEMORY = 294.0, 1240.0  # bytes per cell, and per Gaussian (with what later stages keep of it)
 FAINT = 0.02  # opacity
 FAINT_LOGIT = math.log(FAINT / (1 - FAINT))
-NEARLY = 0.99  # share of the budget: cells are split by eights, so that a few are always missing
 FEWEST = 5000  # Gaussians that faint volumes keep at least
 TOO_FAINT = "so faint that viewers differ in what they draw of them"
 T = TypeVar("T")
@@ -49,7 +48,7 @@ class ClosedFormStage(Stage):
     def run(self, work: Work) -> None:
         """Make the Gaussians, or load them from the checkpoint, without the pyramid; raise NothingVisible for none."""
         from vvgt_cli.closed_form import Start, VbmOptions
-        from vvgt_cli.closed_form.closed_form import bound
+        from vvgt_cli.closed_form.closed_form import NEARLY, bound
 
         run, fit, source = work.run, work.fit, work.field.source
         whole = self.recut or (self.recut_by_error and work.checkpoint.load(CELLS) is None)

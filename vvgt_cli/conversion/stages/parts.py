@@ -10,24 +10,27 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.conversion.cut import CutPlan, cut_of, disk_bytes
+from vvgt_cli.conversion.parts import Refiner, choose_levels, closed_form_parts, refined_parts
 from vvgt_cli.conversion.request import Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
 from vvgt_cli.conversion.stages.refinement import HARMONICS, steps_in_time
+from vvgt_cli.conversion.stored import FinishedParts
+from vvgt_cli.field.block_store import CELLS
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.field.settings import MANY
 from vvgt_cli.field.workload import Workload, pace
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, check_disk_space
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.parts import FinishedParts, Refiner
     from vvgt_cli.score.record import Run
 
 A_STEP, A_WRITE = 5e-7, 2e-5  # seconds a Gaussian: of a step with its share of views, and of the file
@@ -66,9 +69,6 @@ class OutOfCore(Stage):
 
     def run(self, work: Work) -> None:
         """Make the Gaussians; raise MissingBlocks if blocks of other shards are missing."""
-        from vvgt_cli.conversion.cut import cut_of, make_blocks
-        from vvgt_cli.conversion.parts import FinishedParts, Levels
-
         run, field = work.run, work.field
         assert isinstance(field, Blocked)
         if self.together and self.steps:
@@ -80,19 +80,17 @@ class OutOfCore(Stage):
             return
         cut = cut_of(run, field.run_pass)
         if self.levels:
-            work.levels = Levels.chosen(run, field.run_pass, cut, partial(self._refiner, work, field))
+            work.levels = choose_levels(run, field.run_pass, cut, partial(self._refiner, work, field))
             return
-        made = FinishedParts.closed_form(run, field.run_pass, cut)
+        made = closed_form_parts(run, field.run_pass, cut)
         if (refiner := self._refiner(work, field)) is not None:
-            made = made.refined(run, field.run_pass, refiner)
+            made = refined_parts(run, field.run_pass, made, refiner)
         work.parts = made
         if self.together:
             work.gaussians = made.gathered()
 
     def _refiner(self, work: Work, field: Blocked) -> Refiner | None:
         """Return what refines parts by as many steps as there is time for, and a network; None for neither."""
-        from vvgt_cli.conversion.parts import Refiner
-
         fit, limits, steps, run = work.fit, work.limits, self.steps, work.run
         chosen = field.run_pass.store.folder / f"steps-{digest(steps, limits.time_budget)[:16]}"
         if chosen.is_file():
@@ -112,6 +110,35 @@ class OutOfCore(Stage):
             run.console.message("steps on parts are taken on the CPU: their pixels have weights, which a GPU ignores")
         run.compile(for_degree(OPTIMIZE, work.degree))
         return Refiner(field.reader, field.light, replace(fit, steps=steps, device="cpu"), Limits(limits.target_psnr))
+
+
+def make_blocks(work: Work, field: Blocked) -> None:
+    """Integrate the blocks of a field, or reuse them, and save the plan of the file beside them.
+
+    Raises:
+        MissingBlocks: blocks of other shards are missing.
+        DataError: the disk is too small.
+    """
+    from vvgt_cli.closed_form.closed_form import most_cells
+
+    run, fit, source, store = work.run, work.fit, field.source, field.run_pass.store
+    cells = field.cells(fit.size, most_cells(fit.max_gaussians, on_disk=True))
+    CutPlan(
+        cells.grid, fit.max_gaussians, fit.size, source.volume.direction, work.ply, run.report.volume,
+        run.report.transfer_function, "" if cells.rays is None else cells.rays.kind, source.labels_alone, work.degree,
+        field.reader.voxel_bytes,
+    ).save(store, cells.light)  # fmt: skip
+    rays = 0 if cells.rays is None else sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
+    need = disk_bytes(cells.grid, field.visible, fit.max_gaussians, rays, cells.light is not None, work.degree)
+    need -= store.bytes(CELLS)
+    if need > 0 and store.missing(CELLS, range(len(cells))):
+        run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {store.folder}")
+        check_disk_space(store.folder, need)
+    with run.stage("integrate") as stage:
+        done = field.run_pass(cells, "integrate")
+        workers = field.run_pass.runner.workers
+        stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
+    field.grid = cells.grid
 
 
 @dataclass(frozen=True)
