@@ -221,7 +221,8 @@ class Memory:
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item, release its volume, and return the report."""
-        found = convert(item.request, console, start=batch.previous, finished=item.gaussians)
+        alone = replace(item.request, output=None, report=None, preview=None)
+        found = convert(alone, console, start=batch.previous, finished=item.gaussians)
         normals, own = found.normals(), found.field.source.volume.unit_frame()
         gaussians, ply, self._first = found.gaussians, found.ply, self._first or (own, found.ply)
         if own != self._first[0]:  # another layer's
