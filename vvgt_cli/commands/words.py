@@ -79,7 +79,7 @@ def _is_number(text: str) -> bool:
 
 ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("output", "overwrite", "report", "preview", "checkpoint", "quiet"),
-    *("threads", "memory", "workers", "scheduler", "block_size"),
+    *("threads", "memory", "workers", "scheduler", "block_size", "shard"),
 }
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
 _SETTINGS = re.compile(r",(?=[a-z]+=)")  # of a layer, FILE,tf=TF (`vvgt_cli.field.source.parse_layer`)

@@ -164,7 +164,7 @@ class Clouds(Mapping[str, Result]):
 
         Args:
             look: file, colour map's name, or a function; None: their own.
-            **how: range, unit_distance, labels and light; see `Result.recolor`.
+            **how: tf_range, opacity_unit_distance, labels and light; see `Result.recolor`.
 
         Raises:
             DataError, UsageError: see `Result.recolor`.
