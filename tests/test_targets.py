@@ -154,7 +154,6 @@ def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
     ("output", "options", "why"),
     [
         ("a.usdz", (), "no program there opens it; expected .html"),
-        ("folder/lod-meta.json", (), "--for with streamed levels"),
         ("a.glb", ("--tf", "viridis", "--tf", "magma"), "all nodes are drawn together"),
     ],
 )
