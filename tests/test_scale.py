@@ -305,3 +305,9 @@ def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeyp
         else:
             with pytest.raises(UsageError, match="MiB more"):
                 block_edge(volume, BlockOptions(), voxel)
+
+
+def test_parts_are_written_once_to_standard_output_too(vvgt, raw, tmp_path):
+    line = ("init", raw, "--max-gaussians", "500", "--size", "64", "--blocks", "32", "-q", "-o")
+    vvgt.ok(*line, tmp_path / "a.ply")
+    assert vvgt.ok(*line, "-").out == (tmp_path / "a.ply").read_bytes()

@@ -74,9 +74,10 @@ def convert_field(
         work.seen = conversion.seen = levels_in_box(str(request.output), field.source.volume)
     for stage in scores:
         stage.run(work)
-    conversion.ply = with_certificate(
-        conversion.ply, run, field, work.fit, conversion.gaussians, request.command, work.live_psnr
-    )
+    if work.parts is None or work.gaussians is not None:  # else their file is not written again, for a certificate
+        conversion.ply = with_certificate(
+            conversion.ply, run, field, work.fit, conversion.gaussians, request.command, work.live_psnr
+        )
     if request.output is not None:
         if conversion.ply.certificate is not None or not early:
             write(run, request, work, conversion, again=early)
