@@ -115,11 +115,13 @@ def test_keys_alone_measure(marked: str, person: Person) -> None:
     person("press", "Tab")
     person("press", "m")
     person("press", "Enter")
+    person("until", "window.vvgt.where.clicked")
     begin = person("eval", "window.vvgt.where.clicked.world")
     for _ in range(2):
         person("press", "Shift+ArrowRight")
     person("settled")
     person("press", "Enter")
+    person("until", f"window.vvgt.where.clicked.world.join() !== '{','.join(map(repr, begin))}'")
     end = person("eval", "window.vvgt.where.clicked.world")
     assert begin != end
     [told] = person("eval", LIST)

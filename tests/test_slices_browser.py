@@ -67,7 +67,7 @@ def test_values_and_greys_are_those_of_the_file(marked: str, person: Person, tmp
     """At 20 places of each slice, of a volume that is mirrored and oblique."""
     scan, rng = scan_of(marked), np.random.default_rng(1)
     rects = opened(person, marked)
-    assert "slices of the volume" in person("eval", "document.querySelector('#about').textContent")
+    assert "values of the volume" in person("eval", "document.querySelector('#about').textContent")
     middle = np.array(scan.data.shape) // 2
     person("click", *scan.pixel(0, middle, rects[0]))
     person("click", *scan.pixel(1, middle, rects[1]))
