@@ -317,12 +317,9 @@ def _number_or(word: str, number: str) -> Callable[[click.Context, click.Paramet
 
 
 def _shard(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    index, _, count = value.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
-        raise click.BadParameter(f"{value!r}; expected I/N with I from 1 to N, as 3/8")
-    return int(index), int(count)
+    from vvgt_cli.conversion.manifest import parse_shard
+
+    return None if value is None else (parse_shard(value).index, parse_shard(value).count)
 
 
 _options = {

@@ -43,7 +43,7 @@ def ply_options(request: ConvertRequest, source: StyledVolume) -> PlyOptions:
         screen_size=request.fit.screen,
         rule=request.fit.rule,
         light=source.lighting,
-        function=source.name if len(source.layers) > 1 else source.tf.name,
+        function=source.look_name,
         optics=source.optics(),
         legend=_legend(source),
         title=request.title or _example(request) or source.title,

@@ -192,10 +192,8 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
         overwrite: replace an existing page.
 
     Raises:
-        DataError: a file does not hold Gaussians, or there is no file.
+        DataError: a file does not hold Gaussians.
     """
-    if not clouds:
-        raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
     with run.stage("write") as stage:
         shown: list[tuple[str, Gaussians, PlyOptions]] = []
         rules = set[str]()

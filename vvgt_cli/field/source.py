@@ -168,6 +168,11 @@ class StyledVolume:
         return " + ".join(layer.name for layer in self.layers) if self.gridded else self.tf.name
 
     @property
+    def look_name(self) -> str:
+        """Name of the function of one layer, or the names of several."""
+        return self.name if len(self.layers) > 1 else self.tf.name
+
+    @property
     def labels_alone(self) -> bool:
         """Whether every layer is a label map."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
@@ -393,8 +398,7 @@ def describe_source(source: StyledVolume) -> str:
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
     light += " (its own; --light none omits it)" if light and source.lighting == source.tf.lighting else ""
-    name = source.name if len(source.layers) > 1 else source.tf.name
-    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.look_name}: {distance}{light}"
 
 
 def volume_record(source: StyledVolume) -> dict[str, Any]:
@@ -415,7 +419,7 @@ def volume_record(source: StyledVolume) -> dict[str, Any]:
 def tf_record(source: StyledVolume, request: SourceRequest) -> dict[str, Any]:
     """Return the transfer function's entry in a report."""
     return {
-        "name": source.name if len(source.layers) > 1 else source.tf.name,
+        "name": source.look_name,
         "given": request.tf is not None,
         "tf_range": request.tf_range,
         "nodes": source.tf.node_range(),
