@@ -29,6 +29,7 @@ from vvgt_cli.progress import Console
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @shared.title_option
+@shared.story_option
 @shared.overwrite_option
 @shared.rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
@@ -60,7 +61,7 @@ from vvgt_cli.progress import Console
 @shared.common_options
 def command(
     volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool, values: bool,
-    title: str | None, console: Console, blocks: dict[str, Any], **options: Any,
+    title: str | None, story: str | None, console: Console, blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
@@ -89,6 +90,7 @@ def command(
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{step}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert four.nii -o four.html
+      vvgt convert head.nrrd --story story.json -o lesson.html
       vvgt convert cells.ome.tif --channel DAPI,GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
       vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb
@@ -97,6 +99,7 @@ def command(
     from vvgt_cli.conversion.convert_batch import convert_files
     from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.gaussians.story import read_story
 
     given = {parameter.name for parameter in typed(click.get_current_context())}
     options["fit"]["rule"] = options.pop("rule")
@@ -108,7 +111,7 @@ def command(
         raise UsageError(f"--no-values is for a page; got -o {request.output}; expected -o OUT.html")
     request = replace(
         request, blocks=shared.block_options_of(blocks), live=live, values=values,
-        command=line, title=title,
+        command=line, title=title, story=read_story(story) if story else None,
     )  # fmt: skip
     plan = convert_files(
         request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console
