@@ -68,7 +68,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         if name in stories:
             (folder / "story.json").write_text(json.dumps({"steps": stories[name]}))
             how += ["--story", str(folder / "story.json")]
-        how += ["--max-gaussians", "500", "--size", "64", "--steps", "0", "--quiet", "-o", str(folder / f"{name}.html")]
+        how += [
+            "--max-gaussians",
+            "500",
+            "--screen",
+            "64",
+            "--steps",
+            "0",
+            "--quiet",
+            "-o",
+            str(folder / f"{name}.html"),
+        ]
         assert run(["convert", str(folder / source), *how]) == 0
         found[name] = (folder / f"{name}.html").as_uri()
     return found
@@ -213,7 +223,7 @@ def test_a_reader_writes_one(pages: dict[str, str], person: Person, tmp_path: Pa
     assert person("eval", STEPS) == ["a note"]
     volume, page = str(tmp_path / "v.npy"), tmp_path / "told.html"
     np.save(volume, np.random.default_rng(1).uniform(size=(8, 8, 8)).astype(np.float32))
-    how = ["--max-gaussians", "50", "--size", "32", "--steps", "0", "--quiet", "--story", str(story), "-o", str(page)]
+    how = ["--max-gaussians", "50", "--screen", "32", "--steps", "0", "--quiet", "--story", str(story), "-o", str(page)]
     assert run(["convert", volume, *how]) == 0
     assert '"text": "yx!"' in page.read_text("utf-8")
 

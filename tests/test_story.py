@@ -16,7 +16,7 @@ from vvgt_cli.gaussians.story import KEYS, LONG, MOST, read_story
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 
-HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0")
+HOW = ("--max-gaussians", "60", "--screen", "32", "--steps", "0")
 VALUES = Layer(Volume(np.zeros((4, 4, 4), np.uint8), spacing=(2.0, 2.0, 2.0), origin=(10.0, 0.0, 0.0)), RAMP, 0.5)
 TABLE = LabelTable("t", (Label(1, "liver", (1.0, 0.0, 0.0), 1.0), Label(7, "spleen", (0.0, 0.0, 1.0), 1.0)))
 LABELS = VALUES._replace(look=TABLE)
@@ -175,7 +175,7 @@ def test_python_takes_it_too(tmp_path: Path) -> None:
     import vvgt_cli
 
     x, y, z = np.mgrid[-1:1:10j, -1:1:10j, -1:1:10j]
-    result = vvgt_cli.convert(np.exp(-(x**2 + y**2 + z**2)), goal={"max_gaussians": 40, "size": 32, "steps": 0})
+    result = vvgt_cli.convert(np.exp(-(x**2 + y**2 + z**2)), max_gaussians=40, screen=32, steps=0)
     result.save(tmp_path / "a.html", story={"steps": [{"text": "first", "cut": PLANE}]})
     assert scene(tmp_path / "a.html")["story"] == [{"text": "first", "cut": PLANE}]
     with pytest.raises(DataError, match="needs a page with values"):
