@@ -44,7 +44,7 @@ def test_a_step_keeps_what_the_one_before_it_states() -> None:
         ({"text": 5}, ("text 5",)),
         ({"text": "a" * (LONG + 1)}, (f"at most {LONG}", "try two steps")),
         ({"titel": "x"}, ("unknown key 'titel'", ", ".join(KEYS))),
-        ({"camera": "above"}, ("camera 'above'", "front, back")),
+        ({"camera": "above"}, ("camera: got 'above'", "front, back")),
         ({"camera": {"pitch": math.nan}}, ("camera.pitch", "got nan", "finite")),
         ({"camera": {"pitch": 91}}, ("camera.pitch: 91", "-90 to 90")),
         ({"camera": {"distance": 0}}, ("camera.distance: 0", "or more")),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -26,7 +26,7 @@ MOST, LONG = 100, 2000  # steps; letters of a text, as in page/story.mjs
 SIDES = ("front", "back", "left", "right", "top", "bottom", "fit", "reset")
 LOOK = ("cut", "function", "labels", "layer", "light", "slices")  # what needs the volume's values
 KEYS = ("text", "camera", *LOOK, "frame", "link")
-_RGB = "three numbers from 0 to 1"
+Check: TypeAlias = Callable[[Any, str], None]
 StoryLike: TypeAlias = "str | os.PathLike[str] | Mapping[str, Any]"
 
 
@@ -99,6 +99,11 @@ def read_story(given: StoryLike) -> Story:
     return Story(what, tuple(found))
 
 
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def _known(value: Any, keys: Collection[str], where: str) -> Mapping[str, Any]:
     """Return an object that has some of the keys and no others."""
     if not isinstance(value, Mapping):
@@ -106,45 +111,6 @@ def _known(value: Any, keys: Collection[str], where: str) -> Mapping[str, Any]:
     if unknown := [key for key in value if key not in keys]:
         raise DataError(f"{where}: unknown key {unknown[0]!r}; expected {', '.join(keys)}")
     return value
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _number(value: Any, where: str, lo: float = -math.inf, hi: float = math.inf, why: str = "") -> float:
-    """Return a finite number within limits."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(f"{where}: got {_short(value)}; expected a finite number")
-    if not lo <= value <= hi:
-        limits = f"{lo:g} to {hi:g}" if hi < math.inf else f"{lo:g} or more"
-        raise DataError(f"{where}: {value:g}{why}; expected {limits}")
-    return value
-
-
-def _numbers(value: Any, count: int, where: str, lo: float = -math.inf, hi: float = math.inf, why: str = "") -> None:
-    """Check a list of finite numbers within limits."""
-    if not isinstance(value, list | tuple) or len(value) != count:
-        raise DataError(f"{where}: got {_short(value)}; expected {count} numbers")
-    for one in value:
-        _number(one, where, lo, hi, why)
-
-
-def _direction(value: Any, where: str) -> None:
-    _numbers(value, 3, where)
-    if not any(value):
-        raise DataError(f"{where}: is 0; expected a direction of the world")
-
-
-def _flag(value: Any, where: str) -> None:
-    if not isinstance(value, bool):
-        raise DataError(f"{where}: got {_short(value)}; expected true or false")
-
-
-def _whole(value: Any, where: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise DataError(f"{where}: got {_short(value)}; expected a whole number from 0")
 
 
 def _check(step: Any, where: str) -> None:
@@ -162,37 +128,80 @@ def _check(step: Any, where: str) -> None:
             check(step[key], f"{where}: {key}")
 
 
-def _camera(value: Any, where: str) -> None:
-    if isinstance(value, str):
-        if value not in SIDES:
-            raise DataError(f"{where} {value!r}; expected one of {', '.join(SIDES)}, or an object")
-        return
-    keys = {"target": lambda x, w: _numbers(x, 3, w), "pitch": lambda x, w: _number(x, w, -90, 90), "yaw": _number}
-    keys |= {"distance": lambda x, w: _number(x, w, 1e-6), "orthographic": _flag}
-    _fields(value, keys, where)
+def _number(lo: float = -math.inf, hi: float = math.inf, why: str = "") -> Check:
+    """Return a check of a finite number within limits."""
 
-
-def _fields(value: Any, checks: Mapping[str, Any], where: str) -> None:
-    """Check an object by a check of each field."""
-    for key, one in _known(value, checks, where).items():
-        checks[key](one, f"{where}.{key}")
-
-
-def _kind(*kinds: str) -> Any:
     def check(value: Any, where: str) -> None:
-        if value not in kinds:
-            raise DataError(f"{where}: got {_short(value)}; expected one of {', '.join(kinds)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise DataError(f"{where}: got {_short(value)}; expected a finite number")
+        if not lo <= value <= hi:
+            limits = f"{lo:g} to {hi:g}" if hi < math.inf else f"{lo:g} or more"
+            raise DataError(f"{where}: {value:g}{why}; expected {limits}")
 
     return check
 
 
+def _numbers(count: int, one: Check | None = None, nonzero: bool = False) -> Check:
+    """Return a check of a list of numbers."""
+
+    def check(value: Any, where: str) -> None:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise DataError(f"{where}: got {_short(value)}; expected {count} numbers")
+        for number in value:
+            (one or _number())(number, where)
+        if nonzero and not any(value):
+            raise DataError(f"{where}: is 0; expected a direction of the world")
+
+    return check
+
+
+def _is(right: Callable[[Any], bool], expected: str) -> Check:
+    """Return a check of a condition."""
+
+    def check(value: Any, where: str) -> None:
+        if not right(value):
+            raise DataError(f"{where}: got {_short(value)}; expected {expected}")
+
+    return check
+
+
+def _fields(**checks: Check) -> Check:
+    """Return a check of an object."""
+
+    def check(value: Any, where: str) -> None:
+        for key, one in _known(value, checks, where).items():
+            checks[key](one, f"{where}.{key}")
+
+    return check
+
+
+def _among(*known: str) -> Check:
+    return _is(lambda value: value in known, f"one of {', '.join(known)}")
+
+
+WHOLE = _is(lambda x: isinstance(x, int) and not isinstance(x, bool) and x >= 0, "a whole number from 0")
+FLAG = _is(lambda value: isinstance(value, bool), "true or false")
+SHARE, WITHIN, LIGHT = _number(0, 1), _number(0, 1, ", outside the volume"), _number(0, MAX_LIGHT)
+DIRECTION = _numbers(3, nonzero=True)
+CAMERA = _fields(
+    target=_numbers(3), pitch=_number(-90, 90), yaw=_number(), distance=_number(1e-6), orthographic=FLAG
+)  # fmt: skip
+CUT = _fields(
+    kind=_among("none", "plane", "box"), normal=DIRECTION, at=WITHIN, flipped=FLAG, box=_numbers(6, WITHIN)
+)  # fmt: skip
+LABEL = _fields(
+    name=_is(lambda x: isinstance(x, str), "a text"), number=WHOLE, opacity=SHARE, color=_numbers(3, SHARE)
+)  # fmt: skip
+SLICES = _fields(at=_numbers(3), window=_number(1e-30), level=_number(), on_cut=FLAG)
+
+
+def _camera(value: Any, where: str) -> None:
+    (_among(*SIDES) if isinstance(value, str) else CAMERA)(value, where)
+
+
 def _cut(value: Any, where: str) -> None:
-    outside = ", outside the volume"
-    _fields(value, {
-        "kind": _kind("none", "plane", "box"), "normal": _direction, "flipped": _flag,
-        "at": lambda x, w: _number(x, w, 0, 1, outside), "box": lambda x, w: _numbers(x, 6, w, 0, 1, outside),
-    }, where)  # fmt: skip
-    needed = {"plane": "normal", "box": "box", "none": "kind"}.get(value.get("kind"), "kind")
+    CUT(value, where)
+    needed = {"plane": "normal", "box": "box"}.get(value.get("kind"), "kind")
     if needed not in value:
         raise DataError(f"{where}: no {needed}; expected kind none, plane with normal and at, or box with box")
     box = value.get("box", ())
@@ -201,48 +210,32 @@ def _cut(value: Any, where: str) -> None:
 
 
 def _function(value: Any, where: str) -> None:
-    if not isinstance(value, str):
-        points = _known(value, ("name", "points", "opacity_unit_distance"), where).get("points")
-        if not isinstance(points, list) or len(points) < 2:
-            raise DataError(f"{where}: expected a name, or points as in the tf.json that a page saves")
-        for point in points:
-            if not isinstance(point, Mapping) or set(point) != {"x", "opacity", "rgb"}:
-                raise DataError(f"{where}: point {_short(point)}; expected x, opacity and rgb")
-            _number(point["x"], f"{where}: x")
-        read(dict(value), where)
+    if isinstance(value, str):
+        return
+    points = _known(value, ("name", "points", "opacity_unit_distance"), where).get("points")
+    _is(lambda x: isinstance(x, list) and len(x) > 1, "a name, or points as in the tf.json of a page")(points, where)
+    for point in points:
+        _is(lambda x: isinstance(x, dict) and set(x) == {"x", "opacity", "rgb"}, "x, opacity and rgb")(point, where)
+        _number()(point["x"], f"{where}: x")
+    read(dict(value), where)
 
 
 def _labels(value: Any, where: str) -> None:
-    if not isinstance(value, list) or not value:
-        raise DataError(f"{where}: got {_short(value)}; expected a list of labels, by name or number")
+    _is(lambda x: isinstance(x, list) and len(x) > 0, "a list of labels, by name or number")(value, where)
     for one in value:
-        _fields(one, {
-            "name": lambda x, w: None, "number": _whole, "opacity": lambda x, w: _number(x, w, 0, 1),
-            "color": lambda x, w: _numbers(x, 3, w, 0, 1),
-        }, where)  # fmt: skip
+        LABEL(one, where)
         if ("name" in one) == ("number" in one):
             raise DataError(f"{where}: {_short(one)}; expected a name or a number, and opacity (0 hides) or color")
 
 
-def _light(value: Any, where: str) -> None:
-    shares = dict.fromkeys(("ambient", "diffuse", "specular"), lambda x, w: _number(x, w, 0, MAX_LIGHT))
-    _fields(value, {"kind": _kind("none", "headlight", "direction"), "from": _direction, **shares}, where)
-
-
-def _slices(value: Any, where: str) -> None:
-    if value is not True:
-        keys = {"at": lambda x, w: _numbers(x, 3, w), "window": lambda x, w: _number(x, w, 1e-30), "level": _number}
-        _fields(value, keys | {"on_cut": _flag}, where)
-
-
-def _link(value: Any, where: str) -> None:
-    if not isinstance(value, str) or "view=" not in value:
-        raise DataError(f"{where}: got {_short(value)}; expected what follows # in a link that a page copies")
-
-
-CHECKS = {
-    "camera": _camera, "cut": _cut, "function": _function, "labels": _labels, "layer": _whole, "light": _light,
-    "slices": _slices, "frame": _whole, "link": _link,
+CHECKS: dict[str, Check] = {
+    "camera": _camera, "cut": _cut, "function": _function, "labels": _labels, "layer": WHOLE, "frame": WHOLE,
+    "light": _fields(**{
+        "kind": _among("none", "headlight", "direction"), "from": DIRECTION, "ambient": LIGHT, "diffuse": LIGHT,
+        "specular": LIGHT,
+    }),
+    "slices": lambda value, where: None if value is True else SLICES(value, where),
+    "link": _is(lambda x: isinstance(x, str) and "view=" in x, "what follows # in a link that a page copies"),
 }  # fmt: skip
 
 

@@ -7,8 +7,19 @@ import { save } from './shot.mjs';
 const MOST = 100, LONG = 2000;  // steps; letters of a text
 const GLIDE = 900, SWIPE = 40;  // milliseconds from view to view; px
 const HTML = `<button class="back" aria-label="previous step" title="previous step (Page Up)">‹</button><div aria-live="polite" aria-atomic="true"><span></span><p></p></div><button class="next" aria-label="next step" title="next step (Page Down)">›</button>`;
-const WRITE = `<p>A step is what is seen now, with a text.</p><ol></ol><div role="group" aria-label="story"><button class="add">add a step</button><button class="save" title="save this page as it is now, with its story" hidden>save page</button><button class="json" title="save the story for --story">story.json</button></div>`;
+const WRITE = `<p>A step is what is seen now, with a text.</p><ol></ol><div role="group" aria-label="the whole story"><button class="add">add a step</button><button class="save" title="save this page as it is now, with its story" hidden>save page</button><button class="json" title="save the story for --story">story.json</button></div>`;
 const still = matchMedia('(prefers-reduced-motion: reduce)'), numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
+
+// of the parts that a link has: what a step says of them
+function texts({ link, frame, camera } = {}) {
+  try {
+    return link ? partsOf(link) : new Map([['frame', frame ? String(frame) : ''], ['projection', camera?.orthographic ? 'orthographic' : '']]);
+  } catch { return new Map(); }  // damaged: as the page begins
+}
+
+function marksIn(text) {
+  try { return JSON.parse(text || '[]'); } catch { return []; }
+}
 
 // the camera from one pose to another; ends early when somebody else moves it, or going() ends
 function glide(lens, from, to, going, moving) {
@@ -29,24 +40,18 @@ function glide(lens, from, to, going, moving) {
 
 // seen: the parts of links; apply(what): of messages; slices: of where.mjs, or null; begins: steps of the file; moving(text): draws again, with a line that says something; page(): saves it, or null
 export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], page }) {
-  const root = Object.assign(document.createElement('section'), { id: 'story', hidden: true, innerHTML: HTML }), write = listed('steps', 'Story');
+  const root = Object.assign(document.createElement('section'), { id: 'story', hidden: true, innerHTML: HTML }), write = listed('steps', 'Write a story');
   root.setAttribute('aria-label', 'story');
   write.root.lastChild.innerHTML = WRITE;
   document.body.append(root, write.root);
   const find = (selector) => write.root.querySelector(selector), [back, said, next] = root.children, rows = find('ol'), marks = seen.find(({ key }) => key === 'marks');
-  let list = begins, now = -1, turn = 0, placed = '[]';
+  let list = begins, now = -1, turn = 0;
 
-  // rulers and notes that no step has brought
+  // rulers and notes that the step has not brought
   const own = () => {
-    const known = JSON.parse(placed).map((one) => JSON.stringify(one));
-    return JSON.parse(decodeURIComponent(marks.get()) || '[]').filter((one) => !known.includes(JSON.stringify(one)));
+    const brought = marksIn(texts(list[now]).get('marks')).map((one) => JSON.stringify(one));
+    return marksIn(decodeURIComponent(marks.get())).filter((one) => !brought.includes(JSON.stringify(one)));
   };
-  function place(text) {
-    const rest = own();
-    const all = JSON.stringify([...JSON.parse(text || '[]'), ...rest]);
-    placed = text || '[]';
-    marks.set(all === '[]' ? '' : all);
-  }
 
   function fit() {  // the caption takes its place from the picture
     const high = `${root.hidden ? 0 : root.offsetHeight}px`, { style } = document.body;
@@ -115,16 +120,14 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
 
   async function show(k, at_once = still.matches) {
     if (!list[k]) return;
-    const mine = ++turn, going = () => mine === turn, step = list[k], from = lens.pose();
+    const mine = ++turn, going = () => mine === turn, step = list[k], from = lens.pose(), wanted = texts(step);
+    const all = [...marksIn(wanted.get('marks')), ...own()];
     let why = '';
     now = k;
     tell();
-    let texts = new Map([['frame', step.frame ? String(step.frame) : ''], ['projection', step.camera?.orthographic ? 'orthographic' : '']]);
-    try { if (step.link) texts = partsOf(step.link); } catch { /* damaged: as the page begins */ }
-    place(texts.get('marks'));
-    await put(seen.filter(({ key }) => key !== 'view' && key !== 'marks'), texts);
+    await put(seen.filter(({ key }) => key !== 'view'), new Map([...wanted, ['marks', all.length ? JSON.stringify(all) : '']]));
     if (!going()) return;
-    if (texts.has('view')) await put(seen.filter(({ key }) => key === 'view'), texts);
+    if (wanted.has('view')) await put(seen.filter(({ key }) => key === 'view'), wanted);
     else await state(step, going).catch(({ message }) => { why = message; });
     if (!going()) return;
     if (!at_once) await glide(lens, from, lens.pose(), going, moving);
@@ -135,7 +138,7 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
   back.addEventListener('click', () => by(-1));
   next.addEventListener('click', () => by(1));
   let down = null;
-  root.addEventListener('pointerdown', ({ isPrimary, clientX: x, clientY: y }) => { down = isPrimary ? { x, y } : null; });
+  root.addEventListener('pointerdown', ({ isPrimary, pointerType, clientX: x, clientY: y }) => { down = isPrimary && pointerType !== 'mouse' ? { x, y } : null; });  // a mouse selects text
   root.addEventListener('pointerup', ({ clientX: x, clientY: y }) => {
     if (down && Math.abs(x - down.x) > SWIPE && Math.abs(x - down.x) > Math.abs(y - down.y)) by(x < down.x ? 1 : -1);
     down = null;
@@ -144,8 +147,9 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
   find('.add').addEventListener('click', () => {
     if (list.length >= MOST) return;
     const text = own().flatMap(([kind, , words]) => (kind === 'note' && words ? [words] : [])).join('\n');  // a note becomes a step
-    placed = decodeURIComponent(marks.get()) || '[]';
-    set(list.toSpliced(now + 1, 0, { text, link: saidBy(seen) }), now + 1);
+    const step = { text, link: '' };
+    set(list.toSpliced(now + 1, 0, step), now + 1);
+    step.link = saidBy(seen);  // beside the caption, which may be new
     rows.children[now].querySelector('textarea').focus();
   });
   find('.json').addEventListener('click', () => save(new Blob([`${JSON.stringify({ steps: list }, null, 1)}\n`], { type: 'application/json' }), 'story.json'));
@@ -173,7 +177,6 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
         set(text) {
           if (!(Number(text || 1) <= list.length && Number(text || 1) >= 1)) return;
           now = Number(text || 1) - 1;
-          placed = partsOf(list[now].link ?? '').get('marks') ?? '[]';
           tell();
         },
       },
