@@ -5,7 +5,7 @@ import { partsOf, put, saidBy } from './link.mjs';
 import { save } from './shot.mjs';
 
 const MOST = 100, LONG = 2000;  // steps; letters of a text
-const GLIDE = 900, SWIPE = 40;  // milliseconds from view to view; px
+const GLIDE = 900, MOST_AT_ONCE = 0.25, SWIPE = 40;  // milliseconds from view to view; share of it in one frame, however slow; px
 const HTML = `<button class="back" aria-label="previous step" title="previous step (Page Up)">‹</button><div aria-live="polite" aria-atomic="true"><span></span><p></p></div><button class="next" aria-label="next step" title="next step (Page Down)">›</button>`;
 const WRITE = `<p>A step is what is seen now, with a text.</p><ol></ol><div role="group" aria-label="the whole story"><button class="add">add a step</button><button class="save" title="save this page as it is now, with its story" hidden>save page</button><button class="json" title="save the story for --story">story.json</button></div>`;
 const still = matchMedia('(prefers-reduced-motion: reduce)'), numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
@@ -23,11 +23,13 @@ function marksIn(text) {
 
 // the camera from one pose to another; ends early when somebody else moves it, or going() ends
 function glide(lens, from, to, going, moving) {
-  const begin = performance.now(), turn = (((to.yaw - from.yaw) % 360) + 540) % 360 - 180;
-  let last = null;
+  const turn = (((to.yaw - from.yaw) % 360) + 540) % 360 - 180;
+  let last = null, t = 0, drawn = performance.now();
   return new Promise((done) => {
     const step = () => {
-      const t = Math.min((performance.now() - begin) / GLIDE, 1), s = t * t * (3 - 2 * t), mix = (a, b) => a + (b - a) * s;
+      t = Math.min(t + Math.min((performance.now() - drawn) / GLIDE, MOST_AT_ONCE), 1);
+      drawn = performance.now();
+      const s = t * t * (3 - 2 * t), mix = (a, b) => a + (b - a) * s;
       if (!going() || (last && numbers(lens.pose()).some((x, k) => Math.abs(x - last[k]) > 1e-3))) return done();
       lens.set(t < 1 ? { target: from.target.map((x, k) => mix(x, to.target[k])), pitch: mix(from.pitch, to.pitch), yaw: from.yaw + turn * s, distance: from.distance * (to.distance / from.distance) ** s } : to);
       last = numbers(lens.pose());
