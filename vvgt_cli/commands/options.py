@@ -227,6 +227,11 @@ title_option = click.option(
     help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
 )  # fmt: skip
 
+story_option = click.option(
+    "--story", metavar="STORY.json",
+    help="Steps of text, camera, cut, function, labels, light and slices for a page (.html) to tell.",
+)  # fmt: skip
+
 values_option = click.option(
     "--no-values", "values", is_flag=True, default=True, flag_value=False,
     help="Omit the volume's values from the page (.html) of one volume, and with them slices and changes of its look.",

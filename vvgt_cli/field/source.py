@@ -23,6 +23,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.scene import PreparedVolume
+    from vvgt_cli.gaussians.formats.page_values import Layer as PageLayer
     from vvgt_cli.gaussians.formats.page_values import Values
 
 OPTICS = 12  # hexadecimal digits of `StyledVolume.optics`
@@ -189,19 +190,24 @@ class StyledVolume:
                 "field (try --labels none to read label numbers as values)"
             )
 
+    @property
+    def page_layers(self) -> list[PageLayer | None]:
+        """Layers for a page; None: one with colours."""
+        from vvgt_cli.gaussians.formats.page_values import Layer
+
+        known = self.overall if len(self.layers) == 1 else None
+        return [
+            None if layer.colors else Layer(layer.volume, layer.tf, layer.unit_distance, known) for layer in self.layers
+        ]
+
     def values(self, room: float | None = None) -> Values | None:
         """Return the grids of all layers for a page, read part by part; None if all layers have colours.
 
         ``room``: bytes that they may take there.
         """
-        from vvgt_cli.gaussians.formats import page_values
+        from vvgt_cli.gaussians.formats.page_values import values_of
 
-        known = self.overall if len(self.layers) == 1 else None
-        layers = [
-            None if layer.colors else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known)
-            for layer in self.layers
-        ]
-        return page_values.values_of(layers, room)
+        return values_of(self.page_layers, room)
 
     def with_function(self, tf: TransferFunction) -> StyledVolume:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""
