@@ -98,11 +98,8 @@ def person(request: pytest.FixtureRequest) -> Iterator[Person]:
 
 def rests(person: Person) -> list[float]:
     """Where the camera is when it has come to rest."""
-    last: list[float] | None = None
-    while last is None or not np.allclose(last, person("eval", AT)):
-        last = person("eval", AT)
-        person("eval", "new Promise((done) => setTimeout(done, 400))")
-    return last
+    found: list[float] = person("eval", f"window.vvgt.where.story.shown.then(() => {AT})")
+    return found
 
 
 def swipe(person: Person, far: int) -> None:
