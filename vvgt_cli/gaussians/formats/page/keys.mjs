@@ -25,7 +25,9 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
 export function hide(root, back) {
   const inside = root.contains(document.activeElement);
   root.hidden = true;
-  if (inside) back?.focus();
+  if (!inside) return;
+  document.activeElement.blur();  // at once, for the next key
+  back?.focus();
 }
 
 // {root, toggle()} of a panel of rows, or without them of what the caller puts there; of all of them one is open at a time

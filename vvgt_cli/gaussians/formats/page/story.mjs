@@ -120,7 +120,9 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
     }
   }
 
-  async function show(k, at_once = still.matches) {
+  let shown = Promise.resolve();  // when the step asked for last is seen
+  const show = (k, at_once) => (shown = go(k, at_once));
+  async function go(k, at_once = still.matches) {
     if (!list[k]) return;
     const mine = ++turn, going = () => mine === turn, step = list[k], from = lens.pose(), wanted = texts(step);
     const all = [...marksIn(wanted.get('marks')), ...own()];
@@ -165,6 +167,7 @@ export function storyOf({ lens, live, seen, apply, slices, moving, begins = [], 
     begin: () => show(0, true),
     get list() { return list; },
     get now() { return now; },
+    get shown() { return shown; },
     parts: [
       {
         key: 'story', get: () => (JSON.stringify(list) === begun ? '' : encodeURIComponent(JSON.stringify(list))),
