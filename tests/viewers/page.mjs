@@ -17,7 +17,7 @@ const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swifts
   '--force-color-profile=srgb', '--disable-gpu-watchdog'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.window ?? [job.size, job.size];
-const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1 });
+const page = await browser.newPage({ reducedMotion: 'reduce', viewport: { width, height }, deviceScaleFactor: 1 });
 page.setDefaultTimeout(600000);
 const asked = [], errors = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
 await page.route((url) => /^(https?|wss?):/.test(url.href) && !url.href.startsWith(own), (route) => {

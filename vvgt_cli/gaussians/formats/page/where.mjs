@@ -12,11 +12,13 @@ import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
-import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
+import { save } from './saved.mjs';
+import { pageOf, pictureOf, sizesOf } from './shot.mjs';
+import { sheet } from './sheet.mjs';
 import { slicesOf } from './slices.mjs';
-import { element } from './svg.mjs';
+import { element, moveApart } from './svg.mjs';
 
-const LEFT = 12, NARROW = 700;  // px; of a picture in which the panel would lie over what is clicked
+const LEFT = 12;  // px
 const AWAY = 2, UP = 1.3;  // m in a headset, to the middle of the body, whose longest edge is 2 m: away, and above the floor
 const icon = (path) => `<svg viewBox="0 0 18 18" aria-hidden="true"><path d="${path}"/></svg>`;
 const ICONS = {
@@ -33,7 +35,7 @@ export function where(viewer, scene, live, show, grids) {
   const values = live?.layers.some(({ nodes }) => nodes), box = document.createElement('nav'), buttons = [];
   box.id = 'tools';
   box.setAttribute('aria-label', 'view');
-  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []), sizes = listed('sizes', 'Save the picture as PNG');
+  const about = listed('about', 'About this file', []), help = listed('help', 'Mouse, touch and keys', []), sizes = listed('sizes', 'Save or share');
   const places = Object.assign(document.createElement('div'), { id: 'places', hidden: true });
   document.body.append(box, help.root, about.root, sizes.root, places);
   places.setAttribute('role', 'status');
@@ -67,7 +69,7 @@ export function where(viewer, scene, live, show, grids) {
     },
   });
   let faced = 'null';
-  const parts = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const parts = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens, (angles) => free.times(angles)), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   if (live) live.begins = () => saidBy(parts.filter(({ key }) => !/^(function|labels|light|drawn)/.test(key)));  // of a page that the server makes for the look
 
@@ -112,33 +114,35 @@ export function where(viewer, scene, live, show, grids) {
   button('fit', 'fit into the window', 'f', () => look(lens.pose()));
   button('reset', 'reset the view', 'r', () => { last = null; look(firstAngles(scene)); });
   const projection = button('perspective', 'switch between perspective and orthographic', 'o', () => { lens.flat = !lens.flat; again(); });
-  const measure = (now) => {
-    if (now) marks.toggle();
-    else marks.stop();
-    if (marks.open && svg.clientWidth < NARROW) document.querySelector('#live:not(.folded) .fold')?.click();
+  const measure = (open) => {
+    if (open !== marks.open) marks.toggle();
     lens.canvas.classList.toggle('measuring', marks.open);
     clicked = null;
     again();
   };
-  const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(true));
+  const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(!marks.open));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume', 's', () => slices.toggle());
   const picture = (size) => pictureOf(viewer, svg, size, live?.look).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
-  sizes.of(button('picture', 'save a picture (PNG)', 'p', () => {
-    sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
-      const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
-      made.addEventListener('click', () => { sizes.close(); lens.canvas.focus({ preventScroll: true }); picture(size); });
-      return made;
-    }));
-    sizes.toggle();
-    sizes.root.querySelector('button').focus();
-  }));
-  button('link', 'copy a link to this view', 'l', () => {
+  const linked = () => {
     const link = linkOf(parts);
     try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
     again(copied(link) ? 'link to this view copied' : parent === window ? 'the address bar now links to this view' : 'this frame is not allowed to copy a link');
     setTimeout(again, 4000);
-  }).hidden = location.protocol === 'about:';  // of a notebook's cell, which has no address
+  };
+  const addressed = location.protocol !== 'about:';  // not a notebook's cell
+  function offer() {
+    const made = (text, press) => {
+      const one = Object.assign(document.createElement('button'), { textContent: text });
+      one.addEventListener('click', () => { sizes.close(); lens.canvas.focus({ preventScroll: true }); press(); });
+      return one;
+    };
+    sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => made(`picture, ${size.join(' × ')} px`, () => picture(size))), ...(addressed ? [made('copy a link', linked)] : []));
+    sizes.toggle();
+    sizes.root.querySelector('button').focus();
+  }
+  sizes.of(button('picture', 'save a picture (PNG)', 'p', offer));
+  button('link', 'copy a link to this view', 'l', linked).hidden = !addressed;
   const whole = document.documentElement;
   if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', '', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
   for (const kind of ['VR', 'AR']) {
@@ -156,6 +160,12 @@ export function where(viewer, scene, live, show, grids) {
   help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
   about.of(button('about', 'about this file', 'i', about.toggle));
   help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed, sliced: slices }));
+  help.root.before(sheet({
+    ...(live && Object.fromEntries(['look', 'cut'].map((name) => [name, { root: live.root, show: (open) => live.fold(!open) }]))),
+    ...(slices && { slices: { root: slices.root, show: slices.toggle } }),
+    ...(scene.streamed ? {} : { measure: { root: marks.root, show: measure } }),
+    share: { root: sizes.root, show: offer },
+  }));
   lens.canvas.tabIndex = 0;
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
@@ -198,6 +208,7 @@ export function where(viewer, scene, live, show, grids) {
     if (at) drawPlace(rest, at, valueText(clicked));
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
+    moveApart([...rest.querySelectorAll('text')], [...svg.querySelectorAll('.over text')]);
     handles?.draw(world);
     if (slices && live) drawFaces();
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
@@ -222,8 +233,8 @@ export function where(viewer, scene, live, show, grids) {
   live?.look.begin(lens, () => world, live.covering);
   spread();
   addEventListener('resize', spread);
-  const fit = stayFree(lens, scene, draw);
+  const free = stayFree(lens, scene, draw), { fit } = free;
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size, live?.look), get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), turn: () => free.turn(app, () => live?.look.shows), picture: (size) => pictureOf(viewer, svg, size, live?.look), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
