@@ -29,7 +29,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import ClosedFormStage
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import apply_look, baked
@@ -71,8 +71,8 @@ def functions(numbers: Statistics) -> dict[str, TransferFunction]:
 
 def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
-    source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
-    request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
+    source = SourceRequest(OpenedFile((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
+    request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, screen=SIZE))
     run = Run(Console(quiet=True), ConversionReport("convert"))
     with open_field(run, request) as opened:
         work = work_of(run, request, opened)
@@ -101,7 +101,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
         source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
         lit = Resident.of(source)
         run = Run(Console(quiet=True), ConversionReport("init"))
-        fit = FitOptions(max_gaussians=gaussians, size=SIZE)
+        fit = FitOptions(max_gaussians=gaussians, screen=SIZE)
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
         ClosedFormStage().run(work)
         shown = visible_cloud(live, table, box_lighting(source), pixel_width(SIZE))

@@ -191,7 +191,7 @@ def test_a_view_turns_slowly_until_somebody_comes(watcher: Person, desk: Person,
 def test_streamed_levels_fit_at_first_sight(desk: Person, tmp_path: Path) -> None:
     z, y, x = np.mgrid[:40, :44, :100] - np.array([20, 22, 50])[:, None, None, None]
     np.save(tmp_path / "long.npy", ((abs(x) < 48) & (abs(y) < 19) & (abs(z) < 16)).astype(np.float32))
-    how = ["--tf", "gray", "--max-gaussians", "3000", "--size", "100", "--quiet"]
+    how = ["--tf", "gray", "--max-gaussians", "3000", "--screen", "100", "--quiet"]
     assert run(["init", str(tmp_path / "long.npy"), *how, "-o", str(tmp_path / "long" / "lod-meta.json")]) == 0
     with shown("long/lod-meta.json", folder=tmp_path) as (_, url):
         desk("served", url)

@@ -24,7 +24,7 @@ from vvgt_cli.conversion.stages import ClosedFormStage, TestViews
 from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NoLiveForm, NothingVisible
 from vvgt_cli.field.field import Field
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import LENGTH, Looks, Table, baked, lengths
@@ -58,10 +58,11 @@ def check_live(request: ConvertRequest) -> None:
     given = {
         "--target-psnr": limits.target_psnr is not None,
         "--time-budget": limits.time_budget is not None,
-        "--max-size (or write a page, -o OUT.html)": limits.max_megabytes is not None and not is_page(request.output),
+        "--max-megabytes (or write a page, -o OUT.html)": limits.max_megabytes is not None
+        and not is_page(request.output),
         "--steps": fit.steps is not None,
         "--model": fit.model is not None,
-        "--init": fit.init != "vbm",
+        "--init": fit.init != "moments",
         "--checkpoint": request.checkpoint is not None,
         "--sh-degree": request.ply.sh_degree is not None,
         "--no-comments": not request.ply.comments,
@@ -72,7 +73,7 @@ def check_live(request: ConvertRequest) -> None:
         raise NoLiveForm(f"--live: the file is made for every function, without fitting; remove {', '.join(names)}")
 
 
-def live_refusal(request: ConvertRequest, source: Source) -> str | None:
+def live_refusal(request: ConvertRequest, source: StyledVolume) -> str | None:
     """Return the reason why a source has no live file; None where it has one."""
     try:
         check_live(request)
@@ -102,7 +103,7 @@ class LiveForm(Stage):
             facts = LiveFacts.of(source.volume, source.overall, source.tf)
             gaussians = _one_layer(work.run, fit, work.field)
         table, lighting = _baked_look(source, facts), box_lighting(source)
-        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.size)), lighting)
+        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.screen)), lighting)
         work.ply = replace(work.ply, live=facts)
 
 
@@ -124,17 +125,23 @@ class LiveLook(Stage):
         fit, source = work.fit, work.field.source
         assert work.ply.live is not None
         table, lighting = _baked_look(source, work.ply.live), box_lighting(source)
-        shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.size))
+        shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.screen))
         name = source.name if len(source.layers) > 1 else source.tf.name
         with work.run.stage(self.name) as stage:
             live = score_test_views(
-                work.field.views, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
+                work.field.views,
+                shown,
+                fit.screen,
+                RenderSettings(),
+                rule=fit.rule,
+                perceptual=False,
+                only=PREVIEW_VIEWS,
             )
             stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as others show it"
         work.live_psnr = live.psnr
 
 
-def _baked_look(source: Source, facts: LiveFacts) -> Looks:
+def _baked_look(source: StyledVolume, facts: LiveFacts) -> Looks:
     """Return the lookup table of a source's functions, for live Gaussians with these facts."""
     look: Look = source.tf
     if len(source.layers) > 1:
@@ -152,7 +159,7 @@ def _one_layer(run: Run, fit: FitOptions, field: Field) -> Gaussians:
     else:
         foggy = field.with_look(source.with_function(fog(source.overall, source.tf)))
         found = with_values(run, foggy, fog_start(run, foggy, fit))
-    return widen_narrow(found, fit.size)
+    return widen_narrow(found, fit.screen)
 
 
 def _several_layers(run: Run, fit: FitOptions, field: Field) -> tuple[Gaussians, LiveFacts]:
@@ -186,7 +193,7 @@ def _several_layers(run: Run, fit: FitOptions, field: Field) -> tuple[Gaussians,
     return concatenate(found), replace(first, others=tuple(others))
 
 
-def check_layers(source: Source) -> None:
+def check_layers(source: StyledVolume) -> None:
     """Raise NoLiveForm if a layer has colours, neither values nor labels."""
     if any(layer.colors for layer in source.layers):
         raise NoLiveForm(
@@ -195,7 +202,7 @@ def check_layers(source: Source) -> None:
         )
 
 
-def box_lighting(source: Source) -> Lighting | None:
+def box_lighting(source: StyledVolume) -> Lighting | None:
     """Return the light of a source, with directions in the box frame."""
     if source.lighting is None:
         return None
@@ -212,7 +219,7 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     return gaussians if lighting is None else relight(gaussians, gaussians.live[:, AXIS], lighting)
 
 
-def function_table(source: Source) -> Table:
+def function_table(source: StyledVolume) -> Table:
     """Return the lookup table of the function of a source, with lengths in the unit frame."""
     stats, tf, volume = source.overall, source.tf, source.volume
     assert isinstance(tf, TransferFunction)
@@ -225,7 +232,7 @@ def fog_start(run: Run, field: Field, fit: FitOptions) -> Start:
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
-        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, values=True)
+        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.screen, values=True)
         start = field.pyramid(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)

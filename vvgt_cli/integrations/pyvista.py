@@ -14,32 +14,27 @@ from typing import Any
 
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.gaussians.header import camera_of as camera_in
 from vvgt_cli.integrations.layers import Layer, together
 from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import Drawn, drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
-from vvgt_cli.library.inputs import GoalLike, Look, Reading, volume_of
+from vvgt_cli.library.inputs import Look, Reading, volume_of
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.lighting import LightOptions
 
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 
 
-def export_plotter(
-    plotter: Any, path: str | os.PathLike[str], goal: GoalLike = None, *, live: bool = False, overwrite: bool = True,
-    progress: bool = False,
-) -> Conversion:  # fmt: skip
+def export_plotter(plotter: Any, path: str | os.PathLike[str], *, overwrite: bool = True, **options: Any) -> Conversion:
     """Write the volumes that a pyvista.Plotter shows as Gaussians: functions, light and camera are the plotter's.
 
     Args:
         plotter: pyvista.Plotter, of whose active subplot visible volumes are taken, several as layers.
         path: the file, as in `Result.save`.
-        goal: as in `convert`.
-        live: as in `convert`.
         overwrite: replace an existing file.
-        progress: as in `convert`.
+        **options: further ones of `convert`, as ``max_gaussians`` and ``live``.
 
     Returns:
         The conversion, whose file opens at the plotter's camera. One warning names what was not taken.
@@ -73,7 +68,7 @@ def export_plotter(
     notes += unlike + askew
     if notes:
         warnings.warn(f"not taken from the plotter: {'; '.join(dict.fromkeys(notes))}", stacklevel=2)
-    result = together(layers, light, goal, live=live, progress=progress)
+    result = together(layers, light, **options)
     result.ply = replace(result.ply, camera=camera_in(camera.split(",")), up=up)
     result.save(path, overwrite=overwrite)
     return result
@@ -104,7 +99,8 @@ def _layers(found: Drawn, prop: Any) -> tuple[list[Layer], list[str]]:
         reading["mask"] = found.mask
     each: list[Reading] = [reading] if count == 1 else [{**reading, "component": k} for k in range(count)]
     parts = [volume_of(found.data, one) for one in each]
-    contents = [Content(tuple(parts), color=True)] if count > 1 and colored else [Content((part,)) for part in parts]
+    mixed = count > 1 and colored
+    contents = [OpenedFile(tuple(parts), color=True)] if mixed else [OpenedFile((part,)) for part in parts]
     functions = [property_json(prop, k, found.scale) for k in range(len(contents))]
     notes = [note for _, some in functions for note in some]
     if len(contents) > 1:
