@@ -239,8 +239,8 @@ def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: P
     for flat in (False, True):
         if flat:
             person("press", "o")
+        person("press", "m")
         picture = person.picture(tmp_path, "turned.png")
-        person("click", "#tools .measure")
         for channel in (0, 2):
             place, _ = found(picture, channel)
             person("click", *place.tolist())
