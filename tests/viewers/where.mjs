@@ -83,9 +83,13 @@ const steps = {
   until: async (text) => { await page.waitForFunction(text); },
   shot: async (file) => { await page.screenshot({ path: file }); },
   bare: async (file) => {
-    const style = await page.addStyleTag({ content: HIDE });
+    await page.evaluate((text) => {  // no element, which a served page's policy forbids
+      const style = new CSSStyleSheet();
+      style.replaceSync(text);
+      document.adoptedStyleSheets = [style];
+    }, HIDE);
     await page.screenshot({ path: file });
-    await style.evaluate((element) => element.remove());
+    await page.evaluate(() => { document.adoptedStyleSheets = []; });
   },
   axe: async () => {
     await page.evaluate(fs.readFileSync(path.join(modules, 'node_modules', 'axe-core', 'axe.min.js'), 'utf8'));

@@ -115,7 +115,7 @@ def _largest_side(splats: Splats) -> tuple[float, float, float]:
     x, y, z = (len(np.unique(np.delete(cells, axis, axis=1), axis=0)) for axis in range(3))
     if y > _FLAT * max(x, z):
         return (-0.3, 1.0, 0.0)
-    return (0.0, _TILTED, 1.0) if z > _LARGER * x else (-1.0, _TILTED, 0.0)
+    return (0.0, _TILTED, -1.0) if z > _LARGER * x else (-1.0, _TILTED, 0.0)
 
 
 def asked(splats: Splats) -> dict[str, Any] | None:
