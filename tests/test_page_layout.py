@@ -189,16 +189,17 @@ def test_a_view_turns_slowly_until_somebody_comes(watcher: Person, desk: Person,
 
 
 def test_streamed_levels_fit_at_first_sight(desk: Person, tmp_path: Path) -> None:
-    z, y, x = np.mgrid[:40, :44, :100] - np.array([20, 22, 50])[:, None, None, None]
-    np.save(tmp_path / "long.npy", ((abs(x) < 48) & (abs(y) < 19) & (abs(z) < 16)).astype(np.float32))
+    cube = np.zeros((40, 40, 40), np.float32)  # its corners are nearer than its middle
+    cube[2:38, 2:38, 2:38] = 1
+    np.save(tmp_path / "cube.npy", cube)
     how = ["--tf", "gray", "--max-gaussians", "3000", "--screen", "100", "--quiet"]
-    assert run(["init", str(tmp_path / "long.npy"), *how, "-o", str(tmp_path / "long" / "lod-meta.json")]) == 0
-    with shown("long/lod-meta.json", folder=tmp_path) as (_, url):
+    assert run(["init", str(tmp_path / "cube.npy"), *how, "-o", str(tmp_path / "cube" / "lod-meta.json")]) == 0
+    with shown("cube/lod-meta.json", folder=tmp_path) as (_, url):
         desk("served", url)
         for name, step in (("first", "f"), ("side", "x"), ("fit", "f")):
             if name != "first":
                 desk("press", step)
-            assert uncovered(desk, desk.picture(tmp_path, f"{name}.png")) > 0.4, name
+            assert uncovered(desk, desk.picture(tmp_path, f"{name}.png")) > 0.6, name
 
 
 def test_what_a_frame_forbids_to_save_is_offered_otherwise(desk: Person, pages: dict[str, str], tmp_path: Path) -> None:
