@@ -53,6 +53,11 @@ if (job.look) {
   await page.screenshot({ path: job.look });
 }
 if (job.window) await page.setViewportSize({ width: job.size, height: job.size });
+await page.evaluate(() => {  // the picture fills the window, without the tabs of small ones
+  document.body.style.setProperty('--tabs', '0px');
+  dispatchEvent(new Event('resize'));
+});
+await page.waitForTimeout(500);
 const shoot = async ({ camera, frame }) => {
   const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
   const entity = app.root.findComponent('camera').entity;

@@ -35,14 +35,15 @@ const grasp = async (k) => {
   return box;
 };
 const shoot = async (name) => {
-  const take = async (back, seen) => {
+  const take = async (seen) => {
     const { viewer, where: { lens } } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
+    const { clientWidth: w, clientHeight: h } = canvas, back = Math.max(w, h) / Math.min(w, h);
     const camera = app.root.findComponent('camera').entity, { position, target } = seen;
     const away = position.map((x, i) => x - target[i]), distance = Math.hypot(...away);
     let ready = true, shift = 0;
     app.systems.gsplat.on('frame:ready', (c, layer, isReady, loading) => { ready = isReady && loading === 0; });
     lens.set({ target, distance: back * distance, ...lens.toward(away.map((x) => x / distance), [0, 1, 0]) });
-    lens.middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+    lens.middle = [w / 2, h / 2];
     const put = () => camera.translateLocal(shift, 0, 0);
     app.on('update', put);
     const { look } = window.vvgt.live;
@@ -58,7 +59,7 @@ const shoot = async (name) => {
     app.off('update', put);
     return url;
   };
-  const url = await page.evaluate(`${settled}; (${take})(${Math.max(width, height) / Math.min(width, height)}, ${JSON.stringify(job.camera)})`);
+  const url = await page.evaluate(`${settled}; (${take})(${JSON.stringify(job.camera)})`);
   fs.writeFileSync(path.join(job.folder, name), Buffer.from(url.split(',')[1], 'base64'));
 };
 const save = async (label) => {
@@ -74,10 +75,12 @@ await page.evaluate('window.vvgt.where.slices.toggle()');
 noted.slices = await page.evaluate('window.vvgt.where.slices.state.base.dims');
 await page.evaluate('window.vvgt.where.slices.toggle()');
 noted.began = await shown();
-if (await page.evaluate(() => document.querySelector('#live').classList.contains('folded'))) await page.click('#tabs button');
-await page.mouse.move(width / 2, height * 0.75);  // turn the camera
+const tab = async (k) => { if (await page.isVisible('#tabs')) await page.click(`#tabs button:nth-child(${k})`); };
+await tab(1);
+const low = height * (await page.isVisible('#tabs') ? 0.3 : 0.75);
+await page.mouse.move(width / 2, low);  // turn the camera
 await page.mouse.down();
-await page.mouse.move(width / 2 + 60, height * 0.75 + 10, { steps: 3 });
+await page.mouse.move(width / 2 + 60, low + 10, { steps: 3 });
 await page.mouse.up();
 for (let last, now = await place(); String(last) !== String(now); [last, now] = [now, await place()]) await page.waitForTimeout(2000);  // it glides
 const before = await place(), [x, y] = await grasp(1);
@@ -97,10 +100,12 @@ await page.screenshot({ path: path.join(job.folder, 'page-better.png') });
 await shoot('better.png');
 await page.evaluate((note) => window.vvgt.where.marks.part.set(JSON.stringify([['note', [[0, 0, 0]], note]])), job.note);
 noted.saved = [await save('.ply'), await save('.html'), await save('tf.json')];
+await tab(2);
 await page.selectOption('#live .axis', { index: 1 });
 noted.cut = await shown();
 await page.selectOption('#live .axis', { index: 0 });
 noted.uncut = await shown();
+await tab(1);
 await page.evaluate(() => document.querySelector('#live .light').closest('details').setAttribute('open', ''));
 await page.selectOption('#live .light select', 'headlight');
 noted.lit = [await shown()];
