@@ -57,8 +57,8 @@ function draw(app, { dilation, shifted, reach }) {
 function series(viewer) {
   const { app } = viewer, entity = app.root.findByName('gsplat');
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
-  const box = document.createElement('div');
-  box.id = 'series';
+  const box = Object.assign(document.createElement('section'), { id: 'series' });
+  box.setAttribute('aria-label', 'frames');
   box.innerHTML = '<button aria-label="play" title="play">▶</button><input type="range" min="0" value="0" aria-label="frame"><select aria-label="choose a frame"></select>';
   const [button, slider, list] = box.children;
   slider.max = scene.frames.length - 1;
