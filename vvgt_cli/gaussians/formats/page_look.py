@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +48,7 @@ def contents(options: PlyOptions, name: str, names: Sequence[str] = (), values: 
     stated = [one["title"] for one in values.facts if one["title"]] if values else list(names)
     parts += [f"the names {listed(stated, ', ', 3)}"] if stated else []
     parts += ["a checksum of the volume"] if options.certificate else []
+    parts += [f"a story of {len(options.story.steps)} steps"] if options.story else []
     return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"
 
 
@@ -60,11 +61,12 @@ def html(splats: Splats, name: str, values: Values | None = None, options: PlyOp
 
 
 def page_contents(values: Values | None, options: PlyOptions) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Return the contents of elements by their ids, and entries of the scene, for the values of a volume."""
+    """Return the contents of elements by their ids, and entries of the scene, for a volume's values and a story."""
+    story: dict[str, Any] = {"story": options.story.steps} if options.story else {}
     if values is None:
-        return {}, {}
+        return {}, story
     look = {} if values.look is None else {"look": look_entry(values, options)}
-    return values.elements, values.scene | look
+    return values.elements, values.scene | look | story
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
@@ -73,7 +75,7 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
         (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
         for cloud, gaussians, options in clouds
     ]
-    return html_of_several(baked, name)
+    return html_of_several(baked, name, *page_contents(None, clouds[0][2]))
 
 
 def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
@@ -82,16 +84,17 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
     scale, axes = options.scale or 1.0, _axes(upright(options).up)
     if options.light is not None and options.light.headlight + len(options.light.directions) > 1:
         warnings.warn("the page shows one light at a time under other looks, and begins with the first", stacklevel=2)
-    first = values.facts[0]
+    steps = options.story.steps if options.story else ()
+    first, shown = values.facts[0], {str(step.get("function")) for step in steps}
     half = np.linalg.norm(np.reshape(first["affine"], (3, 4))[:, :3], axis=0) * first["dims"] * scale / 2
     return {
-        "layers": [_layer_entry(layer, scale) for layer in values.look.layers],
+        "layers": [_layer_entry(layer, scale, shown) for layer in values.look.layers],
         "light": _light(options.light, axes), "axes": axes.tolist(), "box": [(-half).tolist(), half.tolist()],
     }  # fmt: skip
 
 
-def _layer_entry(layer: LiveFacts, scale: float) -> dict[str, Any]:
-    """Return a layer of `look_entry`."""
+def _layer_entry(layer: LiveFacts, scale: float, shown: Collection[str]) -> dict[str, Any]:
+    """Return a layer of `look_entry`, with presets that a story has ``shown``."""
     distance = layer.distance or 1.0
     entry: dict[str, Any] = {
         "title": layer.name, "labels": [label.page_entry() for label in layer.labels],
@@ -99,7 +102,7 @@ def _layer_entry(layer: LiveFacts, scale: float) -> dict[str, Any]:
         "histogram": list(layer.histogram), "name": layer.baked().get("name", ""),
         "unit_distance": distance * scale, "opacity_unit_distance": distance, "nodes": [],
     }  # fmt: skip
-    return entry if layer.labels else entry | {"nodes": nodes_of(layer), "presets": presets_of(layer, entry)}
+    return entry if layer.labels else entry | {"nodes": nodes_of(layer), "presets": presets_of(layer, entry, shown)}
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
@@ -147,7 +150,7 @@ def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
     return _nodes(read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED)
 
 
-def presets_of(facts: LiveFacts, entry: Mapping[str, Any]) -> list[dict[str, Any]]:
+def presets_of(facts: LiveFacts, entry: Mapping[str, Any], shown: Collection[str] = ()) -> list[dict[str, Any]]:
     """Return the named functions for values that are or look like Hounsfield units, or of the kind of the file's name.
 
     The file's own function is not among them, unless it was changed and has kept the name.
@@ -155,20 +158,21 @@ def presets_of(facts: LiveFacts, entry: Mapping[str, Any]) -> list[dict[str, Any
     Args:
         facts: of the layer.
         entry: its part of the scene, whose ``unit_distance`` opacities become per.
+        shown: names of further ones.
     """
     named, found, known = names(), [], facts.statistics()
     hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(known))
     kind = "ct" if hounsfield else entry["name"].split("-")[0] if entry["name"] in named else ""
-    for name in [name for name in named if name.split("-")[0] == kind]:
+    for name in [name for name in named if name.split("-")[0] == kind or name in shown]:
         tf = named_function(name)
-        if tf.otherwise is not None and not hounsfield:  # a guess
+        if tf.otherwise is not None and not hounsfield and name not in shown:  # a guess
             continue
-        tf = resolve(tf, known, hounsfield=True)
+        tf = resolve(tf, known, hounsfield=hounsfield or name not in shown)
         assert tf.opacity_unit_share is not None
         times = entry["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
         tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
         light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
-        if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):
+        if (name in shown or tf.support(facts.lo, facts.hi)) and not _is_own(tf, facts):
             found.append({"name": name, "shows": named[name], "nodes": _nodes(tf, FEW), "light": light})
     return found
 

@@ -167,7 +167,7 @@ async function start() {
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };
   here.site.loaded();
-  if (!linked && scene.outermost.length) here.turn();
+  if (!linked && !scene.story?.length && scene.outermost.length) here.turn();
 }
 
 start().catch((error) => {
