@@ -19,11 +19,11 @@ TABS = ["look", "cut", "slices", "measure", "share"]
 BOX = "(({ left, top, right, bottom }) => [left, top, right, bottom])"
 DRAWN = f"[...document.querySelectorAll('#where g > *')].map((one) => {BOX}(one.getBoundingClientRect()))"
 PANELS = (  # what may lie over letters and scale
-    "[...document.querySelectorAll('#live, #live > header, #slices, #marks, #sizes, #tabs, #tools button, #series')]"
+    "[...document.querySelectorAll('#live, #live > header, #slices, #marks, #share, #tabs, #tools button, #series')]"
     f".filter((one) => one.checkVisibility()).map((one) => {BOX}(one.getBoundingClientRect()))"
 )
 OPEN = (
-    "[...document.querySelectorAll('#live .function, #live .cut, #slices, #marks, #sizes')]"
+    "[...document.querySelectorAll('#live .function, #live .cut, #slices, #marks, #share')]"
     ".filter((one) => one.checkVisibility()).map((one) => one.id || one.className)"
 )
 POSE = "window.vvgt.where.lens.pose()"
@@ -85,7 +85,7 @@ def test_a_phone_has_a_sheet_with_five_tabs(phone: Person, pages: dict[str, str]
     assert phone("eval", "[...document.querySelectorAll('#tabs button')].map((one) => one.textContent)") == TABS
     assert phone("eval", OPEN) == []
     for k, (name, shows) in enumerate(
-        [("", []), *zip(TABS, ["function", "cut", "slices", "marks", "sizes"], strict=True)]
+        [("", []), *zip(TABS, ["function", "cut", "slices", "marks", "share"], strict=True)]
     ):
         if name:
             phone("click", f"#tabs button:nth-child({k})")
