@@ -24,7 +24,7 @@ export function fitting({ camera: { position, target, fov }, outermost = [] }, {
   return { target: middle, distance: Math.max(...back) };
 }
 
-// {x, y: its middle, wide, high, target, distance} of that part
+// {x, y: its middle, wide, high, target, distance} of that part, and the `least` distance of any
 function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
     .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, width), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, height) }))
@@ -36,8 +36,8 @@ function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
     found.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
   }
   const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
-  if (!(least < FARTHEST * whole.distance)) return whole;
-  return found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0];
+  if (!(least < FARTHEST * whole.distance)) return { ...whole, least: whole.distance };
+  return { ...found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
 }
 
 // Keeps the middle of the view in the middle of that part when panels open and the window changes; until somebody moves the
@@ -65,7 +65,7 @@ export function stayFree(lens, scene, draw) {
   addEventListener('resize', place);
   fit(firstAngles(scene));
   return {
-    fit, times: (angles) => freePart(canvas, scene, angles).distance / fitting(scene, angles, 1, 1).distance,
+    fit, times: (angles) => freePart(canvas, scene, angles).least / fitting(scene, angles, 1, 1).distance,
     turn(app, still) {
       if (matchMedia('(prefers-reduced-motion: reduce)').matches || !untouched()) return;
       turning = true;
