@@ -193,7 +193,9 @@ class Source:
 
         known = self.overall if len(self.layers) == 1 else None
         layers = [
-            None if layer.colors else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known)
+            None
+            if layer.colors
+            else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
             for layer in self.layers
         ]
         return page_values.values_of(layers, room)
