@@ -72,7 +72,7 @@ def functions(numbers: Statistics) -> dict[str, TransferFunction]:
 def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
     source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
-    request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
+    request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, screen=SIZE))
     run = Run(Console(quiet=True), ConversionReport("convert"))
     with open_field(run, request) as opened:
         work = work_of(run, request, opened)
@@ -101,7 +101,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
         source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
         lit = Resident.of(source)
         run = Run(Console(quiet=True), ConversionReport("init"))
-        fit = FitOptions(max_gaussians=gaussians, size=SIZE)
+        fit = FitOptions(max_gaussians=gaussians, screen=SIZE)
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
         ClosedFormStage().run(work)
         shown = visible_cloud(live, table, box_lighting(source), pixel_width(SIZE))

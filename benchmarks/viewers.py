@@ -99,7 +99,7 @@ def main(
 ) -> None:  # fmt: skip
     """Convert VOLUME and compare what viewers draw of it."""
     pictures.mkdir(parents=True, exist_ok=True)
-    path, look = pictures / "splats.ply", ("--tf", tf, "--opacity-unit-distance", "mean-spacing", "--size", str(SIZE))
+    path, look = pictures / "splats.ply", ("--tf", tf, "--opacity-unit-distance", "mean-spacing", "--screen", str(SIZE))
     count = ("--max-gaussians", max_gaussians, "--steps", steps)
     if run(["convert", volume, *look, *count, "--quiet", "--overwrite", "-o", str(path)]):
         raise SystemExit(1)

@@ -12,5 +12,5 @@ cat > ripples.json <<'JSON'
 JSON
 vvgt info ripples.json
 vvgt tf show ripples.json --volume example:marschner-lobb -o ripples.png
-vvgt convert example:marschner-lobb --tf ripples.json --max-gaussians 20000 --size 200 -o ripples.ply
-vvgt evaluate ripples.ply --volume example:marschner-lobb --tf ripples.json --size 200
+vvgt convert example:marschner-lobb --tf ripples.json --max-gaussians 20000 --screen 200 -o ripples.ply
+vvgt evaluate ripples.ply --volume example:marschner-lobb --tf ripples.json --screen 200

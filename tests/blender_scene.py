@@ -104,7 +104,7 @@ def main() -> None:
     facts["camera"] = [[195, -100, 60], [120, -40, 15], 40]
     camera(scene, *facts["camera"])
     picture(scene, "volume.png", 64)
-    words = ["--max-gaussians", "3000", "--size", str(SIZE), "--steps", "0"]
+    words = ["--max-gaussians", "3000", "--screen", str(SIZE), "--steps", "0"]
     facts["without"] = addon.converted(scene, volume, str(FOLDER / "volume.ply"), words)
     bpy.ops.import_scene.gaussian_splats(filepath=str(FOLDER / "volume.ply"))
     volume.hide_render = True

@@ -23,7 +23,7 @@ CENTRE = np.array((17, 24, 20))
 MATRIX = ((0, -0.9, 0.1, 12), (0.8, 0, 0.2, -30), (0, 0.1, 1.5, 7), (0, 0, 0, 1))  # IJK to RAS, sheared
 TURN = ((0.8, -0.6, 0, 5), (0.6, 0.8, 0, -2), (0, 0, 1, 9), (0, 0, 0, 1))
 SIZE, ANGLE = 300, 30.0
-FAST = ["--max-gaussians", "20000", "--size", "300", "--steps", "60", "--overwrite", "-q"]
+FAST = ["--max-gaussians", "20000", "--screen", "300", "--steps", "60", "--overwrite", "-q"]
 spec = spec_from_file_location("mrml", ADAPTER)
 mrml = module_from_spec(spec)
 spec.loader.exec_module(mrml)

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "vvgt_cli"
 SUBPACKAGES = (
     *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "dvr", "device", "splat", "closed_form", "refine", "network", "score", "field"),
-    *("conversion", "checks", "library", "integrations", "commands"),
+    *("conversion", "checks", "library", "commands", "integrations"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
@@ -192,7 +192,7 @@ def test_files_and_functions_are_short(path):
     assert path.read_text("utf-8").count("\n") <= MAX_FILE
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            length = (node.end_lineno or node.lineno) - node.lineno + 1
+            length = (node.end_lineno or node.lineno) - node.lineno + 1 - (ast.get_docstring(node) or "").count("\n")
             assert length <= MAX_FUNCTION, f"{node.name}: {length} lines"
 
 

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.long
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks"
 SIZE = 24
-FEW = f"--max-gaussians 60 --size {SIZE}"
+FEW = f"--max-gaussians 60 --screen {SIZE}"
 PARTS = f"{FEW} --steps 24".replace("60", "300")
 LOOK = ("--tf", "shells.json", "--opacity-unit-distance", "mean-spacing")
 REFINED = {
@@ -125,7 +125,7 @@ def test_tables(bench, scenes, name, constants, words, column, least):
 
         require_opengl()
     if name == "levels":
-        many = ("--max-gaussians", "2000", "--size", "64", "-q", "-o", "levels/lod-meta.json")
+        many = ("--max-gaussians", "2000", "--screen", "64", "-q", "-o", "levels/lod-meta.json")
         assert run(["init", "blob.nrrd", *LOOK, *many]) == 0
     module = bench(name, **constants)
     for line in words.split("; "):
@@ -213,7 +213,7 @@ def test_pages_that_draw_by_the_rule_agree(bench, scenes, monkeypatch):
             {},
         ),
     )
-    call(module.main, f"SCENES -o a.csv --pictures pictures --gaussians 500 --size {SIZE}", scenes)
+    call(module.main, f"SCENES -o a.csv --pictures pictures --gaussians 500 --screen {SIZE}", scenes)
     rows = list(csv.DictReader(Path("a.csv").read_text().splitlines()))
     assert all(20 < float(row["command"]) == float(row["page"]) < float(row["agreement"]) for row in rows)
     viewers = bench("viewers", SIZE=SIZE)

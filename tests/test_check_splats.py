@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
     data = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / (2 * s * s)) for (a, b, c), s in blobs)
     np.save(made / "blobs.npy", np.clip(255 * data, 0, 255).astype(np.uint8))
     (made / "tf.json").write_text(json.dumps({"points": POINTS}))
-    look = ["--tf", str(made / "tf.json"), "--size", "128", "--max-gaussians", "2000", "--steps", "8"]
+    look = ["--tf", str(made / "tf.json"), "--screen", "128", "--max-gaussians", "2000", "--steps", "8"]
     assert run(["convert", str(made / "blobs.npy"), *look, "-o", str(made / "good.ply"), "--quiet"]) == 0
     return made
 

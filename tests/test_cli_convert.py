@@ -15,7 +15,7 @@ from vvgt_cli.images.metrics import psnr
 from vvgt_cli.score.viewing import viewing_conditions
 
 ROOT = Path(__file__).parent.parent
-SMALL = ("--max-gaussians", 300, "--size", 48)
+SMALL = ("--max-gaussians", 300, "--screen", 48)
 SOURCE = "example:marschner-lobb:24"
 
 

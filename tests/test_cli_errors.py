@@ -60,12 +60,12 @@ CASES = {
     "no output": (("convert", "v.raw", *RAW), 2, "--output"),
     "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
     "degree": ((*CONVERT, "--sh-degree", 4), 2, "--sh-degree"),
-    "max-size unit": (
-        (*CONVERT, "--max-size", "5MX"),
+    "max-megabytes unit": (
+        (*CONVERT, "--max-megabytes", "5MX"),
         2,
         "'5MX' is not a file size; expected a number above 0, with b, kb",
     ),
-    "max-size": ((*CONVERT, "--max-size", "100B"), 2, "no Gaussian fits"),
+    "max-megabytes": ((*CONVERT, "--max-megabytes", "100B"), 2, "no Gaussian fits"),
     "time budget": ((*CONVERT, "--time-budget", "0m"), 2, "is not a time"),
     "an expanded glob": (
         ("convert", "good.json", "v.raw", "broken.json", "-o", "out.ply"),
@@ -131,7 +131,7 @@ def test_what_appears_during_the_work_is_not_replaced(late, folder, vvgt, monkey
     load = opening.load
     monkeypatch.setattr(opening, "load", load_and_be_late)
     outputs = ("-o", "a.ply", "--report", "a.json", "--preview", "a.png")
-    few = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--tf", "good.json")
+    few = ("--max-gaussians", 50, "--screen", 24, "--steps", 0, "--tf", "good.json")
     assert f"{late} exists; give --overwrite" in vvgt.fails(2, "convert", "v.raw", *RAW, *few, *outputs)
     assert Path(late).read_bytes() == b"theirs"
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]  # no temporary file
@@ -146,7 +146,7 @@ def test_a_directory_that_is_not_writable(folder, vvgt):
 
 def test_a_size_that_does_not_fit_in_memory(folder, vvgt, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 2**27)
-    assert "--size 2000" in vvgt.fails(2, "convert", "v.raw", *RAW, "-o", "a.ply", "--size", 2000)
+    assert "--screen 2000" in vvgt.fails(2, "convert", "v.raw", *RAW, "-o", "a.ply", "--screen", 2000)
 
 
 def test_version_and_help(vvgt):

@@ -34,7 +34,7 @@ def made(tmp_path_factory):
     volume = ("example:blob:16", "--tf", "viridis")
     views = ("--views", 6, "--test-views", 1, "--size", 32, "-o", folder / "views")
     assert run([str(arg) for arg in ("render-views", *volume, *views, "--quiet")]) == 0
-    start = ("init", *volume, "--max-gaussians", 300, "--size", 32, "-o", folder / "init.ply", "--quiet")
+    start = ("init", *volume, "--max-gaussians", 300, "--screen", 32, "-o", folder / "init.ply", "--quiet")
     assert run([str(arg) for arg in start]) == 0
     gaussians, _ = read_ply(folder / "init.ply")
     world = PlyOptions(frame="world", up="z", scale=0.5, centre=(3.0, 4.0, 5.0), unit_distance=0.7)

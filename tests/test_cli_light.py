@@ -16,7 +16,7 @@ from vvgt_cli.look.lighting import MATTE, Lighting, LightOptions
 from vvgt_cli.volume import Volume
 
 SOURCE = "example:marschner-lobb:24"
-SMALL = ("--max-gaussians", "300", "--size", "48", "--steps", "24")
+SMALL = ("--max-gaussians", "300", "--screen", "48", "--steps", "24")
 FUNCTION = {
     "points": [{"x": 0.0, "rgb": [1, 0.5, 0.2], "opacity": 0}, {"x": 0.5, "opacity": 0.6}, {"x": 1, "opacity": 0.6}],
     "lighting": {"diffuse": 0.9},
@@ -108,12 +108,12 @@ def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
 
 def test_the_library_takes_names_directions_and_options():
     function = {"points": FUNCTION["points"]}
-    few = {"max_gaussians": 100, "size": 40, "steps": 0}
-    by_name = vvgt_cli.convert(SOURCE, Look(function, light="headlight"), few)
+    few = {"max_gaussians": 100, "screen": 40, "steps": 0}
+    by_name = vvgt_cli.convert(SOURCE, Look(function, light="headlight"), **few)
     assert by_name.field.source.lighting == Lighting()
     assert by_name.gaussians.degree == 2
     assert by_name.normals().shape == by_name.gaussians.means.shape
-    by_direction = vvgt_cli.convert(SOURCE, Look(function, light=(0, 0, 1)), few)
+    by_direction = vvgt_cli.convert(SOURCE, Look(function, light=(0, 0, 1)), **few)
     assert by_direction.field.source.lighting == Lighting(False, ((0, 0, 1),))
     options = LightOptions(("above", "headlight"), shadows=True, specular=0)
     _, images = vvgt_cli.render_views(SOURCE, Look(function, light=options), views=1, size=32)

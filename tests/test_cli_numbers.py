@@ -66,7 +66,7 @@ def test_the_command_line_takes_both_forms(vvgt) -> None:
 def test_a_name_with_line_breaks_stays_on_a_line(vvgt) -> None:
     np.save("a\nb\x85c.npy", blob((12, 12, 12)).data)
     assert "name           a b c" in vvgt.ok("info", "a\nb\x85c.npy").out.decode().split("\n")
-    lines = vvgt.ok("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--size", 32).err.splitlines()
+    lines = vvgt.ok("init", "a\nb\x85c.npy", "-o", "d\ne.ply", "--max-gaussians", 50, "--screen", 32).err.splitlines()
     assert sum(line.startswith("read ") and "a b c: 12 x 12 x 12" in line for line in lines) == 1
     assert sum(line.startswith("write ") and "d e.ply: " in line for line in lines) == 1
     assert "a b" in vvgt("init", "no\nsuch\nfile.nrrd", "-o", "a b.ply").error.replace("no such file.nrrd", "a b")

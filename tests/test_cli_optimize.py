@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("optimize")
     small = ("--views", "9", "--test-views", "2", "--size", "32", "--format", "exr")
     assert run(["render-views", *SCENE, *small, "-o", str(folder / "views"), "-q"]) == 0
-    shape = ("--size", "32", "--max-gaussians", "100", "--up", "z", "--sh-degree", "1", "--frame", "world")
+    shape = ("--screen", "32", "--max-gaussians", "100", "--up", "z", "--sh-degree", "1", "--frame", "world")
     assert run(["init", *SCENE, *shape, "-o", str(folder / "in.ply"), "-q"]) == 0
     return folder
 
@@ -166,7 +166,7 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
 
 
 def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
-    small = ("--size", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
+    small = ("--screen", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
     vvgt.ok("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
     report = json.loads((tmp_path / "r.json").read_text())
     stages = {stage["name"]: stage for stage in report["stages"]}

@@ -16,7 +16,7 @@ from tests.headers import uncertified
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import read_ply
 
-INIT = "init example:blob:8 --max-gaussians 20 --size 32"
+INIT = "init example:blob:8 --max-gaussians 20 --screen 32"
 FULL = os.strerror(errno.ENOSPC)
 
 
@@ -61,7 +61,7 @@ def head(tmp_path: Path) -> Path:
     return tmp_path
 
 
-MAKE = "--max-gaussians 50 --size 32 --steps 2 -q"
+MAKE = "--max-gaussians 50 --screen 32 --steps 2 -q"
 
 
 def test_volumes_functions_and_outputs_through_pipes(head):
@@ -114,7 +114,7 @@ def test_a_pipe_is_read_once_and_not_beyond_the_memory(tmp_path, monkeypatch):
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that nobody can write to")
 def test_nothing_but_the_output_need_be_writable(tmp_path):
     """The working folder, the home and the temporary folder are none that could be written to."""
-    line = f"vvgt convert example:blob:8 --max-gaussians 20 --size 32 --steps 2 -q -o {tmp_path}/a.ply"
+    line = f"vvgt convert example:blob:8 --max-gaussians 20 --screen 32 --steps 2 -q -o {tmp_path}/a.ply"
     done = shell(line, Path("/proc"), HOME="/proc", TMPDIR="/proc", XDG_CACHE_HOME="/proc")
     assert (done.returncode, done.stderr) == (0, "")
     assert len(read_ply(tmp_path / "a.ply")[0])

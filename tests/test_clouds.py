@@ -13,7 +13,7 @@ from tests.refused import refused
 from tests.test_index import HOW, LINES, NAMES, SHOWN, TF, at  # noqa: F401 - a fixture
 from tests.test_pages import clouds, same
 
-GOAL = {"max_gaussians": 60, "size": 32, "steps": 0}
+GOAL = {"max_gaussians": 60, "screen": 32, "steps": 0}
 CALLS = {
     "frames": ("four.nii", "bone.json", {}),
     "functions": ("ball.npy", ["bone.json", "skin.json"], {}),
@@ -25,7 +25,7 @@ CALLS = {
 @pytest.mark.parametrize("kind", CALLS)
 def test_files_and_index_are_those_of_the_command(vvgt_run, at, kind, blocks):  # noqa: F811
     volume, look, how = CALLS[kind]
-    result = vvgt.convert(volume, look, GOAL, blocks=blocks, **how)
+    result = vvgt.convert(volume, look, **GOAL, blocks=blocks, **how)
     names = [name for name, _ in NAMES[kind]]
     assert (result.kind, list(result), len(result)) == (kind, names, len(names))
     assert repr(result).endswith(f"{names[0]}, {names[1]}>")
@@ -61,7 +61,7 @@ def vvgt_run(request):
 
 def test_lit_files_keep_their_normals(vvgt_run, at):  # noqa: F811
     look = vvgt.Look("bone.json", light="headlight")
-    vvgt.convert("four.nii", look, GOAL).save("f_{:03d}.ply", sh_degree=0)
+    vvgt.convert("four.nii", look, **GOAL).save("f_{:03d}.ply", sh_degree=0)
     line = ("convert", *LINES["frames"], "--light", "headlight", "--sh-degree", "0", *HOW)
     assert vvgt_run(*line, "-o", "c_{:03d}.ply").code == 0
     normals = [
@@ -74,33 +74,33 @@ def test_lit_files_keep_their_normals(vvgt_run, at):  # noqa: F811
 def test_looks_of_what_is_in_memory_have_their_names(at):  # noqa: F811
     ball, dask = np.load("ball.npy"), pytest.importorskip("dask.array")
     looks = {"red & so on": TF, "lit": vvgt.Look(TF, light="headlight"), "map": "viridis"}
-    result = vvgt.convert(ball, looks, GOAL, spacing=(1, 1, 2))
+    result = vvgt.convert(ball, looks, **GOAL, spacing=(1, 1, 2))
     assert list(result) == list(looks)
-    alone = vvgt.convert(ball, looks["lit"], GOAL, spacing=(1, 1, 2))
+    alone = vvgt.convert(ball, looks["lit"], **GOAL, spacing=(1, 1, 2))
     np.testing.assert_array_equal(result["lit"].gaussians.means, alone.gaussians.means)
-    lazy = vvgt.convert(dask.from_array(ball, chunks=10), looks, GOAL, spacing=(1, 1, 2))
+    lazy = vvgt.convert(dask.from_array(ball, chunks=10), looks, **GOAL, spacing=(1, 1, 2))
     assert list(lazy) == list(looks)
-    again = vvgt.Session(ball, spacing=(1, 1, 2)).convert(looks, GOAL)
+    again = vvgt.Session(ball, spacing=(1, 1, 2)).convert(looks, **GOAL)
     np.testing.assert_array_equal(again["map"].gaussians.means, result["map"].gaussians.means)
     result.save("out.ply")
     assert sorted(path.name for path in at.glob("out_*")) == [
         "out_index.json", "out_lit.ply", "out_map.ply", "out_red-so-on.ply"
     ]  # fmt: skip
-    labels = vvgt.convert(np.load("map.npy"), vvgt.Look(labels="auto"), GOAL, split_labels=True)
+    labels = vvgt.convert(np.load("map.npy"), vvgt.Look(labels="auto"), **GOAL, split_labels=True)
     assert list(labels) == ["label 1", "label 2"]
     lazy = dask.from_array(np.load("map.npy"), chunks=10)
     parts = [
-        vvgt.convert(v, vvgt.Look(labels="auto"), GOAL, split_labels=True, blocks=16) for v in (lazy, lazy.compute())
+        vvgt.convert(v, vvgt.Look(labels="auto"), **GOAL, split_labels=True, blocks=16) for v in (lazy, lazy.compute())
     ]
     for one, other in zip(*(part.values() for part in parts), strict=True):
         np.testing.assert_array_equal(one.gaussians.means, other.gaussians.means)
-    assert list(vvgt.convert("ball*.npy", "bone.json", GOAL)) == ["ball.npy"]
+    assert list(vvgt.convert("ball*.npy", "bone.json", **GOAL)) == ["ball.npy"]
     np.save("ball_2.npy", ball / 2)
-    assert list(vvgt.convert("ball*.npy", "bone.json", GOAL)) == ["ball.npy", "ball_2.npy"]
+    assert list(vvgt.convert("ball*.npy", "bone.json", **GOAL)) == ["ball.npy", "ball_2.npy"]
 
 
 def test_what_several_clouds_cannot_do_is_refused_before_anything_is_written(at):  # noqa: F811
-    result = vvgt.convert("ball.npy", ["bone.json", "skin.json"], GOAL)
+    result = vvgt.convert("ball.npy", ["bone.json", "skin.json"], **GOAL)
     Path("x_skin.ply").write_text("mine")
     for path, how, words in (
         ("x.ply", {"overwrite": False}, "x_skin.ply"),

@@ -155,7 +155,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
     check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 26)
     for pictures, size in ((0, 392), (400**2 * 32 * 23, 288)):  # with those that a series keeps
-        refused(UsageError, f"--size 400.*--size {size} would fit", check_memory, found, pictures)
+        refused(UsageError, f"--screen 400.*--screen {size} would fit", check_memory, found, pictures)
 
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
@@ -295,8 +295,8 @@ def test_views_come_in_sets():
     ("limits", "line"),
     [
         ({"time_budget": 0.0}, "--time-budget 0"),
-        ({"max_megabytes": -1.0}, "--max-size -1"),
-        ({"max_megabytes": float("inf")}, "--max-size inf"),
+        ({"max_megabytes": -1.0}, "--max-megabytes -1"),
+        ({"max_megabytes": float("inf")}, "--max-megabytes inf"),
         ({"target_psnr": float("nan")}, "--target-psnr nan"),
     ],
 )

@@ -12,7 +12,7 @@ from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.refine import loop
 from vvgt_cli.refine.states import OwnAxes
 
-LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "24")
+LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--screen", "32", "--steps", "24")
 
 
 @pytest.fixture

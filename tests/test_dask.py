@@ -16,7 +16,7 @@ from vvgt_cli.volume.stored import Stored, read_block
 da = pytest.importorskip("dask.array")
 
 TF = {"points": [{"x": 0.3, "opacity": 0, "rgb": [0.2, 0.3, 0.9]}, {"x": 1, "opacity": 0.5, "rgb": [1, 0.7, 0.1]}]}
-HOW = {"max_gaussians": 200, "size": 48, "steps": 4}
+HOW = {"max_gaussians": 200, "screen": 48, "steps": 4}
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,8 @@ LOOKS = {
 def test_bytes_are_those_of_the_array_in_blocks(values, tmp_path, name):
     values = np.digitize(values, [0.3, 0.6]).astype(np.uint8) if name == "labels" else values
     array = da.from_array(values, chunks=(13, 16, 20))  # aligned with no block
-    lazy = vvgt.convert(array, LOOKS[name], HOW, spacing=(1, 1, 1.5), blocks=16)
-    whole = vvgt.convert(values, LOOKS[name], HOW, spacing=(1, 1, 1.5), blocks=32)
+    lazy = vvgt.convert(array, LOOKS[name], **HOW, spacing=(1, 1, 1.5), blocks=16)
+    whole = vvgt.convert(values, LOOKS[name], **HOW, spacing=(1, 1, 1.5), blocks=32)
     assert saved(lazy, tmp_path / "lazy.ply") == saved(whole, tmp_path / "whole.ply")
     assert lazy.scores == whole.scores
 
@@ -59,7 +59,8 @@ def test_labelled_arrays_are_lazy_too(values, tmp_path):
     np.testing.assert_array_equal(lazy.data[:], held.data)
     assert (lazy.spacing, lazy.origin, lazy.slope) == (held.spacing, held.origin, held.slope)
     files = [
-        saved(vvgt.convert(volume, TF, HOW, blocks=16), tmp_path / f"{k}.ply") for k, volume in enumerate((lazy, held))
+        saved(vvgt.convert(volume, TF, **HOW, blocks=16), tmp_path / f"{k}.ply")
+        for k, volume in enumerate((lazy, held))
     ]
     assert files[0] == files[1]
     steps = xarray.concat([turned, 2 * turned], "time").chunk({"time": 1, "x": 20})
@@ -97,7 +98,7 @@ def counted(monkeypatch):
 @pytest.mark.parametrize("light", [None, "headlight"])
 def test_few_chunks_are_there_at_once(counted, light):
     array, counts = counted
-    assert len(vvgt.convert(array, vvgt.Look(TF, light=light), HOW, blocks=32).gaussians) > 100
+    assert len(vvgt.convert(array, vvgt.Look(TF, light=light), **HOW, blocks=32).gaussians) > 100
     assert counts["made"] >= 2 * 64  # counted, integrated: every chunk was needed
     assert 3 <= counts["most"] <= 3 + 3 + 1  # kept, computed at once, and one that is let go of
 
@@ -106,7 +107,7 @@ def test_chunks_that_memory_holds_are_made_once(counted, monkeypatch):
     array, counts = counted
     monkeypatch.setattr(dask_arrays, "KEPT", 0.125)
     monkeypatch.setattr(dask_arrays, "free_memory", lambda: 8 * array.nbytes)
-    vvgt.convert(array, TF, HOW, blocks=32)
+    vvgt.convert(array, TF, **HOW, blocks=32)
     assert counts["made"] == 64
 
 
@@ -140,4 +141,4 @@ def test_what_a_chunk_gets_wrong_is_a_line(values):
         "expected integers or floats": array.astype(complex),
     }
     for words, one in wrong.items():
-        refused(vvgt.DataError, words, vvgt.convert, one, TF, HOW)
+        refused(vvgt.DataError, words, vvgt.convert, one, TF, **HOW)

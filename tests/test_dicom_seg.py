@@ -28,7 +28,7 @@ TILT = np.radians(20)
 ROWS = [1, 0, 0, 0, np.cos(TILT), np.sin(TILT)]  # directions along a row and down a column, LPS
 NORMAL = np.cross(ROWS[:3], ROWS[3:])
 CORNER, PIXEL, STEP = np.array([-5.0, 7.0, 20.0]), (0.8, 0.5), 2.0  # between rows and columns, mm; between slices
-SMALL = ("--max-gaussians", 300, "--size", 64, "--steps", 0)
+SMALL = ("--max-gaussians", 300, "--screen", 64, "--steps", 0)
 REFERENCE = "1.2.826.77"
 LIVER, SPLEEN = (255, 51, 0), (0, 0, 255)
 

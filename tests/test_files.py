@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, check_disk_space, claim
 from vvgt_cli.gaussians import read_ply
 
-INIT = ("init", "example:blob:8", "--max-gaussians", "20", "--size", "32")
+INIT = ("init", "example:blob:8", "--max-gaussians", "20", "--screen", "32")
 
 
 def process(code: str, folder: Path, *args: object) -> subprocess.Popen[str]:
@@ -81,7 +81,7 @@ def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     result = vvgt.fails(1, "convert", *INIT[1:], "-o", "a.ply")
     assert "No space left on device: needs 4096 bytes, 2048 are free" in result
     disk["f_bavail"] = 8  # enough to begin with; not for the Gaussians that are found
-    result = vvgt("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "-o", "a.ply")
+    result = vvgt("convert", "example:blob:8", "--max-gaussians", "200", "--screen", "32", "-o", "a.ply")
     assert (result.code, "No space left on device" in result.error) == (1, True)
     assert "closed form" in result.err
     assert "test views" not in result.err

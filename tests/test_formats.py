@@ -144,7 +144,9 @@ def test_unknown_endings_are_refused(name, tmp_path, vvgt):
 
 
 def test_a_size_limit_is_of_a_ply(tmp_path, vvgt):
-    assert "--max-gaussians" in vvgt.fails(2, "convert", "example:blob:8", "-o", tmp_path / "a.spz", "--max-size", 1)
+    assert "--max-gaussians" in vvgt.fails(
+        2, "convert", "example:blob:8", "-o", tmp_path / "a.spz", "--max-megabytes", 1
+    )
 
 
 def test_positions_that_spz_cannot_hold(tmp_path):
@@ -219,7 +221,7 @@ def test_a_usd_stage_is_turned_upright():
 
 
 def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
-    little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
+    little = ("--max-gaussians", 300, "--screen", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
     result = vvgt.ok("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     found = re.search(r"PSNR ([\d.]+) dB, a \.ply would have ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
     after, before, cost = map(float, found.groups())

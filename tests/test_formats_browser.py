@@ -167,7 +167,7 @@ def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_of_a_volume_shows_its_conversion_until_the_function_is_changed(tmp_path: Path) -> None:
-    how = ["example:marschner-lobb:32", "--max-gaussians", "3000", "--size", "200", "--steps", "0", "--quiet"]
+    how = ["example:marschner-lobb:32", "--max-gaussians", "3000", "--screen", "200", "--steps", "0", "--quiet"]
     assert run(["convert", *how, "-o", str(tmp_path / "both.html")]) == 0
     assert run(["convert", *how, "--no-values", "-o", str(tmp_path / "small.html")]) == 0
     wanted, _ = shoot((tmp_path / "small.html").as_uri(), tmp_path)

@@ -20,7 +20,7 @@ from vvgt_cli.images.files import read_png
 from vvgt_cli.splat import render
 from vvgt_cli.volume import ReadOptions, read_volume
 
-SMALL = ("--max-gaussians", 400, "--size", 64, "-q")
+SMALL = ("--max-gaussians", 400, "--screen", 64, "-q")
 
 
 @pytest.fixture(autouse=True)
@@ -250,7 +250,7 @@ def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
 
 
 def evaluated(vvgt, ply: str, volume: str, *options: str) -> dict:
-    how = "--tf tf.json --size 48 --no-conditions --step 0.5 --json"
+    how = "--tf tf.json --screen 48 --no-conditions --step 0.5 --json"
     result = vvgt.ok("evaluate", ply, "--volume", volume, how, *options)
     return json.loads(result.out)["scores"] | {"said": result.err}
 
@@ -310,7 +310,7 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
         index = np.round((world - straight[:3, 3]) / anatomy.ZOOMS).astype(int)
         both = anatomy.letter(straight) + anatomy.balls(straight)
         anatomy.nifti(Path(name), both[index[..., 2], index[..., 1], index[..., 0]], affine)
-        options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png")
+        options = ("--max-gaussians", 400, "--screen", 64, "--steps", 0, "--preview", f"{name}.png")
         options += ("-o", f"{name}.ply")
         vvgt.ok("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
         pictures.append(read_png(f"{name}.png"))

@@ -8,7 +8,7 @@ import pytest
 from tests.headers import uncertified
 from tests.test_streamed import contents
 
-HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
+HOW = ("--max-gaussians", "60", "--screen", "32", "--steps", "2")
 
 
 @pytest.fixture

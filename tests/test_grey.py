@@ -166,7 +166,7 @@ def test_exposure_depends_on_neither_the_unit_distance_nor_the_histograms_size()
 def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("grey") / "live.ply"
     source = ["convert", "example:marschner-lobb:32", "--live", "--tf", "viridis", "--max-gaussians", "20000"]
-    assert run([*source, "--size", "200", "--quiet", "-o", str(path)]) == 0
+    assert run([*source, "--screen", "200", "--quiet", "-o", str(path)]) == 0
     return path
 
 
@@ -191,7 +191,7 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
     vvgt.ok("recolor", live, "--tf", "viridis", "-o", tmp_path / "fixed.ply")
     labels = tmp_path / "labels.ply"
     np.save(tmp_path / "map.npy", np.arange(512).reshape(8, 8, 8).astype(np.uint8) // 128)
-    vvgt.ok("convert", tmp_path / "map.npy", "--labels auto --live --max-gaussians 200 --size 64 -o", labels)
+    vvgt.ok("convert", tmp_path / "map.npy", "--labels auto --live --max-gaussians 200 --screen 64 -o", labels)
     out = tmp_path / "a.png"
     for rule in ("mip", "xray"):
         for arguments, code, text in (
@@ -209,7 +209,7 @@ def test_what_mip_and_x_ray_do_not_go_with(vvgt, live: Path, tmp_path: Path) -> 
 
 
 def test_a_live_result_draws_them() -> None:
-    result = vvgt_library.convert("example:blob:16", goal={"max_gaussians": 300, "size": 48}, live=True)
+    result = vvgt_library.convert("example:blob:16", max_gaussians=300, screen=48, live=True)
     mip, xray = (result.render(size=SIZE, rule=rule) for rule in ("mip", "xray"))
     assert mip.shape == xray.shape == (SIZE, SIZE, 4)
     assert mip[SIZE // 2, SIZE // 2, 0] > 0.7 > xray[0, 0, 0]

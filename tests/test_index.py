@@ -14,7 +14,7 @@ from vvgt_cli.conversion.index import function_name, index_path
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import read_ply
 
-HOW = ("--max-gaussians", 60, "--size", 32, "--steps", 0)
+HOW = ("--max-gaussians", 60, "--screen", 32, "--steps", 0)
 TF = {"points": [{"x": 0.1, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 1, "opacity": 0.6, "rgb": [1, 1, 0]}]}
 
 

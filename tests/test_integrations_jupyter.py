@@ -20,7 +20,7 @@ import json, numpy as np, vvgt_cli as vvgt
 from vvgt_cli.integrations.jupyter import SplatWidget
 values = np.indices((24, 22, 20)).sum(axis=0).astype(np.float32)
 points = [{"x": 0, "opacity": 0, "rgb": [0, 0, 1]}, {"x": 63, "opacity": 0.5, "rgb": [1, 0.5, 0]}]
-result = vvgt.convert(values, {"points": points}, {"max_gaussians": 500, "size": 100, "steps": 4})
+result = vvgt.convert(values, {"points": points}, max_gaussians=500, screen=100, steps=4)
 widget = SplatWidget(result, camera="left")
 widget
 """,

@@ -13,8 +13,8 @@ from tests.vtk_scenes import FIELD, INDEX, LUMP, ORIGIN, SIZE, SPACING, lump, pl
 
 pyvista = pytest.importorskip("pyvista")
 RAMP = [0, 0.1, 0.5, 0.9]
-FEW = {"size": 64, "max_gaussians": 300, "steps": 0}
-FINE = {"size": SIZE, "max_gaussians": 20_000, "steps": 60}
+FEW = {"screen": 64, "max_gaussians": 300, "steps": 0}
+FINE = {"screen": SIZE, "max_gaussians": 20_000, "steps": 60}
 
 
 def plotter(*grids: Any, opacity: Any = RAMP, **options: Any) -> Any:
@@ -35,7 +35,7 @@ def plotter(*grids: Any, opacity: Any = RAMP, **options: Any) -> Any:
 
 def test_function_light_and_camera_are_the_plotters(tmp_path: Path) -> None:
     shown = plotter(shade=True, ambient=0.3, specular=0.4, specular_power=5.0)
-    result = vvgt.export_plotter(shown, tmp_path / "a.html", FEW)
+    result = vvgt.export_plotter(shown, tmp_path / "a.html", **FEW)
     assert result.ply.camera == pytest.approx((*shown.camera.position, *shown.camera.focal_point, FIELD))
     assert result.ply.up == "z"
     assert (result.ply.light.headlight, result.ply.light.ambient, result.ply.light.specular_power) == (True, 0.3, 20)
@@ -49,7 +49,7 @@ def test_what_is_not_taken_is_one_warning(tmp_path: Path) -> None:
     shown.add_mesh(pyvista.Sphere())
     shown.volume.prop.interpolation_type = "nearest"
     with pytest.warns(UserWarning, match=r"not taken from the plotter: 1 surface; nearest-neighbour") as heard:
-        vvgt.export_plotter(shown, tmp_path / "a.spz", FEW)
+        vvgt.export_plotter(shown, tmp_path / "a.spz", **FEW)
     assert len(heard) == 1
     assert (tmp_path / "a.spz").exists()
 
@@ -70,14 +70,14 @@ def test_a_plotter_without_a_volume_is_refused(tmp_path: Path) -> None:
     two.set_active_scalars("pair")
     shown.mapper.SetInputData(two)
     with pytest.raises(vvgt.UsageError, match="pair: two dependent components"):
-        vvgt.export_plotter(shown, tmp_path / "a.html", FEW)
+        vvgt.export_plotter(shown, tmp_path / "a.html", **FEW)
 
 
 def test_shading_of_further_volumes_is_named(tmp_path: Path) -> None:
     shown = plotter(pyvista.wrap(lump()), pyvista.wrap(lump()), shade=True, ambient=0.3)
     shown.volume.prop.ambient = 0.6  # of the second
     with pytest.warns(UserWarning, match="plotter: ambient, diffuse, specular and power of other volumes than the"):
-        vvgt.export_plotter(shown, tmp_path / "a.ply", FEW)
+        vvgt.export_plotter(shown, tmp_path / "a.ply", **FEW)
 
 
 def test_volumes_beside_each_other_are_lit_as_the_plotters(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_volumes_beside_each_other_are_lit_as_the_plotters(tmp_path: Path) -> No
     shown = plotter(grid, moved(grid), shade=True, ambient=0.3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        result = vvgt.export_plotter(shown, tmp_path / "a.ply", FEW)
+        result = vvgt.export_plotter(shown, tmp_path / "a.ply", **FEW)
     assert result.ply.light.ambient == 0.3
     assert np.ptp(result.gaussians.means, axis=0).max() > 0.8  # both of them
 
@@ -146,7 +146,7 @@ def test_beside_pyvistas_own_picture(case: str, least: float, tmp_path: Path) ->
         shown.mapper.SetCroppingRegionPlanes(*np.stack([low, high], axis=1).ravel())
         shown.mapper.SetCroppingRegionFlagsToSubVolume()
     theirs = shown.screenshot(return_img=True)
-    result = vvgt.export_plotter(shown, tmp_path / "a.ply", FINE)
+    result = vvgt.export_plotter(shown, tmp_path / "a.ply", **FINE)
     ours = result.render(seen_by(shown.renderer, result.ply, SIZE))
     assert theirs.max() > 60
     found = psnr(ours, theirs)

@@ -45,7 +45,7 @@ def test_arguments_are_taken_as_slicer_gives_them(vvgt, tmp_path) -> None:
     (tmp_path / "tf.json").write_text(
         '{"points": [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 90, "opacity": 0.5, "rgb": [1, 1, 0]}]}'
     )
-    words = ("--tf", tmp_path / "tf.json", "--layer", tmp_path / "b.npy", "--max_gaussians", 300, "--size", 64)
+    words = ("--tf", tmp_path / "tf.json", "--layer", tmp_path / "b.npy", "--max_gaussians", 300, "--screen", 64)
     result = vvgt.ok("--slicer", *words, tmp_path / "a.npy", tmp_path / "out_1.ply")
     header = read_ply(tmp_path / "out_1.ply")[1]
     assert header.screen_size == 64

@@ -36,7 +36,7 @@ def test_a_page_is_made_once_and_the_same_again(tmp_path: Path) -> None:
         words = [snakemake, "--snakefile", ROOT / "examples" / "splats.smk", "--cores", "1", *more, "--config"]
         where = {"PATH": f"{command.parent}:{os.environ['PATH']}", "SNAKEMAKE_OUTPUT_CACHE": str(tmp_path / "cache")}
         done = subprocess.run(
-            [*words, "options=--max-gaussians 300 --size 64 --steps 2", "--", "a.html"], cwd=folder,
+            [*words, "options=--max-gaussians 300 --screen 64 --steps 2", "--", "a.html"], cwd=folder,
             env=os.environ | where, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr

@@ -9,7 +9,7 @@ from tests.processes import python
 
 xarray = pytest.importorskip("xarray")
 
-GOAL = {"max_gaussians": 100, "size": 32, "steps": 0}
+GOAL = {"max_gaussians": 100, "screen": 32, "steps": 0}
 
 
 def array():
@@ -20,13 +20,13 @@ def array():
 
 def test_it_converts_as_the_library_does() -> None:
     step = array().isel(time=1)
-    ours, same = step.vvgt.convert("viridis", GOAL), vvgt_cli.convert(step, "viridis", GOAL)
+    ours, same = step.vvgt.convert("viridis", **GOAL), vvgt_cli.convert(step, "viridis", **GOAL)
     np.testing.assert_array_equal(ours.gaussians.means, same.gaussians.means)
     assert ours.ply.centre == (1.75, 1.5, 11.0)  # by the coordinates
-    later = array().vvgt.convert("viridis", GOAL, time=1)
+    later = array().vvgt.convert("viridis", **GOAL, time=1)
     np.testing.assert_array_equal(later.gaussians.means, same.gaussians.means)
     with pytest.raises(vvgt_cli.UsageError, match="rho: 2 time steps"):
-        array().vvgt.convert("viridis", GOAL)
+        array().vvgt.convert("viridis", **GOAL)
     assert array().vvgt.session(time=0).volume.dims == (8, 10, 12)
 
 
@@ -43,7 +43,7 @@ def test_arrays_of_dask_are_never_read_as_a_whole() -> None:
         return dask.get(graph, keys, **more)
 
     with dask.config.set(scheduler=get):
-        assert len(lazy.vvgt.convert("viridis", GOAL, blocks=16).gaussians) > 50
+        assert len(lazy.vvgt.convert("viridis", **GOAL, blocks=16).gaussians) > 50
     assert len(asked) >= 8
     assert max(asked) < 8  # chunks at once, of eight
 

@@ -16,7 +16,7 @@ from vvgt_cli.look import read_transfer_function, resolve
 from vvgt_cli.volume import statistics
 from vvgt_cli.volume.types import Volume
 
-SMALL = ("--max-gaussians", 100, "--size", 32)
+SMALL = ("--max-gaussians", 100, "--screen", 32)
 Z, Y, X = np.mgrid[-1:1:20j, -1:1:20j, -1:1:20j]
 R = np.sqrt(X**2 + Y**2 + Z**2)
 BALL = np.clip(1 - R, 0, None).astype(np.float32)  # 0 around it, 1 in the middle
@@ -127,8 +127,8 @@ def test_commands_take_levels_in_memory_in_blocks_and_live(tmp_path: Path, vvgt)
 
 
 def test_the_library_takes_levels() -> None:
-    goal = {"max_gaussians": 100, "size": 32, "steps": 0}
-    lit = library.convert(BALL, library.Look(iso="2sigma"), goal)
+    goal = {"max_gaussians": 100, "screen": 32, "steps": 0}
+    lit = library.convert(BALL, library.Look(iso="2sigma"), **goal)
     assert lit.ply.light is not None
-    assert library.convert(BALL, library.Look(iso=[0.2, 0.5], light="none"), goal).ply.light is None
-    refused(UsageError, "isosurfaces and a function", library.convert, BALL, library.Look("hot", iso=0.5), goal)
+    assert library.convert(BALL, library.Look(iso=[0.2, 0.5], light="none"), **goal).ply.light is None
+    refused(UsageError, "isosurfaces and a function", library.convert, BALL, library.Look("hot", iso=0.5), **goal)

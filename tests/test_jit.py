@@ -18,7 +18,7 @@ from vvgt_cli.jit.store import folders
 
 ROOT = Path(__file__).parent.parent
 SOURCE = "example:marschner-lobb:24"
-SMALL = ("--max-gaussians", "200", "--size", "40")
+SMALL = ("--max-gaussians", "200", "--screen", "40")
 STEP = (
     "from vvgt_cli.refine.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
     "adam(a, a.copy(), 0.1, 0.9, 0.99, 1, a * 0, a * 0); print(a)"
@@ -46,7 +46,7 @@ def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
     """Run the commands that draw, each in a process of its own; what they leave."""
     place.mkdir()
     for line in (
-        f"convert {SOURCE} --max-gaussians 200 --size 40 --steps 12 -o a.ply",
+        f"convert {SOURCE} --max-gaussians 200 --screen 40 --steps 12 -o a.ply",
         f"render-views {SOURCE} --views 6 --test-views 2 --size 40 -o views",
         "optimize a.ply --views views --steps 6 -o b.ply",
         "infer a.ply --views views --model vvgt-small -o c.ply",
@@ -184,10 +184,10 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     rare = {
         f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")
     }  # of opaque scenes
-    fit = ("--max-gaussians", 200, "--size", 64, "-q")
+    fit = ("--max-gaussians", 200, "--screen", 64, "-q")
     rare |= set(ahead.REGRESS)  # and of more than a few Gaussians
     assert wanted("convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
-    many = ("--max-gaussians", 1500, "--size", 650, "-q", "--steps", 24)  # and scored on blocks
+    many = ("--max-gaussians", 1500, "--screen", 650, "-q", "--steps", 24)  # and scored on blocks
     assert set(ahead.REGRESS) <= wanted("convert", SOURCE, *many, "-o", "o.ply")
     assert wanted("init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
     (tmp_path / "v_24x24x24_uint8.raw").write_bytes(bytes(range(216)) * 64)
@@ -209,7 +209,7 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path, spied):
     seen_by_many = ("o.ply", *seen[1:], "--steps", 3, "-qo", "p.ply")
     assert set(ahead.SHARED) <= wanted("optimize", *seen_by_many) <= set(ahead.OPTIMIZE)
     assert wanted("infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
-    assert wanted("evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
+    assert wanted("evaluate", "a.ply", "--volume", SOURCE, "--screen", 24, "-q") == set(ahead.EVALUATE)
     assert wanted("render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
     lit = wanted("convert", SOURCE, *fit, "--steps", 24, "--light", "headlight", "-o", "e.ply")
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare

@@ -19,7 +19,7 @@ from vvgt_cli.look.labels import LabelTable, distinct
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
-SMALL = ("--max-gaussians", 300, "--size", 64, "--steps", 0)
+SMALL = ("--max-gaussians", 300, "--screen", 64, "--steps", 0)
 SLICER = "# Color table file\n1 skin 255 51 0 128\n3 inner_core 0 0 255 255\n"
 FREESURFER = "#No. Label Name: R G B A\n0 Unknown 0 0 0 0\n1 skin 255 51 0 127\n\n3 inner_core 0 0 255 0\n"
 SNAP = '# ITK-SnAP\n0 0 0 0 0 0 0 "Clear Label"\n1 255 51 0 0.5 1 1 "skin"\n3 0 0 255 1 1 1 "inner_core"\n'
@@ -189,11 +189,11 @@ def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
 def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
     path = tmp_path / "x.seg.nrrd"
     path.write_bytes(SEGMENTS.replace("sizes: 2 2 2", "sizes: 24 24 24").encode() + balls().tobytes())
-    how = {"max_gaussians": 100, "size": 48, "steps": 0}
+    how = {"max_gaussians": 100, "screen": 48, "steps": 0}
     session = library.Session(path)
-    found, wanted = session.convert(goal=how).gaussians, library.convert(path, goal=how).gaussians
+    found, wanted = session.convert(**how).gaussians, library.convert(path, **how).gaussians
     np.testing.assert_array_equal(found.colors, wanted.colors)
-    assert not np.array_equal(session.convert("gray", how).gaussians.colors, found.colors)
+    assert not np.array_equal(session.convert("gray", **how).gaussians.colors, found.colors)
 
 
 def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
@@ -272,7 +272,7 @@ def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> No
 
 def test_in_python() -> None:
     entries = {1: {"color": [1, 0, 0], "opacity": 0.1}, 3: {"color": "#0000ff"}}
-    result = library.convert(balls(), library.Look(labels=entries), {"max_gaussians": 300, "size": 64, "steps": 0})
+    result = library.convert(balls(), library.Look(labels=entries), max_gaussians=300, screen=64, steps=0)
     assert result.gaussians.colors[:, 1].max() < 0.05
     _, images = library.render_views(balls(), library.Look(labels=entries), views=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
@@ -367,7 +367,7 @@ def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> N
     again = table(
         tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
     )
-    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 2, "--size", 24, "-q")
+    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 2, "--screen", 24, "-q")
     for options, others in (
         (("--labels", labels), False),
         (("--labels", again), False),  # other names, and a label that the volume has not got

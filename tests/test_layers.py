@@ -112,12 +112,12 @@ def test_the_largest_body_is_kept_in_memory_in_blocks_and_live(tmp_path: Path, v
     with pytest.raises(DataError, match="--keep-largest 300: no voxel lies above"):
         read_volume(str(tmp_path / "v.npy"), ReadOptions(keep_largest=300))
     refused(UsageError, "--keep-largest nan: expected a finite", ReadOptions, keep_largest=float("nan"))
-    whole = library.convert(values, "gray:0.9,1", {"max_gaussians": 200, "size": 40, "steps": 0}, keep_largest=-300)
+    whole = library.convert(values, "gray:0.9,1", max_gaussians=200, screen=40, steps=0, keep_largest=-300)
     assert whole.gaussians.means[:, 0].max() < 0.2
     few, blocks = ("--steps", 0), ("--blocks", 16)
     runs = {"a": few, "b": (*few, *blocks), "c": (*few, *blocks, "--workers", 2), "live": ("--live",)}
     for name, more in runs.items():
-        given = ("--tf", "gray:0.9,1", "--keep-largest", -300, "--max-gaussians", 200, "--size", 40, *more)
+        given = ("--tf", "gray:0.9,1", "--keep-largest", -300, "--max-gaussians", 200, "--screen", 40, *more)
         with pytest.warns(UserWarning, match=r"hides 40\.7 % of the voxels above it") as notes:
             made = vvgt("convert", tmp_path / "v.npy", *given, "-o", tmp_path / f"{name}.ply")
         assert made.code == 0, made.err
@@ -196,7 +196,7 @@ def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int)
 
 def test_the_largest_body_of_colours_is_refused_and_each_channel_has_its_own(vvgt, tmp_path: Path) -> None:
     write_nrrd(tmp_path / "a.nrrd", colors())
-    given = ("convert", tmp_path / "a.nrrd", "--max-gaussians 100 --size 40 --steps 0 -o", tmp_path / "a.ply")
+    given = ("convert", tmp_path / "a.nrrd", "--max-gaussians 100 --screen 40 --steps 0 -o", tmp_path / "a.ply")
     for more in ((), ("--blocks", 16), ("--component", "color")):
         done = vvgt.fails(2, *given, "--keep-largest", 10, *more)
         assert "a.nrrd has colours; expected scalars: give a --mask" in done
@@ -311,8 +311,8 @@ def test_several_channels_by_names_and_numbers(vvgt, tmp_path: Path, asked: str,
 
 def test_several_channels_in_python_and_of_a_layer(tmp_path: Path) -> None:
     write_ome(tmp_path / "a.ome.tif")
-    goal = {"max_gaussians": 50, "size": 32, "steps": 0}
-    made = [library.convert(tmp_path / "a.ome.tif", goal=goal, component=how) for how in (["cyan", 0], "1,red")]
+    goal = {"max_gaussians": 50, "screen": 32, "steps": 0}
+    made = [library.convert(tmp_path / "a.ome.tif", **goal, component=how) for how in (["cyan", 0], "1,red")]
     np.testing.assert_array_equal(made[0].gaussians.means, made[1].gaussians.means)
     assert library.read_volume(tmp_path / "a.ome.tif", component=["cyan"]).data.max() == 3000
     source = load(replace(parse_layer(f"{tmp_path / 'a.ome.tif'},channel=cyan,0")))
@@ -438,11 +438,11 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
 
 
 def test_in_python() -> None:
-    few = {"max_gaussians": 100, "size": 32, "steps": 0}
-    part = library.convert(cloud().data, goal=few, crop="2:8,:,:", mask=np.ones((10, 12, 14)))
+    few = {"max_gaussians": 100, "screen": 32, "steps": 0}
+    part = library.convert(cloud().data, **few, crop="2:8,:,:", mask=np.ones((10, 12, 14)))
     assert part.gaussians.means.shape[1] == 3
     request = SourceRequest(Volume(balls(12)), labels="auto")
-    both = library.convert(Volume(balls(12).astype(np.float32)), library.Look("gray", layers=[request]), few)
+    both = library.convert(Volume(balls(12).astype(np.float32)), library.Look("gray", layers=[request]), **few)
     assert np.ptp(both.gaussians.colors) > 0.1
 
 

@@ -21,7 +21,6 @@ from tests.processes import python
 from tests.refused import refused
 from vvgt_cli.commands.main import COMMANDS
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.library import functions
 
 ROOT = Path(__file__).parent.parent
 TF = {
@@ -33,7 +32,7 @@ TF = {
     "opacity_unit_distance": 1.5,
 }
 SPACING = (1.0, 1.5, 2.0)
-HOW = {"max_gaussians": 300, "size": 48, "steps": 6}
+HOW = {"max_gaussians": 300, "screen": 48, "steps": 6}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,7 @@ def field() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def converted(field) -> vvgt.Conversion:
-    return vvgt.convert(field, TF, HOW, spacing=SPACING)
+    return vvgt.convert(field, TF, **HOW, spacing=SPACING)
 
 
 def saved(result: vvgt.Result, path: Path) -> bytes:
@@ -59,12 +58,12 @@ def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
     field.tofile(tmp_path / "a.raw")
     (tmp_path / "tf.json").write_text(json.dumps(TF))
     read = ("--dims", "20", "16", "12", "--dtype", "float32", "--spacing", *map(str, SPACING))
-    how = ("--max-gaussians", "300", "--size", "48", "--steps", "6", "--tf", str(tmp_path / "tf.json"), "-q")
+    how = ("--max-gaussians", "300", "--screen", "48", "--steps", "6", "--tf", str(tmp_path / "tf.json"), "-q")
     assert run(["convert", str(tmp_path / "a.raw"), *read, *how, "-o", str(tmp_path / "a.ply")]) == 0
     written = uncertified(tmp_path / "a.ply")
     assert saved(converted, tmp_path / "b.ply") == written
     read = {"dims": (20, 16, 12), "dtype": "float32", "spacing": SPACING}
-    path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", HOW, **read)
+    path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", **HOW, **read)
     assert saved(path, tmp_path / "c.ply") == written
     header = written[: written.index(b"end_header")].decode()
     assert "frame world" in saved_world(converted, tmp_path / "w.ply")
@@ -88,7 +87,7 @@ def test_what_is_in_memory_is_read_alike(field, converted, tmp_path):
     inputs["volume"] = (vvgt.read_volume(field, spacing=SPACING), {})
     inputs["pyvista's"] = (grid["values"].reshape(field.shape), {"spacing": SPACING})  # has the methods of VTK's arrays
     for name, (volume, reading) in inputs.items():
-        result = vvgt.convert(volume, TF, HOW, **reading)
+        result = vvgt.convert(volume, TF, **HOW, **reading)
         unnamed = saved(result, tmp_path / f"{name}.ply").replace(b'"quantity": "values"', b'"quantity": ""')
         assert unnamed == wanted, name
 
@@ -103,12 +102,12 @@ def test_masked_values_are_nan(field):
 
 def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):
     session = vvgt.Session(field, spacing=SPACING)
-    alone = [saved(vvgt.convert(field, tf, HOW, spacing=SPACING), tmp_path / f"{tf}.ply") for tf in ("gray", "hot")]
+    alone = [saved(vvgt.convert(field, tf, **HOW, spacing=SPACING), tmp_path / f"{tf}.ply") for tf in ("gray", "hot")]
     from vvgt_cli.dvr import bricks
 
     monkeypatch.setattr(bricks, "brick_ranges", None)  # neither laid out again
     monkeypatch.setattr("vvgt_cli.volume.statistics", None)  # nor counted
-    together = [saved(session.convert(tf, HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
+    together = [saved(session.convert(tf, **HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
     assert together == alone
     _, images = vvgt.render_views(session, "gray", views=1, size=32)
     assert images[..., 3].max() > 0
@@ -122,7 +121,7 @@ def test_a_session_of_colours_is_its_file_in_blocks_too(field, tmp_path):
     tifffile.imwrite(tmp_path / "rgb.tif", colors, photometric="rgb")
     few = HOW | {"max_gaussians": 40, "steps": 0}
     made = [
-        saved(vvgt.convert(volume, None, few, blocks=16), tmp_path / f"{k}.ply")
+        saved(vvgt.convert(volume, None, **few, blocks=16), tmp_path / f"{k}.ply")
         for k, volume in enumerate((tmp_path / "rgb.tif", vvgt.Session(tmp_path / "rgb.tif")))
     ]
     assert made[0] == made[1]
@@ -205,38 +204,54 @@ def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     assert not (tmp_path / "x.obj").exists()
 
 
-def test_a_goal_that_is_none_is_a_line():
-    with pytest.raises(vvgt.UsageError, match="goal: steeps; expected any of max_gaussians"):
-        vvgt.convert(np.zeros((4, 4, 4)), None, {"steeps": 3})
+def test_an_option_that_is_none_is_a_line():
+    refused(vvgt.UsageError, "steeps: unknown option", vvgt.convert, np.zeros((4, 4, 4)), steeps=3)
+
+
+def test_a_conversion_with_an_output_is_the_file(field, tmp_path):
+    result = vvgt.convert(field, TF, tmp_path / "a.ply", **HOW, report=tmp_path / "r.json")
+    assert np.array_equal(vvgt.read_ply(tmp_path / "a.ply")[0].means, result.gaussians.means)
+    assert json.loads((tmp_path / "r.json").read_text())["scores"]["psnr"] == result.scores["psnr"]
+    refused(vvgt.UsageError, "exists", vvgt.convert, field, TF, tmp_path / "a.ply", **HOW)
+    assert "check views" in vvgt.convert(field, TF, tmp_path / "b.ply", **HOW, dry_run=True)
+    assert not (tmp_path / "b.ply").exists()
+    vvgt.init(field, TF, tmp_path / "c.ply", max_gaussians=50)
+    assert len(vvgt.read_ply(tmp_path / "c.ply")[0]) <= 50
+    assert vvgt.convert(field, [TF, "hot"], tmp_path / "{}.ply", **HOW) is None
+    assert len(list(tmp_path.glob("*.ply"))) == 4
 
 
 def test_the_library_goes_through_blocks_too(tmp_path):
     data = np.random.default_rng(0).random((20, 24, 28)).astype(np.float32)
     data.tofile(tmp_path / "v_28x24x20_float32.raw")
-    whole, blocks = (vvgt.convert(tmp_path / "v_28x24x20_float32.raw", TF, HOW, blocks=b) for b in (None, 16))
+    whole, blocks = (vvgt.convert(tmp_path / "v_28x24x20_float32.raw", TF, **HOW, blocks=b) for b in (None, 16))
     assert blocks.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     assert blocks.preview(48).shape == (144, 144, 3)  # pictures that nobody foresaw
     np.testing.assert_allclose(blocks.preview(48)[:, :48], whole.preview(48)[:, :48], atol=0.01)
 
 
-@pytest.mark.parametrize("module", [vvgt, functions, import_module("vvgt_cli.commands.synth")])
+@pytest.mark.parametrize(
+    "module", [vvgt, *map(import_module, ("vvgt_cli.commands.session", "vvgt_cli.commands.synth"))]
+)
 def test_the_examples_in_docstrings_run(module):
     result = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
     assert result.attempted >= 2
     assert result.failed == 0
 
 
-SHARED = [name for name in vvgt.__all__ if name.replace("_", "-") in COMMANDS and name != "convert"]
+SHARED = [name for name in vvgt.__all__ if name.replace("_", "-") in COMMANDS]
 
 
 @pytest.mark.parametrize("name", SHARED)
 def test_a_command_and_its_function_have_the_same_names_and_defaults(name):
-    """Except for groups of options, each of which is one argument."""
+    """Except for groups of options, each of which is one argument, and for what only one of the two can give."""
     command = import_module(f"vvgt_cli.commands.{name}").command
     options = {option.name: option for option in command.params}
     arguments = dict(signature(getattr(vvgt, name)).parameters)
     grouped = {key for key in ("look", "reading", "blocks", "light", "progress") if arguments.pop(key, None)}
-    assert len(SHARED) > 7
+    for key in ("after", "all_views", "command", *(["volume"] if name == "report" else [])):
+        arguments.pop(key, None)
+    assert len(SHARED) > 10
     assert name == "info" or "progress" in grouped
     assert set(arguments) <= set(options)
     for key, argument in arguments.items():
@@ -256,7 +271,7 @@ def test_importing_costs_nothing_and_is_quiet():
 
 
 def test_a_conversion_says_nothing_unless_asked(field, capfd):
-    vvgt.convert(field, TF, {"max_gaussians": 50, "size": 32, "steps": 0})
+    vvgt.convert(field, TF, max_gaussians=50, screen=32, steps=0)
     assert capfd.readouterr() == ("", "")
-    vvgt.convert(field, TF, {"max_gaussians": 50, "size": 32, "steps": 0}, progress=True)
+    vvgt.convert(field, TF, max_gaussians=50, screen=32, steps=0, progress=True)
     assert "closed form" in capfd.readouterr().err

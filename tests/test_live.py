@@ -46,7 +46,7 @@ LO, HI, GRAIN = -20.0, 80.0, 2 / 9
 COLORS = ColorMap(np.array([LO, 20, HI]), np.array([[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]]))
 RAMP = TransferFunction("ramp", PiecewiseOpacity(np.array([0.0, HI]), np.array([0.0, 0.6])), COLORS)
 WINDOW = TransferFunction("window", PiecewiseOpacity(np.array([10.0, 20, 30]), np.array([0.0, 0.5, 0.0])), COLORS)
-SMALL = ("--max-gaussians", 600, "--size", 64)
+SMALL = ("--max-gaussians", 600, "--screen", 64)
 TF = {"name": "w", "points": [{"x": 0.3, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.6, "rgb": [0, 1, 0], "opacity": 0.8}]}
 
 
@@ -241,7 +241,7 @@ def test_cells_are_split_where_values_differ() -> None:
     data = np.full((16, 16, 16), 128, np.uint8)
     data[:, :, 8:] = rng.integers(60, 250, (16, 16, 8))
     data[0, 0, 0] = 0
-    result = vvgt_library.convert(data, "viridis", {"max_gaussians": 400, "size": 64}, live=True)
+    result = vvgt_library.convert(data, "viridis", max_gaussians=400, screen=64, live=True)
     assert (result.gaussians.means[:, 0] > 0).mean() > 0.7
 
 
@@ -331,14 +331,14 @@ def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
     for k in range(2):
         np.save(tmp_path / f"f{k}.npy", np.random.default_rng(k).random((6, 7, 8)).astype(np.float32))
     source = ("convert", tmp_path / "f?.npy", "--tf", "viridis", "-o", tmp_path / "o_{}.ply", "--max-gaussians", 90)
-    vvgt.ok(*source, "--size", 48, "--live")
+    vvgt.ok(*source, "--screen", 48, "--live")
     for k in range(2):
         gaussians, header = read_ply(tmp_path / f"o_{k}.ply")
         assert header.live is not None
         assert gaussians.live is not None
         vvgt.ok("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply")
     assert json.loads((tmp_path / "o_index.json").read_text())["files"][1]["file"] == "o_1.ply"
-    assert "live" in vvgt.fails(2, *source, "--size", 48)
+    assert "live" in vvgt.fails(2, *source, "--screen", 48)
 
 
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
@@ -353,7 +353,7 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     found = []
     for blocks in (None, BlockOptions(16)):
         request = ConvertRequest(SourceRequest("example:marschner-lobb:40"), str(tmp_path / "a.ply"), blocks=blocks)
-        request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
+        request = replace(request, fit=FitOptions(max_gaussians=300, screen=64), live=True)
         with open_field(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
             wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
             foggy = field.with_look(field.source.with_function(fog(field.source.statistics)))
@@ -389,7 +389,7 @@ def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
 
 
 def test_the_library_recolors_results_and_files(live_file, tmp_path, vvgt) -> None:
-    result = vvgt_library.convert("example:blob:12", goal={"max_gaussians": 100, "size": 48}, live=True)
+    result = vvgt_library.convert("example:blob:12", max_gaussians=100, screen=48, live=True)
     assert result.gaussians.live is not None
     other = result.recolor("viridis")
     assert other.gaussians.live is None

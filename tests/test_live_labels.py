@@ -163,9 +163,7 @@ def test_labels_of_a_fog_differ_in_colour() -> None:
 
 def test_cells_do_not_straddle_labels() -> None:
     """Where the budget allows it nearly no Gaussian of one label lies in the other."""
-    result = vvgt_library.convert(
-        halves(), vvgt_library.Look(labels="auto"), {"max_gaussians": 800, "size": 48}, live=True
-    )
+    result = vvgt_library.convert(halves(), vvgt_library.Look(labels="auto"), max_gaussians=800, screen=48, live=True)
     live, means = result.gaussians.live, result.gaussians.means
     assert set(live[:, LABEL_ROW]) == {0, 1}
     right = (means[:, 0] > 0) == (live[:, LABEL_ROW] == 1)

@@ -208,7 +208,7 @@ def test_channels_in_python(tmp_path) -> None:
     data = np.random.default_rng(0).integers(0, 255, (8, 2, 12, 12)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "c.ome.tif", data, metadata={"axes": "ZCYX"}, ome=True)
     with pytest.warns(UserWarning, match="2 channels"):
-        result = vvgt_library.convert(str(tmp_path / "c.ome.tif"), None, {"max_gaussians": 400, "size": 48}, live=True)
+        result = vvgt_library.convert(str(tmp_path / "c.ome.tif"), None, max_gaussians=400, screen=48, live=True)
     assert len(result.ply.live.layers) == 2
     other = result.recolor(layers={1: "magma"})
     assert other.ply.function is not None
@@ -216,4 +216,4 @@ def test_channels_in_python(tmp_path) -> None:
     rgb = np.random.default_rng(0).integers(0, 255, (8, 9, 10, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "rgb.tif", rgb, photometric="rgb")
     with pytest.raises(vvgt_library.UsageError, match="has colours, which Gaussians cannot carry"):
-        vvgt_library.convert(str(tmp_path / "rgb.tif"), None, {"max_gaussians": 90, "size": 48}, live=True)
+        vvgt_library.convert(str(tmp_path / "rgb.tif"), None, max_gaussians=90, screen=48, live=True)

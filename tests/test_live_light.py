@@ -111,9 +111,9 @@ def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_pa
     scores = {}
     for light in ("headlight", "none"):
         shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
-        scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--step", 1, "--size", 48).out)["scores"][
-            "psnr"
-        ]
+        scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--step", 1, "--screen", 48).out)[
+            "scores"
+        ]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
     vvgt.ok("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a")
     vvgt.ok("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b")

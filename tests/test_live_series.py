@@ -14,7 +14,7 @@ from tests.test_live_layers import TF, several
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.live_facts import LAYER_ID, shared_facts
 
-SMALL = ("--max-gaussians", 90, "--size", 48)
+SMALL = ("--max-gaussians", 90, "--screen", 48)
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +33,13 @@ def scene_of(page: bytes) -> dict:
 
 
 def test_a_series_in_python_is_live(frames, tmp_path) -> None:
-    goal = {"max_gaussians": 90, "size": 48}
-    clouds = vvgt_library.convert(str(frames / "f?.npy"), "viridis", goal, live=True)
+    goal = {"max_gaussians": 90, "screen": 48}
+    clouds = vvgt_library.convert(str(frames / "f?.npy"), "viridis", **goal, live=True)
     assert isinstance(clouds, vvgt_library.Clouds)
     assert len(clouds["f1.npy"].recolor("magma").gaussians)
     clouds.save(tmp_path / "p.html")
     assert "look" not in scene_of((tmp_path / "p.html").read_bytes())
-    blocked = vvgt_library.convert(str(frames / "f?.npy"), "viridis", goal, live=True, blocks=16)
+    blocked = vvgt_library.convert(str(frames / "f?.npy"), "viridis", **goal, live=True, blocks=16)
     assert isinstance(blocked, vvgt_library.Clouds)
     assert [cloud.ply.live for cloud in blocked.values()] == [cloud.ply.live for cloud in clouds.values()]
     other = clouds.recolor("magma")

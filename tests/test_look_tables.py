@@ -131,7 +131,7 @@ def test_faulty_separated_tables(tmp_path: Path, text: str, said: str) -> None:
 
 def test_hidden_labels_are_named(vvgt, tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", np.repeat(np.arange(4, dtype=np.uint8), 128).reshape(8, 8, 8))
-    small = ("--max-gaussians", 60, "--size", 64, "--overwrite", "-o", tmp_path / "o.ply")
+    small = ("--max-gaussians", 60, "--screen", 64, "--overwrite", "-o", tmp_path / "o.ply")
     table = saved(tmp_path, "t.ctbl", ROWS.format(a=255, b=0, c=0))
     with pytest.warns(UserWarning, match=r"labels: t.ctbl hides 2 of its labels \(opacity 0\): 2 \(bone\), 3 \(fat\)"):
         vvgt.ok("init", tmp_path / "labels.npy", "--labels", table, *small)

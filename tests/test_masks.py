@@ -23,7 +23,7 @@ from vvgt_cli.look.label_files import table_for
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.types import Volume
 
-SMALL = ("--max-gaussians", 300, "--size", 64, "--steps", 0)
+SMALL = ("--max-gaussians", 300, "--screen", 64, "--steps", 0)
 PLACES = {"liver": np.s_[2:9, 2:9, 2:9], "spleen": np.s_[7:12, 7:12, 7:12], "rib_1": np.s_[0:0], "rib_2": np.s_[0, 0]}
 EXPECTED = np.zeros((13, 14, 15), np.uint8)
 for number, name in ((1, "liver"), (3, "rib_2"), (4, "spleen")):  # the smaller one last

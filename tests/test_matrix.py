@@ -16,8 +16,8 @@ tifffile = pytest.importorskip("tifffile")
 
 DIMS = (28, 24, 30)  # z, y, x: eight blocks of 16 voxels
 AGREE, CLOSER = 0.15, 0.3  # dB: of the test views (of 50 dB), and of the worst viewing condition: single pixels decide
-SMALL = ("--size", "64", "--max-gaussians", "800", "--steps", "60")  # after 30 they may still be 0.4 dB apart
-FEWEST = ("--size", "32", "--max-gaussians", "200", "--steps", "8")  # where no errors are compared
+SMALL = ("--screen", "64", "--max-gaussians", "800", "--steps", "60")  # after 30 they may still be 0.4 dB apart
+FEWEST = ("--screen", "32", "--max-gaussians", "200", "--steps", "8")  # where no errors are compared
 BLOCKS = ("--blocks", "16")
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -73,7 +73,18 @@ def at(data, monkeypatch):
 ROWS = {  # name: (volume, options); all of `convert`, to one .ply
     "function, cropped and masked": (
         "scalars.nii",
-        ("--tf", "tf.json", "--crop", "3:28,:,2:", "--max-size", "0.05", "--mask", "mask.nii", "--rule", "playcanvas"),
+        (
+            "--tf",
+            "tf.json",
+            "--crop",
+            "3:28,:,2:",
+            "--max-megabytes",
+            "0.05",
+            "--mask",
+            "mask.nii",
+            "--rule",
+            "playcanvas",
+        ),
     ),
     "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows", "--ambient-occlusion", "0.3")),
     "colours in the world": ("rgb_0.tif", ("--target-psnr", "35", "--frame", "world", "--up", "z")),
@@ -177,7 +188,7 @@ def test_a_page_of_a_series_and_files_of_labels(vvgt, at, tmp_path):
 
 
 def test_the_closed_form_alone_under_the_light_of_the_functions_file(vvgt, at, tmp_path):
-    base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *BLOCKS)
+    base = ("init", "scalars.nii", "--tf", "lit.json", "--screen", "64", "--max-gaussians", "100", *BLOCKS)
     for name, more in (("x.ply", ()), ("y/lod-meta.json", ()), ("z/lod-meta.json", ("--light", "none"))):
         vvgt.ok(*base, *more, "-o", tmp_path / name)
     assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3

@@ -187,7 +187,7 @@ def test_live_files_of_unlike_boxes_and_histograms_have_one_exposure(tmp_path, v
     np.save(tmp_path / "run_0.npy", ball)
     np.save(tmp_path / "run_1.npy", np.pad(ball, 4))
     for k in range(2):
-        live = "--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,1 -o"
+        live = "--live --max-gaussians 60 --screen 48 -q --tf viridis --tf-range 0,1 -o"
         vvgt.ok("convert", tmp_path / f"run_{k}.npy", live, tmp_path / f"live_{k}.ply")
     first, second = (read_ply(tmp_path / f"live_{k}.ply")[1] for k in range(2))
     assert first.scale == 2 * second.scale
@@ -205,7 +205,7 @@ def test_live_files_of_unlike_boxes_and_histograms_have_one_exposure(tmp_path, v
 
 def test_frames_that_are_no_movie_are_named(run, ply, tmp_path, vvgt):
     for k, hi in enumerate((1, 1, 2)):
-        live = f"--live --max-gaussians 60 --size 48 -q --tf viridis --tf-range 0,{hi} -o"
+        live = f"--live --max-gaussians 60 --screen 48 -q --tf viridis --tf-range 0,{hi} -o"
         vvgt.ok("convert", run / "run_9.npy", live, tmp_path / f"live_{k}.ply")
     (tmp_path / "live_3.ply").write_bytes(b"ply\n")
     for k in range(3):

@@ -20,7 +20,7 @@ from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import extents_of
 
-SMALL = ("--max-gaussians", 500, "--size", 64, "--steps", 0, "--light", "none", "--split-labels")
+SMALL = ("--max-gaussians", 500, "--screen", 64, "--steps", 0, "--light", "none", "--split-labels")
 # as FreeSurfer's volumes lie: i to the left, j down, k forwards; 2 mm, off centre
 AFFINE = np.array([[-2.0, 0, 0, 30], [0, 0, 2, -20], [0, -2, 0, 40], [0, 0, 0, 1]])
 LUT = """#No. Label Name: R G B A

@@ -160,7 +160,7 @@ def test_a_conversion_keeps_what_its_closed_form_has(steps, monkeypatch, tmp_pat
     plan = Planner.plan
     monkeypatch.setattr(closed_form, "initialise", glossy)
     monkeypatch.setattr(Planner, "plan", seen)
-    result = vvgt.convert("example:blob:16", goal={"max_gaussians": 60, "size": 32, "steps": steps})
+    result = vvgt.convert("example:blob:16", max_gaussians=60, screen=32, steps=steps)
     assert planned == [(0, 0), (1, 1)]
     assert result.gaussians.degree == 1
     for options, degree in (({}, 1), ({"sh_degree": 0}, 0), ({"sh_degree": 2}, 2)):

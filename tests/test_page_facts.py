@@ -250,7 +250,7 @@ def test_what_leaves_with_a_file_is_listed(vvgt, tmp_path) -> None:
     values = np.pad(np.ones((6, 6, 6), np.uint8), 2)
     nibabel.save(nibabel.Nifti1Image(values, np.diag([2, 2, 2, 1])), tmp_path / "Doe_John.nii")
     (tmp_path / "t.json").write_text(json.dumps({"1": {"name": "tumour", "color": [1, 0, 0]}}))
-    given = ("--labels", tmp_path / "t.json", "--max-gaussians", 100, "--size", 40)
+    given = ("--labels", tmp_path / "t.json", "--max-gaussians", 100, "--screen", 40)
     quick = ("--steps", 0)
     kinds = {"a.ply": quick, "live.ply": ("--live",), "n.ply": ("--no-comments", *quick), "a.html": ("--live",)}
     for name, more in kinds.items():

@@ -14,7 +14,7 @@ from tests.test_page_where import DESK, Person
 from vvgt_cli.commands.main import run
 
 pytestmark = pytest.mark.long
-SMALL = ["--max-gaussians", "300", "--size", "100", "--quiet"]
+SMALL = ["--max-gaussians", "300", "--screen", "100", "--quiet"]
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_three_hundred_labels(someone: Person, tmp_path: Path) -> None:
     np.save(tmp_path / "many.npy", (1 + x + 7 * y + 49 * z).clip(0, 300).astype(np.uint16))
     names = {n: {"name": f"<b>part</b> & {n}", "color": (n % 7 / 6, n % 5 / 4, 1)} for n in range(1, 301)}
     (tmp_path / "names.json").write_text(json.dumps(names))
-    how = ["--labels", str(tmp_path / "names.json"), "--live", "--max-gaussians", "3000", "--size", "100", "--quiet"]
+    how = ["--labels", str(tmp_path / "names.json"), "--live", "--max-gaussians", "3000", "--screen", "100", "--quiet"]
     assert run(["convert", str(tmp_path / "many.npy"), *how, "-o", str(tmp_path / "many.html")]) == 0
     someone("open", (tmp_path / "many.html").as_uri())
     assert someone("eval", "document.querySelectorAll('#live li').length") == 300

@@ -18,7 +18,7 @@ from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume, averaged
 from vvgt_cli.volume.stored import Stored
 
-HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "0", "--overwrite")
+HOW = ("--max-gaussians", "60", "--screen", "32", "--steps", "0", "--overwrite")
 SHOWN = TransferFunction(
     "ramp", PiecewiseOpacity(np.array([0.0, 1]), np.array([0.0, 0.5])), ColorMap(np.array([0.0]), np.ones((1, 3)))
 )
@@ -238,11 +238,11 @@ def test_a_page_within_its_size_has_coarser_values_before_fewer_gaussians(vvgt, 
     noise = np.random.default_rng(0).integers(0, 4096, (64, 64, 64)).astype(np.int16)  # hardly to be packed
     noise[:, :, 32:] = 0
     np.save(tmp_path / "noise.npy", noise)
-    page, how = tmp_path / "page.html", ("--max-gaussians", "300", "--size", "32", "--overwrite")
+    page, how = tmp_path / "page.html", ("--max-gaussians", "300", "--screen", "32", "--overwrite")
     given = ("convert", tmp_path / "noise.npy", *form, *how, *(() if "--live" in form else ("--steps", "0")))
     sizes, grids, counts = [], [], []
     for limit in ("9MB", "1.1MB", "1MB"):
-        done = vvgt.ok(*given, "--max-size", limit, "-o", page)
+        done = vvgt.ok(*given, "--max-megabytes", limit, "-o", page)
         sizes.append(page.stat().st_size)
         grids.append(grids_in(page)[0][0]["dims"])
         counts.append(re.findall(r"page\.html: (\d+) Gaussians", done.err)[-1])
@@ -251,14 +251,17 @@ def test_a_page_within_its_size_has_coarser_values_before_fewer_gaussians(vvgt, 
     assert 0.9e6 < sizes[1] <= 1.1e6
     assert sizes[2] <= 1e6
     assert counts[0] == counts[1]
-    assert "no Gaussian fits; expected 0.99" in vvgt.fails(2, *given, "--max-size", "900kB", "-o", page)
+    assert "no Gaussian fits; expected 0.99" in vvgt.fails(2, *given, "--max-megabytes", "900kB", "-o", page)
 
 
 def test_a_lit_page_within_its_size_counts_its_harmonics(vvgt, tmp_path):
     grid = np.linspace(-1, 1, 48)
     ball = np.sin(20 * np.sqrt(sum(np.square(np.meshgrid(grid, grid, grid)))))
     np.save(tmp_path / "ball.npy", ball.astype(np.float32))
-    page, how = tmp_path / "page.html", ("--steps", "0", "--size", "64", "--light", "headlight", "--max-size", "1.5MB")
+    page, how = (
+        tmp_path / "page.html",
+        ("--steps", "0", "--screen", "64", "--light", "headlight", "--max-megabytes", "1.5MB"),
+    )
     done = vvgt.ok("convert", tmp_path / "ball.npy", *how, "-o", page)
     assert page.stat().st_size <= 1.5e6
     counts = {int(count.replace(",", "")) for count in re.findall(r"([\d,]+) Gaussians", done.err)}
@@ -287,7 +290,7 @@ def test_labels_lie_over_the_scan_and_series_have_none(vvgt, scan, monkeypatch):
 def test_results_have_values_in_files_and_cells(scan):
     import vvgt_cli as vvgt
 
-    result = vvgt.convert(str(scan / "scan.nii.gz"), goal={"max_gaussians": 60, "size": 32, "steps": 0})
+    result = vvgt.convert(str(scan / "scan.nii.gz"), max_gaussians=60, screen=32, steps=0)
     result.save(scan / "result.html")
     [(facts, values)] = grids_in(scan / "result.html")
     assert values.shape == (18, 16, 14)

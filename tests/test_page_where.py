@@ -201,7 +201,7 @@ def test_a_baked_page_is_uncovered_too(person: Person, tmp_path: Path) -> None:
     z, y, x = np.mgrid[:24, :24, :24] - 11.5
     for k in (0, 1):
         np.save(tmp_path / f"ball{k}.npy", (np.hypot(x, np.hypot(y, z)) < 8 + k).astype(np.float32) * 100)
-    how = ["--tf", "viridis", "--max-gaussians", "3000", "--size", "100", "--steps", "0", "--quiet"]
+    how = ["--tf", "viridis", "--max-gaussians", "3000", "--screen", "100", "--steps", "0", "--quiet"]
     for name, source in (("one", "ball0.npy"), ("two", "ball*.npy")):
         assert run(["convert", str(tmp_path / source), *how, "-o", str(tmp_path / f"{name}.html")]) == 0
         person("open", (tmp_path / f"{name}.html").as_uri())
@@ -296,7 +296,7 @@ def test_a_click_marks_the_label(person: Person, tmp_path: Path) -> None:
     z, y, x = np.mgrid[:12, :12, :12] // 6
     np.save(tmp_path / "map.npy", (1 + x + 2 * y + 4 * z).astype(np.uint8))
     source = ["convert", str(tmp_path / "map.npy"), "--live", "--labels", "auto", "--max-gaussians", "400"]
-    assert run([*source, "--size", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
+    assert run([*source, "--screen", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
     person("open", (tmp_path / "map.html").as_uri())
     across, down = person("eval", MIDDLE)
     person("click", across + 20, down + 20)
@@ -436,7 +436,7 @@ def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) ->
     z, y, x = np.mgrid[:12, :12, :12] // 6
     np.save(tmp_path / "map.npy", (1 + x + 2 * y + 4 * z).astype(np.uint8))
     source = ["convert", str(tmp_path / "map.npy"), "--live", "--labels", "auto", "--max-gaussians", "400"]
-    assert run([*source, "--size", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
+    assert run([*source, "--screen", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
     page = (tmp_path / "map.html").as_uri()
     person("open", page)
     for change in (
@@ -463,7 +463,7 @@ def test_an_address_that_is_no_link_is_let_be(dots: str, person: Person) -> None
 def test_a_baked_page_has_legend_error_and_date(person: Person, tmp_path: Path) -> None:
     """One in a file, and the frames of a series, each its own."""
     ramp = np.broadcast_to(np.linspace(0, 80, 16, dtype=np.float32)[:, None, None], (16, 16, 16))
-    how = ["--tf", "viridis", "--max-gaussians", "300", "--size", "100", "--steps", "0", "--quiet"]
+    how = ["--tf", "viridis", "--max-gaussians", "300", "--screen", "100", "--steps", "0", "--quiet"]
     for k in (0, 1):
         np.save(tmp_path / f"ramp{k}.npy", ramp + k)
     assert run(["convert", str(tmp_path / "ramp0.npy"), *how, "-o", str(tmp_path / "one.html")]) == 0

@@ -12,7 +12,7 @@ from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 
-HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
+HOW = ("--max-gaussians", "60", "--screen", "32", "--steps", "2")
 
 
 def clouds(page: Path) -> dict[str, np.ndarray]:
@@ -87,7 +87,7 @@ def test_functions_and_labels_have_their_names(vvgt, steps):
     (steps / "other.json").write_text((steps / "tf.json").read_text().replace("0.6", "0.1"))
     two = ("--tf", steps / "tf.json", "--tf", steps / "other.json")
     vvgt.ok("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW)
-    big = vvgt.fails(2, "convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-size", "1")
+    big = vvgt.fails(2, "convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-megabytes", "1")
     assert "the limit is for one cloud" in big
     held = clouds(steps / "two.html")
     assert list(held) == ["tf", "other"]
@@ -123,8 +123,10 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         done = vvgt("convert", "four.nii", "-o", "four.html", *extra, *how)
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "with one file of several clouds" in done.error
-    done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
-    assert "--max-size with one file of several clouds" in done
+    done = vvgt.fails(
+        2, "convert", "four.nii", "-o", "four.html", "--max-megabytes", "1", "--tf", "tf.json", "--screen", "32"
+    )
+    assert "--max-megabytes with one file of several clouds" in done
     done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--no-values", *how)
     assert "--no-values with one file of several clouds" in done
     assert "is for a page" in vvgt.fails(2, "convert", "four.nii", "-o", "four_{}.ply", "--no-values", *how)

@@ -13,7 +13,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.score.charts import draw
 from vvgt_cli.score.curves import ReportRuns, psnr
 
-SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
+SMALL = ("--tf", "viridis", "--screen", 24, "--max-gaussians", 60, "--steps", 2)
 MAKE = """
 import json, pathlib, shutil, sys
 start, views, out = map(pathlib.Path, sys.argv[1:])
@@ -36,7 +36,7 @@ def start(tmp_path_factory):
     from vvgt_cli.commands.main import run as vvgt
 
     made = tmp_path_factory.mktemp("peers")
-    args = ["init", "example:blob:10", "--tf", "viridis", "--size", "24", "--max-gaussians", "60"]
+    args = ["init", "example:blob:10", "--tf", "viridis", "--screen", "24", "--max-gaussians", "60"]
     assert vvgt([*args, "-o", str(made / "start.ply"), "--quiet"]) == 0
     (made / "make.py").write_text(MAKE)
     return made
@@ -73,7 +73,7 @@ def test_a_peer_is_run_timed_and_scored_beside_ours(vvgt, start, tmp_path, monke
     ],
 )  # fmt: skip
 def test_peers_that_fail_are_one_line_and_leave_no_report(vvgt, tmp_path, command, code, what) -> None:
-    few = ("--tf", "viridis", "--size", 16, "--max-gaussians", 4, "--steps", 1)
+    few = ("--tf", "viridis", "--screen", 16, "--max-gaussians", 4, "--steps", 1)
     assert what in vvgt.fails(code, "report", "example:blob:6", *few, "--peer", command, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

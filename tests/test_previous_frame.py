@@ -34,7 +34,7 @@ TF = {"points": [
     {"x": 10, "rgb": [0.2, 0.4, 1], "opacity": 0}, {"x": 60, "rgb": [1, 0.6, 0.2], "opacity": 0.1},
     {"x": 100, "rgb": [1, 1, 0.9], "opacity": 0.3},
 ]}  # fmt: skip
-HOW = ("--max-gaussians", "400", "--size", "96", "--steps", "30")
+HOW = ("--max-gaussians", "400", "--screen", "96", "--steps", "30")
 
 
 def patched(base: bytes, runs: bytes) -> bytes:

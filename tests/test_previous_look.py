@@ -13,7 +13,7 @@ from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
 from vvgt_cli.conversion.previous_look import MAX_RATIO, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
 
-GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
+GOAL = {"max_gaussians": 400, "screen": 96, "steps": 24}
 SPACING = (1.0, 1.0, 1.5)
 SHELL = {
     "points": [
@@ -58,7 +58,7 @@ def session(values):
 
 @pytest.fixture(scope="module")
 def earlier(session):
-    return session.convert(SHELL, GOAL)
+    return session.convert(SHELL, **GOAL)
 
 
 def started_warm(result):
@@ -74,28 +74,28 @@ def names(result):
 )  # so few Gaussians are too wide for colours of their own
 def test_another_function_is_as_near_as_by_itself(session, earlier, changes, less):
     tf = shell(**changes)
-    alone, later = session.convert(tf, GOAL), session.convert(tf, GOAL, after=earlier)
+    alone, later = session.convert(tf, **GOAL), session.convert(tf, **GOAL, after=earlier)
     assert started_warm(later)
     assert later.scores["psnr"] > alone.scores["psnr"] - less
     assert "closed form" in names(alone)
     assert names(later)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
     assert later.report.refinement["steps"] == 24
     assert later.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
-    assert np.array_equal(session.convert(tf, GOAL, after=earlier).gaussians.means, later.gaussians.means)
+    assert np.array_equal(session.convert(tf, **GOAL, after=earlier).gaussians.means, later.gaussians.means)
 
 
 def test_another_light_and_another_size(session, earlier):
     lit = vvgt.Look(SHELL, light="headlight")
-    alone, later = session.convert(lit, GOAL), session.convert(lit, GOAL, after=earlier)
+    alone, later = session.convert(lit, **GOAL), session.convert(lit, **GOAL, after=earlier)
     assert started_warm(later)
     assert later.gaussians.degree == 2
     assert later.scores["psnr"] > alone.scores["psnr"] - 0.5
-    unlit = session.convert(SHELL, GOAL, after=later)
+    unlit = session.convert(SHELL, **GOAL, after=later)
     assert started_warm(unlit)
     assert unlit.gaussians.degree == 0
     assert unlit.report.refinement["standard"] == earlier.report.refinement["psnr_after"]  # by itself, not the last
-    small = {**GOAL, "size": 64}
-    assert started_warm(other := session.convert(SHELL, small, after=earlier))
+    small = {**GOAL, "screen": 64}
+    assert started_warm(other := session.convert(SHELL, **small, after=earlier))
     assert other.ply.screen_size == 64
 
 
@@ -110,7 +110,7 @@ def test_another_light_and_another_size(session, earlier):
 )
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
-    later, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
+    later, alone = session.convert(look, **asked, after=earlier), session.convert(look, **asked)
     assert why in dict(later.report.skipped)[WARM_START]
     assert np.array_equal(later.gaussians.means, alone.gaussians.means)
     assert np.array_equal(later.gaussians.colors, alone.gaussians.colors)
@@ -120,7 +120,7 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
 def test_a_volume_that_went_on_is_released_at_once(session, earlier):
     gc.disable()
     try:
-        later = session.convert(SHELL, GOAL, after=earlier)
+        later = session.convert(SHELL, **GOAL, after=earlier)
         assert started_warm(later)
         field = weakref.ref(later.field)
         del later
@@ -130,11 +130,13 @@ def test_a_volume_that_went_on_is_released_at_once(session, earlier):
 
 
 def test_refused(session, earlier):
-    refused(vvgt.UsageError, "same volume", vvgt.convert, "example:blob:16", "viridis", GOAL, after=earlier)
-    refused(vvgt.UsageError, r"after with --live: .*remove it", session.convert, SHELL, GOAL, after=earlier, live=True)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, "example:blob:16", "viridis", **GOAL, after=earlier)
+    refused(
+        vvgt.UsageError, r"after with --live: .*remove it", session.convert, SHELL, **GOAL, after=earlier, live=True
+    )
     with pytest.raises(vvgt.UsageError, match=r"after with labels: .*remove it"):
-        vvgt.convert("example:blob:16", goal=GOAL, after=earlier, split_labels=True)
-    refused(vvgt.UsageError, r"after with .*give one function", session.convert, [SHELL, "gray"], GOAL, after=earlier)
+        vvgt.convert("example:blob:16", **GOAL, after=earlier, split_labels=True)
+    refused(vvgt.UsageError, r"after with .*give one function", session.convert, [SHELL, "gray"], **GOAL, after=earlier)
 
 
 def test_the_same_look_changes_nothing(session, earlier):
@@ -146,7 +148,7 @@ def test_the_same_look_changes_nothing(session, earlier):
 
 
 def test_depth_goes_with_extinction(session, earlier):
-    thin = session.convert(shell(times=0.5), {**GOAL, "steps": 0})
+    thin = session.convert(shell(times=0.5), **{**GOAL, "steps": 0})
     found = recolor_earlier(earlier, thin.field)
     before = to_box_frame(earlier.gaussians, earlier.field.source.volume)
     seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
@@ -159,15 +161,15 @@ def test_depth_goes_with_extinction(session, earlier):
 
 def test_in_blocks_too(values):
     first, second = (
-        vvgt.convert(values, SHELL, GOAL, spacing=SPACING, blocks=16),
-        vvgt.Session(values, spacing=SPACING).convert(SHELL, GOAL),
+        vvgt.convert(values, SHELL, **GOAL, spacing=SPACING, blocks=16),
+        vvgt.Session(values, spacing=SPACING).convert(SHELL, **GOAL),
     )
     tf = shell(times=0.5)
-    blocked = vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    blocked = vvgt.convert(values, tf, **GOAL, after=first, spacing=SPACING, blocks=16)
     assert started_warm(blocked)
-    assert started_warm(vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING, blocks=16))
-    whole = vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING)
+    assert started_warm(vvgt.convert(values, tf, **GOAL, after=second, spacing=SPACING, blocks=16))
+    whole = vvgt.convert(values, tf, **GOAL, after=second, spacing=SPACING)
     assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
     values = values.copy()
     values[12, 12, 12] = 0
-    refused(vvgt.UsageError, "same volume", vvgt.convert, values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    refused(vvgt.UsageError, "same volume", vvgt.convert, values, tf, **GOAL, after=first, spacing=SPACING, blocks=16)

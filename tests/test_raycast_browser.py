@@ -13,7 +13,7 @@ from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
 
 SIZE = 100
-MADE = ["--steps", "0", "--max-gaussians", "500", "--size", "64", "--quiet"]
+MADE = ["--steps", "0", "--max-gaussians", "500", "--screen", "64", "--quiet"]
 DISTANCE = 0.1
 SHELL = {
     "points": [

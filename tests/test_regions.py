@@ -28,7 +28,7 @@ from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.volume import ReadOptions
 
-FIT = ("--max-gaussians", "6000", "--size", "150", "--up", "z", "-q")
+FIT = ("--max-gaussians", "6000", "--screen", "150", "--up", "z", "-q")
 STEPS = ("--steps", "24")
 SINGLE = RenderSettings(step=1.0, samples=1)
 
@@ -125,7 +125,7 @@ def test_descent_on_a_part_weighs_both_kinds_of_views(volume: Path, monkeypatch:
         return args[0], OptimizeRecord(psnr_before=1.0)
 
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.optimize", spied)
-    refine_part(part, part.moved_out(ball()), Refiner(None, None, FitOptions(size=150, steps=4), Limits()))
+    refine_part(part, part.moved_out(ball()), Refiner(None, None, FitOptions(screen=150, steps=4), Limits()))
     assert all((weight == 0.25).all() for weight in seen[way])
 
 
@@ -270,7 +270,7 @@ def test_regions_without_gaussians_are_written_lit_and_not(vvgt, tmp_path, monke
     z, y, x = np.mgrid[:160, :60, :60]
     balls = sum((np.hypot(np.hypot(x - 30, y - 30), z - at) < 14) * 200 for at in (24, 80, 136))
     np.save(tmp_path / "v.npy", balls.astype(np.uint8))
-    fit = ("--tf", "viridis", "--size", "100", "--max-gaussians", "1", "--blocks", "64", "-q")
+    fit = ("--tf", "viridis", "--screen", "100", "--max-gaussians", "1", "--blocks", "64", "-q")
     for light in ("none", "headlight"):
         vvgt.ok("init", tmp_path / "v.npy", *fit, "--light", light, "-o", tmp_path / f"{light}.ply")
         assert len(read_splats(str(tmp_path / f"{light}.ply"))[0]) == 1

@@ -30,7 +30,7 @@ from vvgt_cli.score.curves import (
 )
 from vvgt_cli.score.page import Pictures, page
 
-SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
+SMALL = ("--tf", "viridis", "--screen", 24, "--max-gaussians", 60, "--steps", 2)
 VOID = {"meta", "img", "input", "br"}
 
 
@@ -159,7 +159,7 @@ def test_nothing_is_overwritten_unasked(scene_report, vvgt):
 
 def test_compare_reads_reports_and_conversions(scene_report, vvgt, tmp_path):
     folder, _ = scene_report
-    vvgt.ok("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
+    vvgt.ok("convert", "example:blob:10", "--tf", "viridis", "--screen", 24, "--max-gaussians", 60,
                 "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")  # fmt: skip
     result = vvgt.ok("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
     assert {p.name for p in (tmp_path / "both").iterdir()} == {"report.csv", "report.html", *FILES}

@@ -9,7 +9,7 @@ import pytest
 
 from vvgt_cli.commands.main import run
 
-SMALL = ("--size", "32", "--max-gaussians", "200", "--steps", "2")
+SMALL = ("--screen", "32", "--max-gaussians", "200", "--steps", "2")
 TF = '{"points": [{"x": 0, "opacity": 0, "rgb": [0, 0, 1]}, {"x": 1, "opacity": 0.7, "rgb": [1, 0.5, 0]}]}'
 COMMANDS = {
     **{  # the bytes of the others do not depend on more than their Gaussians: tests/test_formats.py

@@ -10,7 +10,7 @@ from vvgt_cli.gaussians import read_ply
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.stats import statistics
 
-FIT = ("--max-gaussians", "3000", "--size", "150", "-q")
+FIT = ("--max-gaussians", "3000", "--screen", "150", "-q")
 
 
 def bodies(dims=(100, 90, 80)):
@@ -66,7 +66,7 @@ def in_memory_and_in_blocks(vvgt, raw, folder, *fit):
 
 @pytest.mark.parametrize("budget", ["7", "60000"])
 def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
-    fit = ("--max-gaussians", budget, "--size", "100", "-q")
+    fit = ("--max-gaussians", budget, "--screen", "100", "-q")
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, raw, tmp_path, *fit))
 
 
@@ -74,7 +74,7 @@ def test_surfaces_of_labels_lie_where_they_do_in_memory(vvgt, tmp_path):
     z, y, x = np.indices((44, 36, 40))
     r = np.sqrt((x - 19.5) ** 2 + (y - 17.5) ** 2 + (z - 21.5) ** 2)
     np.save(tmp_path / "v.npy", ((r < 14) + (r < 8)).astype(np.uint8))
-    fit = ("--labels", "auto", "--light", "none", "--max-gaussians", "2000", "--size", "200", "-q")
+    fit = ("--labels", "auto", "--light", "none", "--max-gaussians", "2000", "--screen", "200", "-q")
     assert same_gaussians(*in_memory_and_in_blocks(vvgt, tmp_path / "v.npy", tmp_path, *fit))
 
 
@@ -89,7 +89,7 @@ def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
     tf.write_text('{"range": [0, 1000], "points": [{"x": 0.3, "rgb": [1, 0, 0], "opacity": 0},'
                   '{"x": 0.4, "rgb": [1, 1, 0], "opacity": 1}]}')  # fmt: skip
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
-    options = ("--tf", tf, "--max-gaussians", "3000", "--size", "200", "-q")
+    options = ("--tf", tf, "--max-gaussians", "3000", "--screen", "200", "-q")
     vvgt.ok("init", path, "-o", one, *options)
     for size in ("16", "32"):
         vvgt.ok("init", path, "-o", other, *options, "--blocks", size, "--overwrite")
@@ -207,7 +207,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     for size, level, grid in ((300, None, "64 x 64 x 64"), (30, None, "32 x 32 x 32"), (30, "full", "64 x 64 x 64"),
                               (30, "2", "16 x 16 x 16")):  # fmt: skip
         chosen = ["--level", level] if level else ["--blocks", "auto"]
-        run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
+        run = vvgt.ok("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--screen", size, *options, *chosen)
         assert f": {grid} uint8" in run.err
     run = vvgt.fails(2, "init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
     assert "expected full, or 0 to 2" in run
@@ -225,7 +225,7 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     vvgt.ok("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
     assert (
         "processed in blocks"
-        in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source, "--step 2 --size 48 --no-conditions").err
+        in vvgt.ok("evaluate", tmp_path / "b.ply", "--volume", source, "--step 2 --screen 48 --no-conditions").err
     )
     assert "processed in blocks" in vvgt.ok("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8").err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
@@ -308,6 +308,6 @@ def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeyp
 
 
 def test_parts_are_written_once_to_standard_output_too(vvgt, raw, tmp_path):
-    line = ("init", raw, "--max-gaussians", "500", "--size", "64", "--blocks", "32", "-q", "-o")
+    line = ("init", raw, "--max-gaussians", "500", "--screen", "64", "--blocks", "32", "-q", "-o")
     vvgt.ok(*line, tmp_path / "a.ply")
     assert vvgt.ok(*line, "-").out == (tmp_path / "a.ply").read_bytes()

@@ -214,7 +214,7 @@ def test_a_converted_volume_is_released_at_once(monkeypatch, blocks, live):
             yield field
 
     monkeypatch.setattr(convert, "open_field", open_field)
-    fit = FitOptions(200, size=64, steps=None if live else 2)
+    fit = FitOptions(200, screen=64, steps=None if live else 2)
     source = SourceRequest("example:marschner-lobb:16", tf=colormaps["viridis"].name)
     one = ConvertRequest(source, fit=fit, blocks=blocks, live=live)
     gc.disable()

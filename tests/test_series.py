@@ -30,7 +30,7 @@ from vvgt_cli.score.record import ConversionReport
 from vvgt_cli.volume import Volume, statistics
 from vvgt_cli.volume.shapes import blob
 
-SMALL = ("--size", "32", "--max-gaussians", "60", "-q")
+SMALL = ("--screen", "32", "--max-gaussians", "60", "-q")
 TF = {"points": [{"x": 0, "rgb": [0, 0, 1], "opacity": 0}, {"x": 10, "rgb": [1, 0, 0], "opacity": 0.5}]}
 
 
@@ -320,7 +320,7 @@ def test_outputs_keep_step_time_and_stem_of_their_inputs(vvgt, series: Path, sta
     assert "frame 0 states no time" in vvgt("convert", "run_*.npy", "-o", "{time}.ply").error
     assert "{step} or {time} that its input states" in vvgt("convert", "t.nc", "-o", "{when}.ply").error
     assert len(stand_in) == before
-    clouds = library.convert("vtk_*.vti", "gray", {"max_gaussians": 50, "size": 32, "steps": 0})
+    clouds = library.convert("vtk_*.vti", "gray", max_gaussians=50, screen=32, steps=0)
     assert isinstance(clouds, library.Clouds)
     clouds.save("lib_{step}_{time}.ply")
     assert sorted(path.name for path in series.glob("lib*.ply"))[0] == "lib_0050_0.05.ply"
@@ -361,7 +361,7 @@ def test_a_function_that_fits_is_named_where_none_is_given(vvgt, series: Path, m
     for k in (1, 2):
         noise = np.random.default_rng(k).integers(-9, 9, values.shape)
         nib.save(nib.Nifti1Image((values + noise).astype(np.int16), np.diag([4, 4, 4, 1])), f"ct_{k}.nii")
-    small = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--overwrite")
+    small = ("--max-gaussians", 50, "--screen", 24, "--steps", 0, "--overwrite")
     said = "no look is given; --tf ct-bone is made for such data"
     for call, count in (
         *((("ct_1.nii",), 1), (("ct_1.nii", "--blocks", 16), 1), (("ct_*.nii",), 1)),

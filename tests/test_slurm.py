@@ -23,7 +23,7 @@ def test_an_array_of_two_and_a_merge_leave_what_one_run_leaves(tmp_path: Path) -
     z, y, x = np.mgrid[:64, :64, :64] / 31.5 - 1
     volume = tmp_path / "v_64x64x64_uint8.raw"
     volume.write_bytes((255 * np.exp(-4 * (x * x + 2 * y * y + z * z))).astype(np.uint8).tobytes())
-    options = ("--max-gaussians", 500, "--size", 64, "--blocks", 32, "-q")
+    options = ("--max-gaussians", 500, "--screen", 64, "--blocks", 32, "-q")
     last = None
     for _ in range(3):
         for task in (1, 2):

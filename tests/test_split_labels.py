@@ -22,7 +22,7 @@ from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.score.views import score_test_views
 from vvgt_cli.volume import Volume
 
-SMALL = ("--max-gaussians", 600, "--size", 64, "--steps", 0)
+SMALL = ("--max-gaussians", 600, "--screen", 64, "--steps", 0)
 
 
 def nested(n: int = 24, cut: bool = False) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_every_label_is_told_of(vvgt, tmp_path: Path) -> None:
     values = nested(16)
     values[values == 3] += np.arange(16, dtype=np.uint8)[np.nonzero(values == 3)[0]] // 8
     np.save(tmp_path / "v.npy", values)
-    few = ("--max-gaussians", 60, "--size", 24, "--steps", 0)
+    few = ("--max-gaussians", 60, "--screen", 24, "--steps", 0)
     told = vvgt.ok(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", *few, "-o", tmp_path / "{}.ply"
     ).err
@@ -100,7 +100,7 @@ def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path
 def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
     assert list(converted(vvgt, tmp_path, np.where(nested() == 3, 3, 0))) == [3]
     line = ("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
-    assert "--max-size with labels: the limit is for one cloud" in vvgt(*line, "--max-size", 1).error
+    assert "--max-megabytes with labels: the limit is for one cloud" in vvgt(*line, "--max-megabytes", 1).error
     time = vvgt.fails(2, "convert", tmp_path / "v.npy", "--labels auto --split-labels --time-budget 9 -o", "p_{}.ply")
     assert "--time-budget with labels: it is for one conversion" in time
 

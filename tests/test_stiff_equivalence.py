@@ -52,7 +52,7 @@ class Row:
         kind = {"labels": self.function} if self.labels else {"tf": self.function}
         result = vvgt_cli.convert(
             Volume(self.data, self.edge), vvgt_cli.Look(**kind, light=light, opacity_unit_distance=unit),
-            {"max_gaussians": BUDGET, "size": SIZE, "steps": None if live else 8}, live=live, blocks=blocks,
+            max_gaussians=BUDGET, screen=SIZE, steps=None if live else 8, live=live, blocks=blocks,
         )  # fmt: skip
         if live:
             assert np.isfinite(result.gaussians.live).all()
@@ -118,7 +118,7 @@ def test_streamed_as_in_one_file(vvgt, tmp_path, name):
     (tmp_path / "look.json").write_text(json.dumps(row.function))
     look = ("--labels" if row.labels else "--tf", tmp_path / "look.json", "--opacity-unit-distance", np.mean(row.edge))
     for options in (("-o", tmp_path / "a.ply"), ("--blocks", BLOCK, "-o", tmp_path / "lod" / "lod-meta.json")):
-        budget = ("--max-gaussians", BUDGET, "--size", SIZE, "--spacing", *row.edge)
+        budget = ("--max-gaussians", BUDGET, "--screen", SIZE, "--spacing", *row.edge)
         vvgt.ok("init", tmp_path / "a.npy", *look, *budget, *options)
         found.append(pictures(vvgt_cli.read_ply(options[-1])[0]))
     assert_alike(*found, ROUNDED)

@@ -32,7 +32,7 @@ from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.images import read_png
 
-FIT = ("--max-gaussians", "9000", "--size", "150", "-q")
+FIT = ("--max-gaussians", "9000", "--screen", "150", "-q")
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +168,7 @@ def test_levels_of_a_fog_begin_where_viewers_draw_it(vvgt, tmp_path: Path) -> No
     volume.write_bytes((100 + 99 * np.sin(x / 9) * np.sin(y / 8) * np.sin(z / 7)).astype(np.uint8).tobytes())
     points = [{"x": 0, "rgb": [0, 0, 0], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.01}]
     tf.write_text(json.dumps({"range": [0, 255], "points": points}))
-    line = ("init", volume, "--tf", tf, "--max-gaussians", "20000", "--size", "150", "--blocks", "32")
+    line = ("init", volume, "--tf", tf, "--max-gaussians", "20000", "--screen", "150", "--blocks", "32")
     vvgt.ok(*line, "-q", "-o", tmp_path / "fog.ply")
     notes = vvgt.ok(*line, "-o", tmp_path / "fog" / "lod-meta.json").err
     counts = read_manifest(tmp_path / "fog" / "lod-meta.json")["counts"]
@@ -192,7 +192,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     [
         (("--init", "wavelet"), "cuts of moments"),
         (("--frame", "world"), "choose levels by distances"),
-        (("--max-size", "5"), "--max-size needs .ply or .html output"),
+        (("--max-megabytes", "5"), "--max-megabytes needs .ply or .html output"),
         (("--live",), "no place for values"),
         (("--labels", "auto", "--split-labels"), "share the Gaussians of one finished cloud"),
         (("--shard", "1/2"), "'vvgt init --shard' and 'vvgt merge'"),
@@ -443,7 +443,7 @@ def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: 
 
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
-    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), goal={"max_gaussians": 20, "steps": 0})
+    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), max_gaussians=20, steps=0)
     with pytest.raises(UsageError, match="streamed levels need the volume"):
         result.save(tmp_path / "lod-meta.json")
     assert not list(tmp_path.iterdir())

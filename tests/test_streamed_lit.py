@@ -17,7 +17,7 @@ from vvgt_cli.gaussians.formats import read_splats
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
-FIT = ("--max-gaussians", "9000", "--size", "150", "--up", "z", "-q")
+FIT = ("--max-gaussians", "9000", "--screen", "150", "--up", "z", "-q")
 LIGHTS = {
     "head": ("--light", "headlight"),
     "shadows": ("--light", "1,0.3,2", "--shadows", "--ambient-occlusion", "0.3"),

@@ -22,7 +22,6 @@ from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.gaussians.targets import TARGETS
 from vvgt_cli.images.metrics import psnr
-from vvgt_cli.library.inputs import Goal
 from vvgt_cli.score.viewing import AWAY, eye_pictures
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
@@ -41,20 +40,20 @@ def test_the_table_is_consistent():
         assert target.best not in target.unread
         if target.focal is not None:  # a pixel of the nearest eye is one of the screen in the default views
             near = target.focal * 2 * 3 * math.tan(math.radians(20)) / min(AWAY)
-            assert target.size == pytest.approx(near, abs=0.5)
+            assert target.screen == pytest.approx(near, abs=0.5)
 
 
 def test_what_is_given_wins_over_the_target():
     device = TARGETS["quest"]
-    whole = FitOptions(target="quest")
-    assert (whole.max_gaussians, whole.size, whole.rule) == (device.max_gaussians, device.size, device.rule)
-    default = FitOptions()
-    assert (default.max_gaussians, default.size, default.rule) == (100_000, 1080, "inria")
-    goal = Goal.of({"target": "quest", "size": 1080, "rule": "inria"})  # also where it equals the default
-    assert (goal.max_gaussians, goal.size, goal.rule) == (device.max_gaussians, 1080, "inria")
-    assert Goal(target="phone", max_gaussians=100_000).max_gaussians == 100_000
-    refused(UsageError, r"--target-psnr 200", Goal, target="phone", target_psnr=200)
-    refused(UsageError, r"target 'watch'; expected one of quest, visionos, phone, desktop", FitOptions, target="watch")
+    whole = FitOptions.of("quest")
+    assert (whole.max_gaussians, whole.screen, whole.rule) == (device.max_gaussians, device.screen, device.rule)
+    default = FitOptions.of(max_gaussians=None)
+    assert (default.max_gaussians, default.screen, default.rule) == (100_000, 1080, "inria")
+    given = FitOptions.of("quest", screen=1080, rule="inria")  # also where it equals the default
+    assert (given.max_gaussians, given.screen, given.rule) == (device.max_gaussians, 1080, "inria")
+    assert FitOptions.of("phone", max_gaussians=100_000).max_gaussians == 100_000
+    refused(UsageError, r"--target-psnr 200", vvgt_cli.convert, BLOB, target="phone", target_psnr=200)
+    refused(UsageError, r"target 'watch'; expected one of quest, visionos, phone, desktop", FitOptions.of, "watch")
 
 
 @pytest.mark.parametrize(
@@ -88,7 +87,7 @@ def test_eyes_stand_where_the_page_puts_them():
         assert np.degrees(2 * np.arctan(left.height / 2 / left.fy)) == pytest.approx(40)
     assert len(eye_pictures("visionos")) == 2 * 3 * 2
     assert eye_pictures("phone") == eye_pictures(None) == []
-    fit = FitOptions(size=64)
+    fit = FitOptions(screen=64)
     assert len(ViewingConditions("quest").views(fit)) == len(ViewingConditions().views(fit)) + 4
 
 
@@ -103,12 +102,12 @@ def test_eyes_stand_above_the_middle_as_viewers_show_it(up, direction):
 
 def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
     out, report = tmp_path / "a.ply", tmp_path / "a.json"
-    command = ("convert", BLOB, *FEW, "--for", "quest", "--size", 48, "-o", out)
+    command = ("convert", BLOB, *FEW, "--for", "quest", "--screen", 48, "-o", out)
     found = vvgt.ok(*command, "--report", report)
     assert "for quest: at most 20 MB, 60 Gaussians, 48 px, drawn as playcanvas" in found.err
     known = json.loads(report.read_text())
-    assert {key: known["options"][key] for key in ("target", "max_gaussians", "size", "rule", "max_megabytes")} == {
-        "target": "quest", "max_gaussians": 60, "size": 48, "rule": "playcanvas", "max_megabytes": 20,
+    assert {key: known["options"][key] for key in ("target", "max_gaussians", "screen", "rule", "max_megabytes")} == {
+        "target": "quest", "max_gaussians": 60, "screen": 48, "rule": "playcanvas", "max_megabytes": 20,
     }  # fmt: skip
     scored = {one["where"]: one for one in known["conditions"] if one["where"]}
     assert set(scored) == set(BOTH)
@@ -129,23 +128,23 @@ def test_a_headset_is_scored_by_both_eyes_and_the_file_says_so(vvgt, tmp_path):
 
 
 def test_every_kind_of_conversion_has_the_score(vvgt, tmp_path):
-    goal = {"target": "quest", "max_gaussians": 60, "size": 48, "steps": 0}
-    clouds = vvgt_cli.convert(BLOB, {"one": "viridis", "two": "magma"}, goal)
-    live = vvgt_cli.convert(BLOB, "viridis", {"target": "quest", "max_gaussians": 60, "size": 48}, live=True)
+    goal = {"target": "quest", "max_gaussians": 60, "screen": 48, "steps": 0}
+    clouds = vvgt_cli.convert(BLOB, {"one": "viridis", "two": "magma"}, **goal)
+    live = vvgt_cli.convert(BLOB, "viridis", target="quest", max_gaussians=60, screen=48, live=True)
     for one in (*clouds.values(), live):
         assert set(BOTH) <= {name for name, _ in one.ply.certificate.conditions}
-    screen = vvgt_cli.convert(BLOB, "viridis", goal | {"target": "phone"})
+    screen = vvgt_cli.convert(BLOB, "viridis", **goal | {"target": "phone"})
     assert not any("eyes" in name for name, _ in screen.ply.certificate.conditions)
 
 
 def test_a_file_is_scored_on_a_device_later(vvgt, tmp_path):
     out = tmp_path / "a.ply"
-    vvgt.ok("convert", BLOB, *FEW, "--size", 48, "-o", out)
-    found = vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "quest", "--size", 48, "--step", 1, "--json")
+    vvgt.ok("convert", BLOB, *FEW, "--screen", 48, "-o", out)
+    found = vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "quest", "--screen", 48, "--step", 1, "--json")
     told = json.loads(found.out)
     assert told["rule"] == "playcanvas"
     assert set(BOTH) <= {one["where"] for one in told["conditions"]}
-    vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "phone", "--size", 48, "--step", 1, "--no-conditions")
+    vvgt.ok("evaluate", out, "--volume", BLOB, "--for", "phone", "--screen", 48, "--step", 1, "--no-conditions")
     result = vvgt.fails(2, "evaluate", out, "--volume", BLOB, "--for", "quest", "--no-conditions")
     assert "--no-conditions with --for quest" in result
 

@@ -11,7 +11,7 @@ from vvgt_cli.commands.options import THREAD_VARIABLES
 
 
 def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):
-    line = ["convert", "example:blob:24", "--max-gaussians", "400", "--size", "64", "--steps", "4", "-q", "--threads"]
+    line = ["convert", "example:blob:24", "--max-gaussians", "400", "--screen", "64", "--steps", "4", "-q", "--threads"]
     for threads in ("1", "2", "3"):
         python(*VVGT, *line, threads, "-o", f"{threads}.ply", cwd=tmp_path)
     first = (tmp_path / "1.ply").read_bytes()
@@ -21,7 +21,7 @@ def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):
 @pytest.mark.long
 def test_two_at_once_take_at_most_2_3_times_as_long_as_one(tmp_path):
     """Medians of five, alternated: threads that wait leave the processors to the other run."""
-    line = ["convert", "example:blob:64", "--max-gaussians", "20000", "--size", "400", "-q", "--overwrite", "-o"]
+    line = ["convert", "example:blob:64", "--max-gaussians", "20000", "--screen", "400", "-q", "--overwrite", "-o"]
 
     def seconds(runs: int) -> float:
         begin = time.monotonic()

@@ -82,7 +82,7 @@ def square(image: np.ndarray) -> np.ndarray:
 
 def test_a_live_file_is_served_as_its_page_in_a_file_shows_it(tmp_path: Path) -> None:
     live = tmp_path / "blob.ply"
-    how = ["--live", "--max-gaussians", "5000", "--size", "256", "--quiet"]
+    how = ["--live", "--max-gaussians", "5000", "--screen", "256", "--quiet"]
     assert run(["convert", "example:blob:24", *how, "-o", str(live)]) == 0
     assert run(["view", str(live), "-o", str(tmp_path / "blob.html"), "--quiet"]) == 0
     one, _ = shoot((tmp_path / "blob.html").as_uri(), tmp_path)
@@ -92,8 +92,8 @@ def test_a_live_file_is_served_as_its_page_in_a_file_shows_it(tmp_path: Path) ->
 
 
 def test_a_result_is_shown_within_a_notebooks_page(tmp_path: Path) -> None:
-    goal: dict[str, Any] = {"max_gaussians": 3000, "size": 128}
-    frame = vvgt.convert("example:blob:24", "viridis", goal, live=True)._repr_html_()
+    goal: dict[str, Any] = {"max_gaussians": 3000, "screen": 128}
+    frame = vvgt.convert("example:blob:24", "viridis", **goal, live=True)._repr_html_()
     (tmp_path / "notebook.html").write_text(f"<!doctype html><body style='margin:0'>{frame}</body>")
     job = {"browser": browser(), "url": (tmp_path / "notebook.html").as_uri(), "out": str(tmp_path / "a.png")}
     (tmp_path / "job.json").write_text(json.dumps(job))

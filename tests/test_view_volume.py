@@ -407,6 +407,6 @@ def test_a_series_is_shown_frame_by_frame_and_saved_as_a_page(tmp_path, vvgt, mo
     wrong = vvgt("view", tmp_path / "run_*.npy", "--crop", "30:,:,:")
     assert (wrong.code, "live form" in wrong.err) == (2, False)
     saved: list[ConvertRequest] = []
-    monkeypatch.setattr(convert_batch, "convert_files", lambda request, console: saved.append(request))
+    monkeypatch.setattr(convert_batch, "convert_all", lambda requests, console: saved.append(requests[""]))
     vvgt.ok("view", tmp_path / "run_*.npy", "--tf", "viridis", "-o", tmp_path / "a.html")
     assert (saved[0].output, saved[0].source.tf, saved[0].live) == (str(tmp_path / "a.html"), "viridis", False)

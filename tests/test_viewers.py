@@ -196,7 +196,7 @@ def shown(volume: str, folder: Path) -> Shown:
     from vvgt_cli.field.source import SourceRequest, load
 
     path = folder / "converted.ply"
-    options = ("--max-gaussians", "20000", "--size", "1080", "--steps", "0", "--quiet")
+    options = ("--max-gaussians", "20000", "--screen", "1080", "--steps", "0", "--quiet")
     assert run(["convert", volume, *options, "-o", str(path)]) == 0
     camera = default_views("test", size=1080)[3]
     return Shown(path, camera, render_view(load(SourceRequest(volume)).scene(), camera)[..., :3])

@@ -221,6 +221,6 @@ def test_by_command(vvgt, tmp_path: Path) -> None:
     path = write(tmp_path, "hdf5")
     facts = json.loads(vvgt.ok("info", path, "--channel", "GFP", "--time", "1", "--json").out)
     assert (facts["range"], facts["spacing"]) == ([41100, 41219], list(SPACING))
-    few = ("--max-gaussians", "50", "--steps", "1", "--size", "32", "--time", "0")
+    few = ("--max-gaussians", "50", "--steps", "1", "--screen", "32", "--time", "0")
     for how in ((), ("--blocks", "16", "--level", "full")):
         vvgt.ok("convert", path, "--channel", "DAPI", *few, *how, "-o", str(tmp_path / "v.ply"), "--overwrite")

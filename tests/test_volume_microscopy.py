@@ -352,7 +352,7 @@ def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
     ):
         vvgt.ok(*command)
     assert json.loads(vvgt("info", path, "--channel", "GFP", "--json").out)["range"] == [0, 3000]
-    made = library.convert(path, goal={"max_gaussians": 200, "size": 32, "steps": 0})
+    made = library.convert(path, max_gaussians=200, screen=32, steps=0)
     assert np.ptp(made.gaussians.colors, axis=0).max() > 0.5
 
 

@@ -248,7 +248,7 @@ def test_other_lists_are_components(tmp_path: Path) -> None:
 
 def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt) -> None:
     (tmp_path / "v.seq.nrrd").write_bytes(sequence())
-    few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
+    few = ("--max-gaussians", 50, "--screen", 32, "--steps", 0)
     vvgt.ok("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", *few)
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
 

@@ -263,7 +263,7 @@ def test_smoke_of_nothing_is_shown_by_its_histogram(tmp_path: Path) -> None:
 def test_smoke_and_fire_are_two_layers(tmp_path: Path, vvgt) -> None:
     path = vdb(tmp_path / "a.vdb", plume(16))
     vdb(tmp_path / "b.vdb", {name: values for name, values in plume(16).items() if name == "flame"})
-    few = ("--max-gaussians", 100, "--size", 32, "--steps", 0)
+    few = ("--max-gaussians", 100, "--screen", 32, "--steps", 0)
     with pytest.warns(UserWarning, match="grid density"):
         made = vvgt("convert", path, "--layer", f"{path},array=flame", *few, "-o", tmp_path / "a.ply")
     assert made.code == 0, made.err

@@ -115,7 +115,7 @@ def test_suv_on_the_command_line(tmp_path: Path, vvgt) -> None:
     source = pet(tmp_path / "pet")
     assert b"SUVbw" in vvgt.ok("info", source).out
     assert b"Bq/ml" in vvgt.ok("info", source, "--suv", "none").out
-    few = ("--max-gaussians", 50, "--size", 32, "--steps", 0)
+    few = ("--max-gaussians", 50, "--screen", 32, "--steps", 0)
     vvgt.ok("convert", source, "-o", tmp_path / "p.ply", *few)
     assert b'"SUVbw"' in (tmp_path / "p.ply").read_bytes()
     save(image(STORED[0], (0, 0, 0)), tmp_path / "mr" / "0.dcm")

@@ -21,7 +21,7 @@ from vvgt_cli.volume.arrays.remote import Remote
 from vvgt_cli.volume.registry import level_shapes
 
 zarr = pytest.importorskip("zarr")
-FIT = ("--max-gaussians", "2000", "--size", "100", "-q")
+FIT = ("--max-gaussians", "2000", "--screen", "100", "-q")
 
 
 class Handler(SimpleHTTPRequestHandler):
@@ -124,8 +124,8 @@ def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> Non
     array = dask.from_zarr(f"{address}/x.ome.zarr/0")
     named = xarray.DataArray(array, dims=("z", "y", "x"), name="bodies")
     assert not [path for path in Handler.asked if "/c/" in path]
-    goal = {"max_gaussians": 500, "size": 60, "steps": 0}
-    assert len(vvgt_cli.convert(named, None, goal, blocks=32).gaussians) > 100
+    goal = {"max_gaussians": 500, "screen": 60, "steps": 0}
+    assert len(vvgt_cli.convert(named, None, **goal, blocks=32).gaussians) > 100
     assert [path for path in Handler.asked if "/c/" in path]
 
 

@@ -151,5 +151,5 @@ def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Pa
 
 def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt) -> None:
     source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
-    vvgt.ok("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--size", 32, "--steps", 0)
+    vvgt.ok("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--screen", 32, "--steps", 0)
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply"]

@@ -238,7 +238,7 @@ def test_a_missing_choice_of_an_array_is_usage(tmp_path: Path, vvgt) -> None:
 
 def test_a_series_is_converted_with_its_times(tmp_path: Path, vvgt) -> None:
     path = str(IMAGE_STEPS["vtk.series"](tmp_path))
-    how = ("--max-gaussians", "50", "--size", "64", "--steps", "0")
+    how = ("--max-gaussians", "50", "--screen", "64", "--steps", "0")
     told = vvgt("convert", path, "--array", "ramp", "-o", str(tmp_path / "p_{:02d}.ply"), *how).err
     assert "v.vtk.series time 0 (0.5): frame 1 of 2" in told
     assert "v.vtk.series time 1 (1.25): frame 2 of 2" in told

@@ -1,7 +1,7 @@
 """The library of VVGT, which turns scientific volumes into 3D Gaussian splats; see docs/python.md.
 
 >>> import vvgt_cli as vvgt
->>> result = vvgt.convert("example:blob:16", goal={"max_gaussians": 50, "size": 48, "steps": 0})
+>>> result = vvgt.convert("example:blob:16", max_gaussians=50, screen=48, steps=0)
 >>> len(result.gaussians) <= 50
 True
 """
@@ -22,13 +22,17 @@ __version__ = VERSION
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
     from vvgt_cli.commands.check import check
+    from vvgt_cli.commands.convert import convert
     from vvgt_cli.commands.evaluate import evaluate
     from vvgt_cli.commands.infer import infer
     from vvgt_cli.commands.info import info
+    from vvgt_cli.commands.init import init
     from vvgt_cli.commands.optimize import optimize
     from vvgt_cli.commands.recolor import recolor
     from vvgt_cli.commands.render import render
     from vvgt_cli.commands.render_views import render_views
+    from vvgt_cli.commands.report import report
+    from vvgt_cli.commands.session import Session, read_ply, read_volume
     from vvgt_cli.commands.synth import synth
     from vvgt_cli.commands.view import view
     from vvgt_cli.conversion.clouds import Clouds
@@ -36,8 +40,7 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.integrations.pyvista import export_plotter
-    from vvgt_cli.library.functions import Session, convert, read_ply, read_volume
-    from vvgt_cli.library.inputs import Goal, Look
+    from vvgt_cli.library.inputs import Look
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import Volume
@@ -47,15 +50,15 @@ _WHERE = {  # imported on first use, so that `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "integrations.pyvista": ("export_plotter",),
-    "library.functions": ("Session", "convert", "read_ply", "read_volume"),
-    "library.inputs": ("Goal", "Look"),
+    "commands.session": ("Session", "read_ply", "read_volume"),
+    "library.inputs": ("Look",),
     "conversion.clouds": ("Clouds",),
     "conversion.result": ("Conversion", "Result"),
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
-    **{f"commands.{name}": (name,) for name in ("check", "evaluate", "infer", "info", "optimize", "recolor", "render")},
-    **{f"commands.{name}": (name,) for name in ("render_views", "synth", "view")},
+    **{f"commands.{name}": (name,) for name in ("check", "convert", "evaluate", "infer", "info", "init", "optimize")},
+    **{f"commands.{name}": (name,) for name in ("recolor", "render", "render_views", "report", "synth", "view")},
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -66,7 +69,6 @@ __all__ = [
     "Conversion",
     "DataError",
     "Gaussians",
-    "Goal",
     "LightOptions",
     "Look",
     "PiecewiseOpacity",
@@ -84,6 +86,7 @@ __all__ = [
     "export_plotter",
     "infer",
     "info",
+    "init",
     "optimize",
     "orbit_views",
     "read_ply",
@@ -92,6 +95,7 @@ __all__ = [
     "recolor",
     "render",
     "render_views",
+    "report",
     "synth",
     "view",
 ]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    ply: PathLike | Result, volume: VolumeLike, look: LookLike = None, *, size: int | None = None,
+    ply: PathLike | Result, volume: VolumeLike, look: LookLike = None, *, screen: int | None = None,
     rule: str | None = None, target: str | None = None, conditions: bool = True, step: float = 0.125,
     preview: PathLike | None = None, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
     progress: bool | Console = False, **reading: Unpack[Reading],
@@ -28,7 +28,7 @@ def evaluate(
         ply: path, "-" for standard input, or result of `convert` or `optimize`.
         volume: as in `convert`.
         look: as in `convert`.
-        size: pixels along the edge of pictures; None: the file's.
+        screen: pixels along the edge of pictures; None: the file's.
         rule: drawing rule; None: the file's.
         target: device to score it on, as ``--for``.
         conditions: also score every rule at several sizes and close up, and texture on smooth areas.
@@ -46,8 +46,8 @@ def evaluate(
     from vvgt_cli.library.inputs import blocks_of, console_of, ply_of, source_of
 
     return score(
-        console_of(progress), ply_of(ply), source_of(volume, look, reading), blocks_of(blocks), size=size, rule=rule,
-        target=target, conditions=conditions, step=step, preview=preview, overwrite=overwrite,
+        console_of(progress), ply_of(ply), source_of(volume, look, reading), blocks_of(blocks), screen=screen,
+        rule=rule, target=target, conditions=conditions, step=step, preview=preview, overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -55,8 +55,8 @@ def evaluate(
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--volume", required=True, metavar="VOLUME", help="Volume that OUT.ply was made from.")
 @click.option(
-    "--size", type=click.IntRange(16, 8192), metavar="PX",
-    help="Image size to score at. Default: the size recorded in the file, or 400.",
+    "--screen", type=click.IntRange(16, 8192), metavar="PX",
+    help="Screen size to score at, in pixels. Default: the one recorded in the file, or 400.",
 )  # fmt: skip
 @shared.rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @shared.target_option(

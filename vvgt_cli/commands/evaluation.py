@@ -163,7 +163,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
 
 
 def score(
-    console: Console, ply: str | BinaryIO, request: SourceRequest, options: BlockOptions | None, *, size: int | None,
+    console: Console, ply: str | BinaryIO, request: SourceRequest, options: BlockOptions | None, *, screen: int | None,
     rule: str | None, target: str | None, conditions: bool, step: float, preview: PathLike | None, overwrite: bool,
 ) -> Evaluation:  # fmt: skip
     """Score Gaussians against their volume; see `vvgt_cli.evaluate`."""
@@ -175,14 +175,14 @@ def score(
             raise UsageError(
                 f"--no-conditions with --for {device.name}: its eyes are conditions; give one or the other"
             )
-        size, rule = size or device.size, rule or device.rule
+        screen, rule = screen or device.screen, rule or device.rule
     inputs = [*request.paths(), *([ply] if isinstance(ply, str) else [])]
     check_outputs(Output.of("--preview", preview, (".png",)), inputs, overwrite)
     place = split_name(ply) if isinstance(ply, str) else None
     if place is not None and place[1] in (None, VIEW):
         ply = str(place[0])
     gaussians, header = open_gaussians(ply)
-    size, drawn = size or header.screen_size or SIZE, file_rule(header, rule)
+    size, drawn = screen or header.screen_size or SIZE, file_rule(header, rule)
     with opened_as_recorded(run, request, gaussians, header, size, options) as field:
         volume = field.source.volume
         inside: Shown = to_box_frame(shown(gaussians, header, field.source, request), volume)

@@ -19,7 +19,6 @@ import click
 from vvgt_cli.commands.process import ENDING, end_on_signals, first_of_group, leave, open_streams, received
 from vvgt_cli.commands.words import expand
 from vvgt_cli.errors import UsageError, VvgtError
-from vvgt_cli.integrations.command import ENDED
 from vvgt_cli.progress import Console, Once
 from vvgt_cli.resources import keep_freed_memory, return_freed_memory
 from vvgt_cli.version import VERSION
@@ -33,6 +32,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE
 ALONE = 2.0  # seconds after which a process of a group of them tells of an error of its own
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DEBUG = "VVGT_TRACEBACK"
+ENDED = "vvgt: ended: "  # before the status of each of several commands; vvgt_cli/integrations/command.py reads it
 noted = [Once()]  # warnings of the current run
 
 
@@ -164,7 +164,7 @@ def _status(error: BaseException) -> int:
     if isinstance(error, OSError):
         return _fail(_os_error(error), 1)
     if isinstance(error, MemoryError):
-        return _fail("out of memory: try fewer Gaussians, a smaller --size, or a smaller volume", 1)
+        return _fail("out of memory: try fewer Gaussians, a smaller --screen, or a smaller volume", 1)
     if isinstance(error, KeyboardInterrupt):
         return _fail("interrupted", INTERRUPTED)
     if isinstance(error, SystemExit):

@@ -29,7 +29,7 @@ HOLD_OUT = 8  # of so many training views one decides, where the folder has no c
 def optimize(
     ply: PathLike | Result, views: PathLike, output: PathLike | None = None, *, steps: int | None = None,
     time_budget: float | None = None, target_psnr: float | None = None, method: str = "frame",
-    max_gaussians: int | None = None, checkpoint: PathLike | None = None, size: int | None = None,
+    max_gaussians: int | None = None, checkpoint: PathLike | None = None, screen: int | None = None,
     rule: str | None = None, sh_degree: int | None = None, seed: int = 0, report: PathLike | None = None,
     device: str = "cpu", overwrite: bool = False, progress: bool | Console = False,
 ) -> Result:  # fmt: skip
@@ -45,7 +45,7 @@ def optimize(
         method: "frame", "adam" or "3dgs".
         max_gaussians: maximal number of Gaussians, for "3dgs".
         checkpoint: ``.npz`` to save progress in, from which the same call goes on.
-        size: pixels along the edge of the target screen; None: the file's.
+        screen: pixels along the edge of the target screen; None: the file's.
         rule: drawing rule; None: the file's.
         sh_degree: degree of the spherical harmonics that are refined, 0 to 3; None: the file's.
         seed: seed of the order of views.
@@ -78,7 +78,7 @@ def optimize(
     start = ply_of(ply)
     inputs = [start] if isinstance(start, str) else []
     check_outputs(Output.of("--checkpoint", kept, (".npz",)), inputs, True)
-    make = partial(_refined, start, os.fspath(views), how, size, rule, sh_degree)
+    make = partial(_refined, start, os.fspath(views), how, screen, rule, sh_degree)
     return written(make, "optimize", inputs, output, report, overwrite=overwrite, progress=progress)
 
 
@@ -109,8 +109,8 @@ def optimize(
     help="Save progress here, so that the same command resumes after an interruption.",
 )  # fmt: skip
 @click.option(
-    "--size", type=click.IntRange(16, 8192), metavar="PX",
-    help="Screen size to optimise for, in pixels. Default: the size recorded in IN.ply, or that of the views.",
+    "--screen", type=click.IntRange(16, 8192), metavar="PX",
+    help="Screen size to optimise for, in pixels. Default: the one recorded in IN.ply, or that of the views.",
 )  # fmt: skip
 @shared.rule_option("Viewer to optimise for. Default: the one recorded in IN.ply, or inria.")
 @click.option(
@@ -140,7 +140,7 @@ def command(console: Console, **options: Any) -> None:
 
 
 def _refined(
-    ply: str | BinaryIO, folder: str, how: OptimizeOptions, size: int | None, rule: str | None, sh_degree: int | None,
+    ply: str | BinaryIO, folder: str, how: OptimizeOptions, screen: int | None, rule: str | None, sh_degree: int | None,
     run: Run,
 ) -> Result:  # fmt: skip
     """Refine Gaussians without writing anything but the checkpoint."""
@@ -161,9 +161,9 @@ def _refined(
         stage.note = f"{len(train)} training views, {len(check)} check views{held_out}"
     run.compile(for_degree(OPTIMIZE, start.degree))
     edge = train.cameras[0].width
-    screen, asked = size or header.screen_size or edge, file_rule(header, rule)
+    screen, asked = screen or header.screen_size or edge, file_rule(header, rule)
     fitted = asked.at(edge / screen)
-    named = {"rule": asked.name, "judge": asked.name, "size": screen, "sh_degree": start.degree}
+    named = {"rule": asked.name, "judge": asked.name, "screen": screen, "sh_degree": start.degree}
     run.report.options = asdict(how) | named
     gaussians = refine(run, start, train, check, replace(how, rule=fitted, judge=fitted))
     if test is not None:

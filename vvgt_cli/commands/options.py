@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,10 +20,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.resources import parse_size, processors, set_memory
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.request import ConvertRequest
     from vvgt_cli.field.settings import BlockOptions
-    from vvgt_cli.field.source import SourceRequest
-    from vvgt_cli.library.inputs import Reading
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK")
@@ -32,12 +29,17 @@ THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK
 command = functools.partial(click.command, cls=SectionedCommand)
 
 
-def group(name: str, **options: Decorator) -> Decorator:
-    """Bundle several options into one keyword argument, a dict by option name.
+def bundle(**options: Decorator) -> Decorator:
+    """Return a decorator that adds options, first the first."""
 
-    Commands keep few parameters: ``group("read", dims=click.option(...))`` calls the command with
-    ``read={"dims": ...}``.
-    """
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        return functools.reduce(lambda decorated, option: option(decorated), reversed(options.values()), function)
+
+    return decorate
+
+
+def group(name: str, **options: Decorator) -> Decorator:
+    """Return a decorator that adds options, which the command gets as one keyword argument: a dict of them by name."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
@@ -45,10 +47,7 @@ def group(name: str, **options: Decorator) -> Decorator:
             kwargs[name] = {key: kwargs.pop(key) for key in options}
             return function(*args, **kwargs)
 
-        decorated: Callable[..., Any] = wrapper
-        for option in reversed(options.values()):
-            decorated = option(decorated)
-        return decorated
+        return bundle(**options)(wrapper)
 
     return decorate
 
@@ -345,7 +344,7 @@ _options = {
     "level": click.option(
         "--level", metavar="full|N", callback=_number_or("full", "the number of a level (0, 1, ...)"),
         help="Resolution level of an OME-Zarr, N5, Imaris or BigDataViewer image in blocks, 0 the finest. Default: the "
-        "coarsest sufficient for --size.",
+        "coarsest sufficient for --screen.",
     ),
 }  # fmt: skip
 _shard_option = {
@@ -387,15 +386,14 @@ def arguments(
     return {**options, **read, **({} if console is None else {"progress": console})}
 
 
-fit_options = group(
-    "fit",
+fit_options = bundle(
     max_gaussians=click.option(
-        "--max-gaussians", type=click.IntRange(1, 100_000_000), default=MAX_GAUSSIANS, show_default=True, metavar="K",
-        help="Maximum number of Gaussians.",
+        "--max-gaussians", type=click.IntRange(1, 100_000_000), metavar="K",
+        help=f"Maximum number of Gaussians. Default: {MAX_GAUSSIANS}.",
     ),
-    size=click.option(
-        "--size", type=click.IntRange(16, 8192), default=SIZE, show_default=True, metavar="PX",
-        help="Screen size that the file is optimised for and scored at, in pixels along an edge.",
+    screen=click.option(
+        "--screen", type=click.IntRange(16, 8192), metavar="PX",
+        help=f"Screen size that the file is optimised for and scored at, in pixels along an edge. Default: {SIZE}.",
     ),
     init=click.option(
         "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default=INIT, show_default=True,
@@ -426,8 +424,7 @@ def rule_option(help: str, default: str | None = None, more: tuple[str, ...] = (
     )
 
 
-limit_options = group(
-    "limits",
+limit_options = bundle(
     target_psnr=click.option(
         "--target-psnr", type=click.FloatRange(0, 150), metavar="DB",
         help="Stop at this PSNR, skipping stages and Gaussians that are not needed for it.",
@@ -437,7 +434,7 @@ limit_options = group(
         help="Time for the whole run, such as 90, 10m or 1h; stages that do not fit are skipped.",
     ),
     max_megabytes=click.option(
-        "--max-size", "max_megabytes", type=Measure("file size", MEGABYTES), metavar="MB",
+        "--max-megabytes", type=Measure("file size", MEGABYTES), metavar="MB",
         help="Maximum file size in 10^6 bytes, also as 5MB or 800kB, of a .ply or a page; coarsens values, then "
         "reduces the number of Gaussians.",
     ),
@@ -456,8 +453,7 @@ def _camera(context: click.Context, option: click.Parameter, text: str | None) -
         ) from None
 
 
-ply_options = group(
-    "ply",
+ply_options = bundle(
     frame=click.option(
         "--frame", type=click.Choice(["unit", "world"]), default="unit", show_default=True,
         help="Coordinates: centred and scaled to a longest edge of 2, or those of the volume's physical space.",
@@ -483,26 +479,3 @@ ply_options = group(
     comments=click.option("--no-comments", "comments", is_flag=True, default=True, flag_value=False,
         help="Omit the comments (frame, unit distance, version, certificate, ...) from the header."),
 )  # fmt: skip
-
-
-def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any]) -> SourceRequest:
-    """Return the source that shared options describe, under the first function of several."""
-    from vvgt_cli.library.inputs import Look, source_of
-
-    tf = optics["tf"]
-    first = next(iter(tf), None) if isinstance(tf, tuple) else tf
-    return source_of(volume, Look(**optics | {"tf": first}, light=light), cast("Reading", read))
-
-
-def convert_request(
-    volume: str, *, fit: dict[str, Any], ply: dict[str, Any], read: dict[str, Any], optics: dict[str, Any],
-    light: dict[str, Any], steps: int | None = None, target: str | None = None, model: str | None = None,
-    device: str = "cpu", limits: dict[str, Any] | None = None, **more: Any,
-) -> ConvertRequest:  # fmt: skip
-    """Return the request that the options of `convert` and `init` describe; ``more`` are fields of it."""
-    from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
-    from vvgt_cli.gaussians import PlyOptions
-
-    up, source = ply.pop("up"), source_request(volume, read, optics, light)
-    fitted = FitOptions(**fit, steps=steps, model=model, device=device, target=target)
-    return ConvertRequest(source, fit=fitted, limits=Limits(**(limits or {})), ply=PlyOptions(**ply), up=up, **more)

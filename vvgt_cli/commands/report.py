@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
@@ -10,9 +12,57 @@ from vvgt_cli.commands import options as shared
 from vvgt_cli.commands.words import command_line, typed
 from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import UsageError
-from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.library.inputs import LookLike, PathLike, Reading, VolumeLike
+    from vvgt_cli.progress import Console
 
 COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "quiet"}
+
+
+def report(
+    volume: VolumeLike, look: LookLike, output: PathLike, *, max_gaussians: int = MAX_GAUSSIANS, screen: int = SIZE,
+    steps: Sequence[int] = REPORT_STEPS, model: str | None = None, seed: int = 0, peers: Sequence[str] = (),
+    picture_size: int = 400, blocks: int | str | BlockOptions | None = None, overwrite: bool = False,
+    progress: bool | Console = False, command: str | None = None, **reading: Unpack[Reading],
+) -> dict[str, Any]:  # fmt: skip
+    """Convert a volume in increasingly expensive ways, and write what each costs and gains: ``vvgt report``.
+
+    Args:
+        volume: as in `convert`.
+        look: as in `convert`.
+        output: folder to write, created if missing.
+        max_gaussians: maximum number of Gaussians; the closed form also runs with 1/64, 1/16 and 1/4 of it.
+        screen: pixels along the edge of the screen that files are made for and scored at.
+        steps: numbers of gradient descent steps, one run each.
+        model: network: a folder, or the name of a shipped one; None: the shipped one, if any.
+        seed: random seed.
+        peers: other trainers, ``NAME=COMMAND`` each.
+        picture_size: largest edge of the pictures on the page, in pixels.
+        blocks: as in `convert`.
+        overwrite: replace files that exist.
+        progress: print messages and bars on standard error.
+        command: command line that the report records.
+        **reading: as in `convert`.
+
+    Returns:
+        The content of the folder's ``report.json`` (docs/report.md).
+
+    Raises:
+        UsageError, DataError: see `convert`.
+    """
+    from vvgt_cli.commands.peers import Peer
+    from vvgt_cli.commands.report_runs import RunOptions, report_on
+    from vvgt_cli.library.inputs import blocks_of, console_of, source_of
+
+    runs = RunOptions(
+        max_gaussians, screen, tuple(steps), model, seed, blocks_of(blocks), peers=tuple(map(Peer.of, peers))
+    )
+    return report_on(
+        source_of(volume, look, reading), os.fspath(output), runs, picture_size=picture_size, overwrite=overwrite,
+        command=command, console=console_of(progress),
+    )  # fmt: skip
 
 
 @shared.command("report", short_help="Plot error against run time, as an HTML page and tables.")
@@ -26,7 +76,7 @@ COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "qui
     help="Maximum number of Gaussians; the closed form also runs with 1/64, 1/16 and 1/4 of it.",
 )  # fmt: skip
 @click.option(
-    "--size", type=click.IntRange(16, 2048), default=SIZE, show_default=True, metavar="PX",
+    "--screen", type=click.IntRange(16, 2048), default=SIZE, show_default=True, metavar="PX",
     help="Screen size that files are optimised for and scored at.",
 )  # fmt: skip
 @click.option(
@@ -55,9 +105,7 @@ COMPARE_PARAMETERS = {"paths", "compare", "output", "overwrite", "threads", "qui
 @shared.overwrite_option
 @shared.common_options
 @click.pass_context
-def command(
-    ctx: click.Context, /, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
-) -> None:
+def command(ctx: click.Context, /, paths: tuple[str, ...], compare: bool, **options: Any) -> None:
     """Convert VOLUME in increasingly expensive ways and show what each costs and gains.
 
     Runs the closed form with several budgets, a network if there is one, gradient descent of several lengths, and two
@@ -67,26 +115,17 @@ def command(
 
     Examples:
       vvgt report head.nrrd --tf bone.json -o head-report
-      vvgt report example:frog --size 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report
+      vvgt report example:frog --screen 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report
       vvgt report --compare head-report/report.json other/report.json -o both
     """
-    from vvgt_cli.commands import report_runs
-    from vvgt_cli.commands.peers import Peer
-
     if compare:
+        from vvgt_cli.commands.report_runs import compare as overlay
+
         other = [p.opts[-1] for p in typed(ctx) if p.name not in COMPARE_PARAMETERS]
         if other:
             raise UsageError(f"{', '.join(other)}: not with --compare, which only overlays reports")
-        report_runs.compare(paths, output, options["overwrite"], console)
+        overlay(paths, options["output"], options["overwrite"], options["console"])
         return
     if len(paths) != 1:
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
-    runs = report_runs.RunOptions(
-        options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
-        shared.block_options_of(options["blocks"]), peers=tuple(map(Peer.of, options["peers"])),
-    )  # fmt: skip
-    source = shared.source_request(paths[0], options["read"], options["optics"], options["light"])
-    report_runs.report(
-        source, output, runs, picture_size=options["picture_size"], overwrite=options["overwrite"],
-        command_line=command_line(ctx), console=console,
-    )  # fmt: skip
+    report(paths[0], command=command_line(ctx), **shared.arguments(**options))

@@ -75,7 +75,7 @@ class RunOptions:
 
     Attributes:
         max_gaussians: largest budget K.
-        size: pixels along the edge of the screen that files are made for and scored on.
+        screen: pixels along the edge of the screen that files are made for and scored on.
         steps: lengths of gradient descent, one run each; the baselines take the longest.
         model: folder or name of an exported network, None for none.
         seed: random seed.
@@ -85,7 +85,7 @@ class RunOptions:
     """
 
     max_gaussians: int = MAX_GAUSSIANS
-    size: int = SIZE
+    screen: int = SIZE
     steps: tuple[int, ...] = REPORT_STEPS
     model: str | None = None
     seed: int = 0
@@ -116,7 +116,7 @@ class PlannedRun:
 
 def plan_runs(options: RunOptions) -> list[PlannedRun]:
     """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines."""
-    most, size, seed = options.max_gaussians, options.size, options.seed
+    most, size, seed = options.max_gaussians, options.screen, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
         PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
@@ -242,7 +242,7 @@ def do_runs(
         views = None
         if options.peers:  # as many as our longest run has, at the screen's size
             count = view_count(max(options.steps, default=0), small=False)
-            views = PeerViews.render(source, Path(folder) / "views", count, options.size, options.blocks)
+            views = PeerViews.render(source, Path(folder) / "views", count, options.screen, options.blocks)
         for planned in plan_runs(options):
             report, gaussians = _run(source, planned, reference.axes, options.blocks, views)
             if report.refinement and report.refinement["reason"] == "interrupted":
@@ -295,10 +295,10 @@ def _views_of(report: ConversionReport, fit: FitOptions) -> int:
 def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.screen, small=False))
     volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = render_check_views(volume.views, default_views("check", size=fit.size), RenderSettings())
+        judges = render_check_views(volume.views, default_views("check", size=fit.screen), RenderSettings())
     with run.stage("views"):
         return Views(train, render_views(volume.views, train)), judges
 
@@ -325,11 +325,11 @@ def _baseline(
                 half = np.array(volume.source.volume.unit_frame().half)
                 start = random_points(half, count, fit.seed)
             else:
-                start = volume.pyramid(VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
+                start = volume.pyramid(VbmOptions(count, fit.screen, "uniform", fit.seed)).gaussians
         train, check = _views(run, volume, fit)
     options = OptimizeOptions.of(
         "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,
-        rule=INRIA.at(train.cameras[0].width / fit.size), judge=INRIA,
+        rule=INRIA.at(train.cameras[0].width / fit.screen), judge=INRIA,
     )  # fmt: skip
     return _finish(run, refine(run, start, train, check, options))
 
@@ -366,13 +366,13 @@ PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
 VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32 RGBA
 
 
-def report(
-    source: SourceRequest, output: str, options: RunOptions, *, picture_size: int, overwrite: bool, command_line: str,
+def report_on(
+    source: SourceRequest, output: str, options: RunOptions, *, picture_size: int, overwrite: bool, command: str | None,
     console: Console,
 ) -> dict[str, Any]:  # fmt: skip
     """Do all runs, write `report.json`, `report.csv`, the plots and `report.html`, and return the JSON's content.
 
-    ``picture_size`` is the largest edge of the page's pictures, in pixels, and ``command_line`` what the user typed.
+    ``picture_size`` is the largest edge of the page's pictures, in pixels, and ``command`` what the user typed.
 
     Raises:
         UsageError: an output that may not be written, or standard input as the volume, which every run reads again.
@@ -381,8 +381,8 @@ def report(
     if source.volume == STDOUT:
         raise UsageError("VOLUME is '-', but every run reads it again; expected a file")
     folder = _folder(output, (DATA, TABLE, PAGE, *FILES), overwrite)
-    options, size = _with_model(options), options.size
-    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
+    options, size = _with_model(options), options.screen
+    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--screen {size}: test views and ours", "try a smaller --screen")
     whole = ConvertRequest(source, fit=FitOptions(options.max_gaussians, size), blocks=options.blocks)
     with open_field(Run(console, ConversionReport("report")), whole, INIT) as volume:
         scene = volume.source
@@ -400,7 +400,7 @@ def report(
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     best, bend = [run["name"] for run in pareto(runs)], knee(runs)
     content = {
-        "command_line": command_line,
+        "command_line": command or "",
         "volume": volume_record(scene),
         "transfer_function": tf_record(scene, source),
         "options": asdict(options),

@@ -13,18 +13,20 @@ from xml.sax.saxutils import escape
 import click
 
 from vvgt_cli.commands.convert import command
+from vvgt_cli.defaults import MAX_GAUSSIANS, SIZE
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.version import VERSION
 
 FLAG = "--slicer"  # the first word that Slicer gives: a parameter that its panel does not show
 LAYER = "layer"  # an image of labels, which Slicer stores without their names: distinct colours
+DEFAULTS = {"max_gaussians": MAX_GAUSSIANS, "screen": SIZE}
 FIELDS = {  # tag of each parameter, by the option of `vvgt convert` whose help it shows
     "tf": '<file fileExtensions=".vp,.json,.xml">',
     "labels": '<file fileExtensions=".ctbl,.txt,.csv,.label,.json">',
     LAYER: '<image type="label">',
     "mask": '<image type="label">',
     "max_gaussians": "<integer>",
-    "size": "<integer>",
+    "screen": "<integer>",
 }
 HEAD = """<?xml version="1.0" encoding="utf-8"?>
 <executable>
@@ -55,7 +57,7 @@ def description() -> str:
     for name, tag in FIELDS.items():
         option = options["layers" if name == LAYER else name]
         kind = tag[1:-1].partition(" ")[0]
-        end = "<channel>input</channel>" if kind in ("file", "image") else f"<default>{option.default}</default>"
+        end = "<channel>input</channel>" if kind in ("file", "image") else f"<default>{DEFAULTS[name]}</default>"
         lines += [
             f"{tag}<name>{name}</name><longflag>{name}</longflag><label>{name.replace('_', ' ')}</label>",
             f"<description>{escape(option.help or '')}</description>{end}</{kind}>",

@@ -56,7 +56,7 @@ def save(
     overwrite: bool,
 ) -> None:  # fmt: skip
     """Write Gaussians, or a volume that is converted, as `vvgt_cli.view` does."""
-    from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.convert_batch import convert_all
     from vvgt_cli.conversion.request import ConvertRequest
 
     file, request = clouds[0][1], ConvertRequest(source, title=title)
@@ -65,7 +65,7 @@ def save(
     elif _is_series(source):
         if not is_page(output):
             raise UsageError(f"-o {output}: holds one frame; expected a page (.html), or --time N")
-        convert_files(replace(request, output=output, overwrite=overwrite, values=values), console=run.console)
+        convert_all({"": replace(request, output=output, overwrite=overwrite, values=values)}, console=run.console)
     else:
         with claimed([Output("-o", output, SUFFIXES, splats=True)], [file], overwrite):
             gaussians, options, held = _opened(run, file, request, values and is_page(output))
@@ -82,7 +82,7 @@ def show(
 
     The server takes a free port for 0.
     """
-    from vvgt_cli.conversion.convert_batch import convert_files
+    from vvgt_cli.conversion.convert_batch import convert_all
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 
     if len(clouds) > 1 or not _is_series(source):
@@ -90,7 +90,7 @@ def show(
         return
     with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
         quick = ConvertRequest(source, os.path.join(folder, "{}.ply"), FitOptions(steps=0), title=title)
-        convert_files(quick, console=run.console)
+        convert_all({"": quick}, console=run.console)
         frames = named_files(sorted(map(str, Path(folder).glob("*index.json"))))
         _serve(run, frames, SourceRequest(source.path), port, browser, announce)
 

@@ -84,7 +84,6 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
 _SETTINGS = re.compile(r",(?=[a-z]+=)")  # of a layer, FILE,tf=TF (`vvgt_cli.field.source.parse_layer`)
 _LAYER_FOLDERS = re.compile(r"(?<==)[^=]*/(?=[^/])")  # before the name in tf=TF
-_SHARD = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
 def typed(ctx: click.Context) -> list[click.Parameter]:
@@ -124,7 +123,7 @@ def _anonymous(name: str, value: str) -> str:
     if name == "layers":
         file, *rest = _SETTINGS.split(value)
         return ",".join([file if file.startswith("example:") else "LAYER", *(_LAYER_FOLDERS.sub("", x) for x in rest)])
-    return value if _SHARD.fullmatch(value) else _FOLDERS.sub("", value)
+    return _FOLDERS.sub("", value)
 
 
 SECTIONS = {  # parameters by name, in the order shown; all others come first, under "Options"

@@ -54,7 +54,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--dry-run": "a plan is for one file; remove it",
         "--shard": "shards are for series; remove it",
         "--checkpoint": "it is for one conversion; remove it",
-        "--max-size": WHOLE,
+        "--max-megabytes": WHOLE,
         "--time-budget": "it is for one conversion, and there are several; try --steps",
         "--live": "a live file of the whole map can show each label alone; remove one of them",
         "after": "only one conversion can start from another; remove it",
@@ -71,7 +71,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
         "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
         "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
-        "--max-size": WHOLE,
+        "--max-megabytes": WHOLE,
         "--no-values": "it holds none, for each cloud has its own volume; remove it",
     },
 }
@@ -148,39 +148,40 @@ class Functions(Batch):
     """One volume under several functions or looks, read and laid out once.
 
     Args:
-        requests: name, conversion and, for the index, source of each function.
+        requests: conversion of each function or look, by name.
     """
 
     kind = FUNCTIONS
 
-    def __init__(self, requests: Sequence[tuple[str, ConvertRequest, str]]) -> None:
+    def __init__(self, requests: Mapping[str, ConvertRequest]) -> None:
         """Store the requests, with file names made of their names."""
-        request = requests[0][1]
+        request = next(iter(requests.values()))
         given = request.source.volume
         volume = Path(given).name if isinstance(given, str) else content_of(given).volumes[0].name
-        super().__init__(request, volume, [UNSAFE.sub("-", name).strip("-.") or "function" for name, *_ in requests])
-        self._requests = list(requests)
+        super().__init__(request, volume, [UNSAFE.sub("-", name).strip("-.") or "function" for name in requests])
+        self._requests = dict(requests)
 
     def prepare(self, run: Run) -> None:
         """Read the volume, where it fits in memory."""
         source = self.request.source
         blocks = self.request.blocks or automatic(source, run.console)
         if blocks is not None:
-            self._requests = [(name, replace(one, blocks=blocks), fact) for name, one, fact in self._requests]
+            self._requests = {name: replace(one, blocks=blocks) for name, one in self._requests.items()}
             return
         with run.stage("volume") as stage:
             given = source.volume
             content = open_content(source.path, source.read) if isinstance(given, str) else content_of(given)
             content.prepare()
             stage.note = f"{content.volumes[0].name}, for {len(self._requests)} functions"
-        self._requests = [
-            (name, replace(one, source=replace(one.source, volume=content)), fact) for name, one, fact in self._requests
-        ]
+        self._requests = {
+            name: replace(one, source=replace(one.source, volume=content)) for name, one in self._requests.items()
+        }
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """Yield an item for each function."""
-        for number, ((name, request, fact), stem) in enumerate(zip(self._requests, self.stems, strict=True), 1):
+        for number, ((name, request), stem) in enumerate(zip(self._requests.items(), self.stems, strict=True), 1):
             if wanted(stem):
+                fact = request.source.tf if isinstance(request.source.tf, str) else name
                 run.console.progress(f"{fact}: function {number} of {len(self._requests)}")
                 yield Item(name, stem, request, {"function": fact})
 
@@ -192,9 +193,9 @@ def options_in(request: ConvertRequest) -> set[str]:
         "--checkpoint": request.checkpoint, "--report": request.report, "--preview": request.preview,
         "--live": request.live, "--tf": source.tf, "--layer": source.layers, "--steps": fit.steps,
         "--model": fit.model, "--labels none": source.labels == NO_LABELS,
-        "--max-size": limits.max_megabytes, "--time-budget": limits.time_budget, "--target-psnr": limits.target_psnr,
-        "--device": fit.device != "cpu", "--for": fit.target, "--init": fit.init != INIT,
-        "--frame world": request.ply.frame != "unit",
+        "--max-megabytes": limits.max_megabytes, "--time-budget": limits.time_budget,
+        "--target-psnr": limits.target_psnr, "--device": fit.device != "cpu", "--for": fit.target,
+        "--init": fit.init != INIT, "--frame world": request.ply.frame != "unit",
     }  # fmt: skip
     return {option for option, value in used.items() if value}
 

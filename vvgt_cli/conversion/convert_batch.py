@@ -33,7 +33,6 @@ from vvgt_cli.conversion.index import (
     FUNCTIONS,
     LABELS,
     entry,
-    function_name,
     index_of,
     index_output,
     is_pattern,
@@ -267,32 +266,38 @@ def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
         sink.close()
 
 
-def convert_files(
-    request: ConvertRequest, functions: Sequence[str] = (), *, split_labels: bool = False, dry_run: bool = False,
-    shard: str | None = None, console: Console | None = None,
-) -> str | None:  # fmt: skip
-    """Convert one volume, the frames of a series, several functions or the labels of a map to files or one file.
+def convert_all(
+    requests: Mapping[str, ConvertRequest], *, as_clouds: bool = False, split_labels: bool = False,
+    dry_run: bool = False, shard: str | None = None, after: Conversion | None = None, console: Console | None = None,
+) -> Conversion | Clouds | str | None:  # fmt: skip
+    """Convert a volume, the frames of a series, several looks or the labels of a map, to files or into memory.
 
     Args:
-        request: the request; an ``output`` with a place for a number or name (``{}``) asks for several files.
-        functions: all values of ``--tf``, the request's own included.
+        requests: request of each look, by name; an ``output`` with a place for a number or name (``{}``) asks for a
+            file each.
+        as_clouds: return `Clouds` even for a single look.
         split_labels: make a cloud of each label.
         dry_run: plan one volume, and write nothing.
         shard: ``I/N``, the share of a series to convert.
+        after: an earlier conversion of the same volume to start from.
         console: destination of messages.
 
     Returns:
-        The plan of a dry run.
+        The conversion of one volume and look, `Clouds` that are in memory or in one file, or the plan of a dry run;
+        None for a file each, and for a part of a volume.
 
     Raises:
         UsageError: contradictory options; raised before anything is read.
         DataError: see `convert`; complete files stay.
     """
-    console, output = console or Console(), request.output or ""
-    several, numbered = len(functions) > 1, is_pattern(output)
+    from vvgt_cli.conversion.previous_look import PreviousLook
+
+    console, request = console or Console(), next(iter(requests.values()))
+    output, numbered = request.output or "", is_pattern(request.output or "")
     flags = {"--dry-run": dry_run, "--shard": shard, "--split-labels": split_labels, "a file each": numbered}
-    flags["--no-values"] = is_page(output) and request.scored and not request.values
+    flags |= {"--no-values": is_page(output) and request.scored and not request.values, "after": after is not None}
     used = options_in(request) | {option for option, given in flags.items() if given}
+    several = as_clouds or len(requests) > 1
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind
     kinds = [*([LEVELS] if is_streamed(output) else []), named, *([LIVE] if request.live else [])]
@@ -308,32 +313,32 @@ def convert_files(
         request = replace(request, blocks=request.blocks or BlockOptions())
     if dry_run:
         return plan_of(request, console).text()
-    if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source)):
+    holds_frames = not output or is_page(output)
+    if kind == ONE and not (holds_frames and is_glob_of_volumes(request.source)):
         try:
-            convert(request, console)
-            return None
+            return convert(request, console, start=None if after is None else PreviousLook(after))
         except SeveralSteps:
-            if not is_page(output):
+            if not holds_frames or not isinstance(request.source.volume, str):
                 raise
     if kind == ONE:
-        kind, together = FRAMES, True
-        check_options(ONE_FILE, used)
+        kind, together = FRAMES, bool(output)
+        for one in [FRAMES, *([ONE_FILE] if together else [])]:
+            check_options(one, used)
     share = WHOLE_RUN if shard is None else parse_shard(shard)
     request = replace(request, shares_output=together)
-    looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, looks, share)
+    looks = {name: replace(request, source=one.source) for name, one in requests.items()}
+    batch = FrameSeries(request, share) if kind == FRAMES else Labels(request) if kind == LABELS else Functions(looks)
     if together:
-        _save_one_file(batch, request, output, console)
-    else:
-        _run(batch, Files(request, share), console)
-    return None
+        return _save_one_file(batch, request, output, console)
+    found = _run(batch, Files(request, share) if output else Memory(), console)
+    return None if output else found
 
 
-def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> None:
+def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: Console) -> Clouds:
     """Convert a batch to a page, or a file with a node an item; raise DataError if nothing is visible in any."""
     run = Run(console, ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite):
-        clouds = _run(batch, Memory(), console)
+        clouds: Clouds = _run(batch, Memory(), console)
         if not clouds:
             raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
         with run.stage("write") as stage:
@@ -342,48 +347,4 @@ def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: 
         names = [cloud.shown_name() for cloud in clouds.clouds]
         run.console.message(contents(clouds.clouds[0].ply, output, names) if is_page(output) else SORTED.format(output))
         run.finish()
-
-
-def convert_to_memory(
-    requests: Mapping[str, ConvertRequest], *, as_clouds: bool = False, split_labels: bool = False,
-    after: Conversion | None = None, console: Console | None = None,
-) -> Conversion | Clouds:  # fmt: skip
-    """Convert one volume, the frames of a series, several looks or the labels of a map, without files.
-
-    Args:
-        requests: request of each look, by name.
-        as_clouds: return `Clouds` even for a single look.
-        split_labels: make a cloud of each label.
-        after: an earlier conversion of the same volume to start from.
-        console: destination of messages.
-
-    Raises:
-        UsageError, DataError: see `convert_files`.
-    """
-    from vvgt_cli.conversion.previous_look import PreviousLook
-
-    console, request = console or Console(), next(iter(requests.values()))
-    used = options_in(request) | ({"after"} if after else set()) | ({"--split-labels"} if split_labels else set())
-    kind = FUNCTIONS if as_clouds else LABELS if split_labels else ONE
-    for one in [LAYERS if kind == LABELS and request.source.layers else kind, *([LIVE] if request.live else [])]:
-        check_options(one, used)
-    if kind == ONE and not is_glob_of_volumes(request.source):
-        try:
-            return convert(request, console, start=None if after is None else PreviousLook(after))
-        except SeveralSteps:
-            if not isinstance(request.source.volume, str):
-                raise
-    kind = FRAMES if kind == ONE else kind
-    check_options(kind, used)
-    batch = _batch(kind, request, [(name, one, name) for name, one in requests.items()])
-    found: Clouds = _run(batch, Memory(), console)
-    return found
-
-
-def _batch(
-    kind: str, request: ConvertRequest, functions: Sequence[tuple[str, ConvertRequest, str]], shard: Shard = WHOLE_RUN
-) -> Batch:  # fmt: skip
-    """Return the batch of a kind."""
-    if kind == FRAMES:
-        return FrameSeries(request, shard)
-    return Labels(request) if kind == LABELS else Functions(functions)
+    return clouds

@@ -40,7 +40,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         up=up_axis(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
-        screen_size=request.fit.size,
+        screen_size=request.fit.screen,
         rule=request.fit.rule,
         light=source.lighting,
         function=source.name if len(source.layers) > 1 else source.tf.name,

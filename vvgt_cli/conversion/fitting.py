@@ -141,10 +141,10 @@ def _pictures(stages: Sequence[Stage], fit: FitOptions) -> list[Picture]:
 def _planned(work: Work, request: ConvertRequest) -> tuple[Planner, Plan]:
     """Return planner and plan before the first stage."""
     fit = work.fit
-    workload = replace(work.field.workload(fit.size, fit.max_gaussians), degree=work.degree)
+    workload = replace(work.field.workload(fit.screen, fit.max_gaussians), degree=work.degree)
     planner = Planner(
         request.limits, fit, sh_degree=request.ply.sh_degree or work.degree,
-        wide=expected_wide(fit.max_gaussians, fit.size), whole=request.scored_whole, writes=request.writes,
+        wide=expected_wide(fit.max_gaussians, fit.screen), whole=request.scored_whole, writes=request.writes,
         axes=headset_axes(work.field.source.volume, work.ply.up), parts=_parts(work, request),
     )  # fmt: skip
     plan = planner.plan(workload, work.run.elapsed())
@@ -164,7 +164,7 @@ def _run(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     if planner.parts is None:
         # the mean of its pace and that of drawing, since steps follow neither alone on every machine
         pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
-        planner = replace(planner, wide=suits_small_views(work.current(), work.fit.size), sh_degree=degree)
+        planner = replace(planner, wide=suits_small_views(work.current(), work.fit.screen), sh_degree=degree)
         workload = replace(plan.workload.at(pace), gaussians=len(work.current()), degree=work.current().degree)
         plan = planner.plan(workload, work.run.elapsed(), begun=True)
         check_memory(plan)

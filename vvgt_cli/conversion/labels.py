@@ -206,7 +206,7 @@ def _gaussians(request: ConvertRequest, parts: Sequence[LabelItem], run: Run) ->
     whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions((NONE,))))
     with open_field(run, plain) as field, run.stage("hidden"):
-        form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
+        form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.screen)).form
         assert form is not None
         from vvgt_cli.closed_form.tree import HIDDEN
 

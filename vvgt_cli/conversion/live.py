@@ -58,7 +58,8 @@ def check_live(request: ConvertRequest) -> None:
     given = {
         "--target-psnr": limits.target_psnr is not None,
         "--time-budget": limits.time_budget is not None,
-        "--max-size (or write a page, -o OUT.html)": limits.max_megabytes is not None and not is_page(request.output),
+        "--max-megabytes (or write a page, -o OUT.html)": limits.max_megabytes is not None
+        and not is_page(request.output),
         "--steps": fit.steps is not None,
         "--model": fit.model is not None,
         "--init": fit.init != "vbm",
@@ -102,7 +103,7 @@ class LiveForm(Stage):
             facts = LiveFacts.of(source.volume, source.overall, source.tf)
             gaussians = _one_layer(work.run, fit, work.field)
         table, lighting = _baked_look(source, facts), box_lighting(source)
-        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.size)), lighting)
+        work.gaussians = apply_light(baked(gaussians, table, pixel_width(fit.screen)), lighting)
         work.ply = replace(work.ply, live=facts)
 
 
@@ -124,11 +125,17 @@ class LiveLook(Stage):
         fit, source = work.fit, work.field.source
         assert work.ply.live is not None
         table, lighting = _baked_look(source, work.ply.live), box_lighting(source)
-        shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.size))
+        shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.screen))
         name = source.name if len(source.layers) > 1 else source.tf.name
         with work.run.stage(self.name) as stage:
             live = score_test_views(
-                work.field.views, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
+                work.field.views,
+                shown,
+                fit.screen,
+                RenderSettings(),
+                rule=fit.rule,
+                perceptual=False,
+                only=PREVIEW_VIEWS,
             )
             stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; scoring next as others show it"
         work.live_psnr = live.psnr
@@ -152,7 +159,7 @@ def _one_layer(run: Run, fit: FitOptions, field: Field) -> Gaussians:
     else:
         foggy = field.with_look(source.with_function(fog(source.overall, source.tf)))
         found = with_values(run, foggy, fog_start(run, foggy, fit))
-    return widen_narrow(found, fit.size)
+    return widen_narrow(found, fit.screen)
 
 
 def _several_layers(run: Run, fit: FitOptions, field: Field) -> tuple[Gaussians, LiveFacts]:
@@ -225,7 +232,7 @@ def fog_start(run: Run, field: Field, fit: FitOptions) -> Start:
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
-        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, values=True)
+        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.screen, values=True)
         start = field.pyramid(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)

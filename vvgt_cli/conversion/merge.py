@@ -78,7 +78,7 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
         cut = cut_of(run, run_pass)
         run.report.volume, run.report.transfer_function = plan.volume, plan.function
         run.report.options = {
-            "max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up
+            "max_gaussians": plan.budget, "screen": plan.size, "frame": plan.ply.frame, "up": plan.ply.up
         }  # fmt: skip
         if is_streamed(output):
             write_levels(run, run_pass, choose_levels(run, run_pass, cut), output, overwrite, plan.ply)

@@ -48,7 +48,7 @@ def open_field(
         names = (CONVERT if request.scored else alone) if kernels is None else kernels
         return for_degree(source.kernels(names + (LIVE if request.live else ())), degree_of(request, source))
 
-    needs = FieldNeeds(request.budget(), request.fit.size, request.ply.sh_degree, request.out_of_core, request.live)
+    needs = FieldNeeds(request.budget(), request.fit.screen, request.ply.sh_degree, request.out_of_core, request.live)
     store = nullcontext(BlockStore(Path(str(beside)).absolute())) if shard else store_beside(beside)
     with opened(run, request.source, request.blocks, needs, needed, store, request.fit.device) as field:
         yield field

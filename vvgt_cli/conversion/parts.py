@@ -240,10 +240,10 @@ def refine_part(part: VolumePart, gaussians: Gaussians, refiner: Refiner, distan
     start, steps = part.moved_in(gaussians), refiner.fit.steps or 0
     if not len(gaussians):
         return gaussians
-    screen = pixel_width(refiner.fit.size) * distance / RADIUS * part.scale
+    screen = pixel_width(refiner.fit.screen) * distance / RADIUS * part.scale
     width = float(np.exp(np.median(np.sort(start.log_scales, axis=1)[:, 1])))
     edge = view_edge(width, screen)
-    fit = replace(refiner.fit, size=max(round(pixel_width(1) / screen), edge))
+    fit = replace(refiner.fit, screen=max(round(pixel_width(1) / screen), edge))
     field = cast("Field", part)  # only its pictures are drawn
     run = Run(Console(quiet=True), ConversionReport("convert"))
     work = Work(run, field, fit, refiner.limits, gaussians=start, weigh=lambda at: part.weights(at, FACES * width))

@@ -179,7 +179,7 @@ class Planner:
         workload = plan.workload
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
-        small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
+        small = self.wide and not few and not network and self.fit.screen >= 2 * SMALLEST
         wanted = most_steps(self.fit, self.limits)
         steps = steps_in_time(wanted, left, lambda steps: self._seconds(workload, steps, small))
         if not steps:
@@ -202,7 +202,7 @@ class Planner:
         enough = steps >= ENOUGH_STEPS
         return [
             CheckViews(),
-            TrainingViews(view_count(steps, small), view_edge(self.fit.size, small)),
+            TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),
             *([CellsByError(small, keep=not self._recuts())] if enough and self.vbm and self.fit.model is None else []),
             Refinement(steps, most, small, overlap=enough and self.vbm),
         ]
@@ -223,7 +223,7 @@ class Planner:
         if not projected:
             plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_time_left(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
-        train = TrainingViews(view_count(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
+        train = TrainingViews(view_count(0, small=False), view_edge(self.fit.screen, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
         judge = self.limits.target_psnr is not None and (left is None or left >= views)
@@ -264,7 +264,7 @@ def check_memory(plan: Plan, pictures: float = 0.0, beside: Callable[[Workload],
     )
     if (drawn := views + pictures) > free:
         raise UsageError(
-            f"--size {size}: views need {drawn / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
+            f"--screen {size}: views need {drawn / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --screen "
             f"{max(int(size * (free / drawn) ** 0.5), 1)} would fit, or try 'vvgt init', which renders none"
         )
     need = SURE * plan.working_memory + pictures + beside(plan.workload)
@@ -287,5 +287,5 @@ def report_target(run: Run, fit: FitOptions, megabytes: float | None) -> None:
     if fit.target is not None:
         most = "" if megabytes is None else f"{megabytes:g} MB, "
         run.console.message(
-            f"for {fit.target}: at most {most}{fit.max_gaussians} Gaussians, {fit.size} px, drawn as {fit.rule}"
+            f"for {fit.target}: at most {most}{fit.max_gaussians} Gaussians, {fit.screen} px, drawn as {fit.rule}"
         )

@@ -64,7 +64,7 @@ class _Frame:
 def previous_frame(request: ConvertRequest, shards: int = 1) -> PreviousFrame | None:
     """Return the warm start of a series in ``shards`` shards; None where each frame is converted from scratch."""
     limited = request.limits.target_psnr is not None or request.limits.time_budget is not None
-    return None if request.live or request.checkpoint or limited or shards > 1 else PreviousFrame(request.fit.size)
+    return None if request.live or request.checkpoint or limited or shards > 1 else PreviousFrame(request.fit.screen)
 
 
 class PreviousFrame(WarmStart):
@@ -163,7 +163,7 @@ class PreviousFrame(WarmStart):
                 "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
             result = refine(work.run, work.current(), Views(cameras, images), judged, options, free=free)
-            result = as_stored(widen_small(result, work.fit.size)[0])
+            result = as_stored(widen_small(result, work.fit.screen)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
             if psnr >= last.psnr - WORSE or work.run.report.interrupted:

@@ -84,9 +84,9 @@ class PreviousLook(WarmStart):
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
         steps = min(work.fit.steps or WARM_STEPS, WARM_STEPS)
-        small = suits_small_views(work.current(), work.fit.size)
+        small = suits_small_views(work.current(), work.fit.screen)
         stages = (
-            TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
+            TrainingViews(view_count(steps, small), view_edge(work.fit.screen, small)),
             Refinement(steps, steps, small),
         )
         judge = CheckViews()

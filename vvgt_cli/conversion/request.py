@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from vvgt_cli.conversion.place import AUTO
 from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
@@ -29,36 +30,38 @@ class FitOptions:
     """Options of the fit: budget, screen, method, steps.
 
     Attributes:
-        max_gaussians: budget of Gaussians; None: the target's, or `MAX_GAUSSIANS`.
-        size: pixels along the edge of the screen that the file is made for; None: the target's, or `SIZE`.
+        max_gaussians: maximum number of Gaussians.
+        screen: pixels along the edge of the screen that the file is made for.
         init: "vbm", "wavelet" or "uniform".
-        rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by; None: the target's, or `RULE`.
+        rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by.
         seed: seed of random numbers.
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.
         steps: maximum number of steps of gradient descent; None: the default.
         device: "cpu", or "cuda" for views and steps.
         target: name of the device that the file is made for (`vvgt_cli.gaussians.targets`), None for none.
-
-    Raises:
-        UsageError: there is no such target.
     """
 
-    max_gaussians: int = None  # type: ignore[assignment] # set below, as size and rule
-    size: int = None  # type: ignore[assignment]
+    max_gaussians: int = MAX_GAUSSIANS
+    screen: int = SIZE
     init: str = INIT
-    rule: str = None  # type: ignore[assignment]
+    rule: str = RULE
     seed: int = 0
     steps: int | None = None
     model: str | None = None
     device: str = "cpu"
     target: str | None = None
 
-    def __post_init__(self) -> None:
-        """Set what is not given."""
-        target = target_of(self.target)
-        for name, default in (("max_gaussians", MAX_GAUSSIANS), ("size", SIZE), ("rule", RULE)):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, getattr(target, name, default))
+    @classmethod
+    def of(cls, target: str | None = None, **given: Any) -> FitOptions:
+        """Return the options that are given and not None; others are the target's, or the defaults.
+
+        Raises:
+            UsageError: there is no such target.
+        """
+        device = target_of(target)
+        names = ("max_gaussians", "screen", "rule") if device else ()
+        known = {name: getattr(device, name) for name in names}
+        return cls(target=target, **known | {name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class Limits:
         if self.time_budget is not None and not 0 < self.time_budget < math.inf:
             raise UsageError(f"--time-budget {self.time_budget:g}: expected more than 0 seconds")
         if self.max_megabytes is not None and not 0 < self.max_megabytes < math.inf:
-            raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
+            raise UsageError(f"--max-megabytes {self.max_megabytes:g}: expected more than 0 MB")
 
     def gaussians(self, most: int, header: float, each: float) -> int:
         """Return how many Gaussians of ``each`` bytes budget and file size allow after a header.
@@ -97,7 +100,9 @@ class Limits:
         fit = int((self.max_megabytes * 1e6 - header) // each)
         if fit < 1:
             least = (header + each) / 1e6
-            raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more")
+            raise UsageError(
+                f"--max-megabytes {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more"
+            )
         return min(most, fit)
 
 
@@ -166,7 +171,7 @@ class ConvertRequest:
             header += SMALLEST_VALUES if self.values else 0
         elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
             raise UsageError(
-                f"--max-size needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"
+                f"--max-megabytes needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"
             )
         else:
             header, each = file_bytes(0, degree), file_bytes(1, degree) - file_bytes(0, degree)

@@ -223,7 +223,9 @@ class Conversion(Result):
                 room = None if limit is None else limit - CERTIFICATES - len(encoded(page, *bare, ""))
                 found = self._values[limit] = self.field.source.values(room)
                 colours = all(layer.colors for layer in self.field.source.layers)
-                why = "the volume has colours" if colours else f"--max-size leaves {max(room or 0, 0) / 1e6:.2f} MB"
+                why = (
+                    "the volume has colours" if colours else f"--max-megabytes leaves {max(room or 0, 0) / 1e6:.2f} MB"
+                )
                 stage.note = str(found or f"none: {why}")
         return self._values[limit]
 

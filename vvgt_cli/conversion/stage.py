@@ -87,7 +87,7 @@ class Work:
     def check_rule(self) -> Rule:
         """Return the drawing rule of the check views, which may have fewer pixels than the screen."""
         assert self.check is not None
-        return self.rule.at(self.check.cameras[0].width / self.fit.size)
+        return self.rule.at(self.check.cameras[0].width / self.fit.screen)
 
     def current(self) -> Gaussians:
         """Return the Gaussians of the latest stage."""

@@ -16,7 +16,7 @@ class Target:
         name: value of ``--for``.
         max_gaussians: Gaussians that it draws at its frame rate.
         megabytes: largest file, 10^6 bytes.
-        size: pixels along the edge of its screen, as `vvgt_cli.conversion.request.FitOptions` has it.
+        screen: pixels along the edge of its screen, as `vvgt_cli.conversion.request.FitOptions` has it.
         rule: name of the drawing rule of its programs.
         best: ending of the file that most of its programs open.
         unread: endings of files that none of them opens.
@@ -26,7 +26,7 @@ class Target:
     name: str
     max_gaussians: int
     megabytes: float
-    size: int
+    screen: int
     rule: str
     best: str
     unread: tuple[str, ...] = ()

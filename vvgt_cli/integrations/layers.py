@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.commands.convert import convert
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.field.layered import Content
-from vvgt_cli.library.functions import convert
-from vvgt_cli.library.inputs import GoalLike, LightLike, Look, source_of
+from vvgt_cli.library.inputs import LightLike, Look, source_of
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.types import triple
@@ -25,7 +25,7 @@ AROUND = "around"  # name of an empty volume that holds all
 Layer = tuple[Content, Look]
 
 
-def together(layers: Sequence[Layer], light: LightLike, goal: GoalLike = None, **options: Any) -> Conversion:
+def together(layers: Sequence[Layer], light: LightLike, **options: Any) -> Conversion:
     """Convert volumes, each with its look, under one light, wherever they lie; ``options`` are those of `convert`.
 
     Raises:
@@ -35,7 +35,7 @@ def together(layers: Sequence[Layer], light: LightLike, goal: GoalLike = None, *
     look = replace(look, light=light, layers=[source_of(*one, {}) for one in rest])
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", f"{AROUND}, none: nothing is visible")
-        result = convert(first, look, goal, **options)
+        result = convert(first, look, **options)
     assert isinstance(result, Conversion)
     return result
 

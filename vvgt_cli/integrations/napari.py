@@ -22,11 +22,11 @@ from napari import current_viewer
 from napari.layers import Layer
 from napari.utils.notifications import show_warning
 
+from vvgt_cli.commands.session import read_volume
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content
 from vvgt_cli.integrations.layers import together
-from vvgt_cli.library.functions import read_volume
 from vvgt_cli.library.inputs import Look
 
 NODES = 256  # of a colour map, which may have steps

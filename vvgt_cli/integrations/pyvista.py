@@ -20,26 +20,21 @@ from vvgt_cli.integrations.layers import Layer, together
 from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import Drawn, drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
-from vvgt_cli.library.inputs import GoalLike, Look, Reading, volume_of
+from vvgt_cli.library.inputs import Look, Reading, volume_of
 from vvgt_cli.look import read_transfer_function
 from vvgt_cli.look.lighting import LightOptions
 
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 
 
-def export_plotter(
-    plotter: Any, path: str | os.PathLike[str], goal: GoalLike = None, *, live: bool = False, overwrite: bool = True,
-    progress: bool = False,
-) -> Conversion:  # fmt: skip
+def export_plotter(plotter: Any, path: str | os.PathLike[str], *, overwrite: bool = True, **options: Any) -> Conversion:
     """Write the volumes that a pyvista.Plotter shows as Gaussians: functions, light and camera are the plotter's.
 
     Args:
         plotter: pyvista.Plotter, of whose active subplot visible volumes are taken, several as layers.
         path: the file, as in `Result.save`.
-        goal: as in `convert`.
-        live: as in `convert`.
         overwrite: replace an existing file.
-        progress: as in `convert`.
+        **options: further ones of `convert`, as ``max_gaussians`` and ``live``.
 
     Returns:
         The conversion, whose file opens at the plotter's camera. One warning names what was not taken.
@@ -73,7 +68,7 @@ def export_plotter(
     notes += unlike + askew
     if notes:
         warnings.warn(f"not taken from the plotter: {'; '.join(dict.fromkeys(notes))}", stacklevel=2)
-    result = together(layers, light, goal, live=live, progress=progress)
+    result = together(layers, light, **options)
     result.ply = replace(result.ply, camera=camera_in(camera.split(",")), up=up)
     result.save(path, overwrite=overwrite)
     return result

@@ -22,9 +22,9 @@ class Accessor:
         """Take the array, which is not read."""
         self._array = array
 
-    def convert(self, look: Any = None, goal: Any = None, **options: Any) -> Any:
+    def convert(self, look: Any = None, **options: Any) -> Any:
         """Convert the array; see `vvgt_cli.convert`. A ``time`` axis needs ``time=N``."""
-        return vvgt.convert(self._array, look, goal, **options)
+        return vvgt.convert(self._array, look, **options)
 
     def render_views(self, look: Any = None, output: Any = None, **options: Any) -> Any:
         """Render calibrated views of the array; see `vvgt_cli.render_views`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli.conversion.index import function_name
 from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
+from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, open_content
@@ -154,48 +154,6 @@ def _name_of(function: FunctionLike | None) -> str:
     return function.name if isinstance(function, TransferFunction) else function_name(os.fspath(function))
 
 
-@dataclass(frozen=True)
-class Goal(Limits, FitOptions):
-    """The goal of a conversion: the attributes of `FitOptions` (``target`` is ``--for``) and `Limits`.
-
-    What is not given follows from the target when the goal is made; ``replace`` with another target keeps it.
-
-    Attributes:
-        all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
-    """
-
-    all_views: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the limits, and set what is not given."""
-        Limits.__post_init__(self)
-        FitOptions.__post_init__(self)
-
-    @classmethod
-    def of(cls, goal: GoalLike) -> Goal:
-        """Return a goal as it is, or made from a mapping of its attributes.
-
-        Raises:
-            UsageError: an attribute is unknown.
-        """
-        if not isinstance(goal, Mapping):
-            return goal or cls()
-        known = [field.name for field in fields(cls)]
-        if unknown := sorted(set(goal) - set(known)):
-            raise UsageError(f"goal: {unknown[0]}; expected any of {', '.join(known)}")
-        return cls(**goal)
-
-    def request(self, source: SourceRequest) -> ConvertRequest:
-        """Return the request for the conversion of a source."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        fit = FitOptions(**{field.name: given[field.name] for field in fields(FitOptions)})
-        limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
-        return ConvertRequest(source, fit=fit, limits=limits, all_views=self.all_views)
-
-
-GoalLike = Goal | Mapping[str, Any] | None
-
-
 class Reading(TypedDict, total=False):
     """Options of reading a volume; see `vvgt_cli.volume.ReadOptions`, and `volume_in_memory` for affine and origin."""
 
@@ -301,6 +259,28 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
     else:
         source = SourceRequest(content_of(volume, reading))
     return with_look(source, Look.of(look))
+
+
+def requests_of(
+    volume: VolumeLike, look: LooksLike, reading: Reading, *, blocks: int | str | BlockOptions | None, **options: Any
+) -> tuple[dict[str, ConvertRequest], bool]:
+    """Return the request of each look by its name, and whether several looks were given.
+
+    Args:
+        volume: as in `convert`.
+        look: as in `convert`.
+        reading: as in `convert`.
+        blocks: as in `convert`.
+        **options: further attributes of `ConvertRequest`; paths become text.
+
+    Raises:
+        DataError, UsageError: see `source_of` and `looks_of`.
+    """
+    looks, several = looks_of(look)
+    source = source_of(volume, None, reading)
+    given = {name: os.fspath(one) if isinstance(one, os.PathLike) else one for name, one in options.items()}
+    request = ConvertRequest(source, blocks=blocks_of(blocks), **given)
+    return {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}, several
 
 
 def with_look(source: SourceRequest, look: Look) -> SourceRequest:

@@ -59,7 +59,7 @@ class ClosedFormStage(Stage):
             work.start, work.gaussians = Start(kept[0], None), kept[0]
             return
         options = VbmOptions(
-            max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed, degree=work.degree
+            max_gaussians=fit.max_gaussians, size=fit.screen, method=fit.init, seed=fit.seed, degree=work.degree
         )
         with run.stage(self.name) as stage:
             start = work.field.pyramid(options, run.console.bar(self.name))

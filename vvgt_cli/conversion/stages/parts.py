@@ -74,7 +74,7 @@ class OutOfCore(Stage):
         if self.together and self.steps:
             run.console.message(f"more than {MANY:,} Gaussians: refined part by part (docs/scale.md)")
         if self.alone:
-            field.views.expect(scored_views(work.fit.size))
+            field.views.expect(scored_views(work.fit.screen))
         make_blocks(work, field)
         if field.run_pass.shard is not None:
             return
@@ -122,9 +122,9 @@ def make_blocks(work: Work, field: Blocked) -> None:
     from vvgt_cli.closed_form.closed_form import most_cells
 
     run, fit, source, store = work.run, work.fit, field.source, field.run_pass.store
-    cells = field.cells(fit.size, most_cells(fit.max_gaussians, on_disk=True))
+    cells = field.cells(fit.screen, most_cells(fit.max_gaussians, on_disk=True))
     CutPlan(
-        cells.grid, fit.max_gaussians, fit.size, source.volume.direction, work.ply, run.report.volume,
+        cells.grid, fit.max_gaussians, fit.screen, source.volume.direction, work.ply, run.report.volume,
         run.report.transfer_function, "" if cells.rays is None else cells.rays.kind, source.labels_alone, work.degree,
         field.reader.voxel_bytes,
     ).save(store, cells.light)  # fmt: skip

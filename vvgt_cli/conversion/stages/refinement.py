@@ -97,7 +97,7 @@ class Refinement(Stage):
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.current()
-        begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
+        begin = (widened(start, WIDER, pixel_width(work.fit.screen)), work.psnr(start)) if self.overlap else None
         work.gaussians = refine(work.run, start, work.train, work.check, options, begin)
         if work.weigh is None:
             work.gaussians = _drop_undrawn(work, work.gaussians)
@@ -105,10 +105,10 @@ class Refinement(Stage):
 
 def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
     """Apply `without_undrawn`; where that removes many, count the mass in the way that the check views prefer."""
-    kept = without_undrawn(gaussians, work.fit.size)
+    kept = without_undrawn(gaussians, work.fit.screen)
     if len(kept) >= MIN_KEPT * len(gaussians):
         return kept
-    return max(kept, without_undrawn(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
+    return max(kept, without_undrawn(gaussians, work.fit.screen, work.rule.dilation), key=work.psnr)
 
 
 def refine(

@@ -59,7 +59,8 @@ class TestViews(Stage):
 
         only = None if self.whole else PREVIEW_VIEWS
         return [
-            Picture(camera, RenderSettings(), blocks) for _, camera, blocks in scored_views(fit.size, self.whole, only)
+            Picture(camera, RenderSettings(), blocks)
+            for _, camera, blocks in scored_views(fit.screen, self.whole, only)
         ]
 
     def run(self, work: Work) -> None:
@@ -71,7 +72,7 @@ class TestViews(Stage):
             scores = score_test_views(
                 work.field.views,
                 work.shown,
-                fit.size,
+                fit.screen,
                 RenderSettings(),
                 rule=fit.rule,
                 perceptual=self.whole,
@@ -79,7 +80,7 @@ class TestViews(Stage):
                 progress=run.console.bar(self.name),
             )
             run.report.scores = asdict(scores)
-            stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.size} px"
+            stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.screen} px"
 
 
 def _places(size: int) -> list[tuple[tuple[int, float], int]]:
@@ -125,8 +126,8 @@ class ViewingConditions(Stage):
         """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in self._wanted(fit.size)]
-        return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
+        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in self._wanted(fit.screen)]
+        return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.screen))]
 
     def run(self, work: Work) -> None:
         """Score the Gaussians."""
@@ -138,9 +139,9 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.shown, RenderSettings()
-            seen = condition_views(work.field.views, self._wanted(fit.size), settings)
+            seen = condition_views(work.field.views, self._wanted(fit.screen), settings)
             conditions = score_conditions(made, seen, dict.fromkeys((*VIEWERS, fit.rule)), fit.rule)
             run.report.conditions = [asdict(condition) for condition in conditions]
-            near, views = texture_cameras(fit.size), work.field.views
-            run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))
+            near, views = texture_cameras(fit.screen), work.field.views
+            run.report.texture = asdict(score_texture(views, made, fit.screen, fit.rule, settings, cameras=near))
             stage.note = f"worst of {len(conditions)}: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"

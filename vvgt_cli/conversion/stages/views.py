@@ -65,7 +65,8 @@ class CheckViews(Stage):
 
         settings = RenderSettings() if self.fine else FIT_VIEWS
         return [
-            Picture(camera, settings, blocks) for camera, blocks in check_blocks(default_views("check", size=fit.size))
+            Picture(camera, settings, blocks)
+            for camera, blocks in check_blocks(default_views("check", size=fit.screen))
         ]
 
     def run(self, work: Work) -> None:
@@ -75,7 +76,7 @@ class CheckViews(Stage):
 
         if work.check is not None:
             return
-        size = self.edge or work.fit.size
+        size = self.edge or work.fit.screen
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:
             work.check = render_check_views(work.field.views, cameras, RenderSettings() if self.fine else FIT_VIEWS)
@@ -116,7 +117,7 @@ class TrainingViews(Stage):
         found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
         if self.fitted:
             camera, blocks = _probe(self.edge)
-            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.size))]
+            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
         return found
 
     def run(self, work: Work) -> None:
@@ -124,7 +125,7 @@ class TrainingViews(Stage):
         from vvgt_cli.dvr import render_views
         from vvgt_cli.dvr.render import FIT_VIEWS
 
-        footprint = self.edge / work.fit.size
+        footprint = self.edge / work.fit.screen
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:

@@ -99,7 +99,9 @@ class Values(NamedTuple):
     def __str__(self) -> str:
         """Describe the grids for whoever sends the page."""
         grids = [" x ".join(map(str, one["dims"])) for one in self.facts]
-        return f"values of the volume ({', '.join(grids)} voxels{', coarser for --max-size' if self.limited else ''})"
+        return (
+            f"values of the volume ({', '.join(grids)} voxels{', coarser for --max-megabytes' if self.limited else ''})"
+        )
 
 
 def values_of(layers: Sequence[Layer | None], room: float | None = None) -> Values | None:
