@@ -69,13 +69,14 @@ def test_presets_suit_the_values_and_are_those_that_the_file_does_not_have() -> 
     assert (nodes[250], nodes[450]) == (0.06, 0.25)
     assert [found["name"] for found in presets(bone, "ct-skin")] == CT[1:]
     assert [found["name"] for found in presets(skin, "ct-skin", longer=2)] == CT
-    assert [presets(bone, name, unit="") for name in ("ct-bone", "bone")] == [[], []]
+    for name in ("ct-bone", "bone"):
+        assert [found["title"] for found in presets(bone, name, unit="")] == SHARES
     scan = tuple(np.histogram(np.repeat([-995, 40.0], [300, 200]), 256, (-1000, 400))[0].tolist())
     assert [found["name"] for found in presets(bone, "bone", unit="", histogram=scan)] == CT[1:]
     assert [found["title"] for found in presets(bone, "bone", unit="K", histogram=scan)] == SHARES
     found = presets_of(replace(facts(), function=function_text(RAMP, LO, HI), histogram=scan), 1, 2, "mr")
-    assert [one["name"] for one in found] == ["mr-head", "mr-angio", *SHARES[:1]]
-    assert found[-1]["light"] == {"ambient": 0.2, "diffuse": 1.0, "specular": 0.0}
+    assert [one["name"] for one in found] == [*SHARES[:1], "mr-head", "mr-angio"]
+    assert found[0]["light"] == {"ambient": 0.2, "diffuse": 1.0, "specular": 0.0}
 
 
 @pytest.mark.parametrize("longer", [0.2, 8, 16])

@@ -28,11 +28,8 @@ from vvgt_cli.volume.types import Volume
 FEW = 12  # nodes of presets for colours that are not interpolated linearly in RGB
 ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
 EDGE, QUALITY = 84, 80  # px of a small picture; of its WebP
-CELLS, STEP, ENTRIES = (
-    1 << 19,
-    0.6,
-    1 << 12,
-)  # of the grid that it is drawn from, and of its edge; of a function's table
+CELLS, ENTRIES = 1 << 19, 1 << 12  # of the grid that it is drawn from; of a function's table
+STEP, STEPS = 0.6, 256  # of a cell's edge, between samples; and at most so many on a ray
 _HEADLIGHT = {key: getattr(MATTE, key) for key in ("ambient", "diffuse", "specular")}
 
 
@@ -56,7 +53,7 @@ def presets_of(facts: LiveFacts, distance: float, edge: float, kind: str, name: 
         kind: of `kind_of`.
         name: of the file's function.
 
-    Of kinds other than CT, one by shares is added.
+    Of kinds other than CT, one by shares comes first.
 
     Returns:
         of each ``name``, ``title``, ``shows``, ``nodes`` and ``light``: its coefficients, None for none.
@@ -76,7 +73,7 @@ def presets_of(facts: LiveFacts, distance: float, edge: float, kind: str, name: 
         if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):
             about = {"name": name, "title": titles()[name], "shows": named[name]}
             found.append(about | {"nodes": function_nodes(tf, FEW), "light": light})
-    return found + _by_shares(facts)[: 0 if kind == "ct" else 1 if found else None]
+    return _by_shares(facts)[: 0 if hounsfield else 1 if found else None] + found
 
 
 def _by_shares(facts: LiveFacts) -> list[dict[str, Any]]:
@@ -213,12 +210,12 @@ class Sketch:
         up, step = np.cross(eye, right), size / dims
         half = max(np.abs(right) @ size, np.abs(up) @ size) / 2
         across = half * (2 * (np.arange(EDGE) + 0.5) / EDGE - 1)
-        self.length = STEP * float(step.min())
-        deep = np.arange(np.linalg.norm(size) / 2, -np.linalg.norm(size) / 2, -self.length)
-        # (EDGE, EDGE, n, 3) in cells, from the upper left and from before
-        at = np.add.outer(np.add.outer(across, across) * 0, deep)[..., None] * eye
-        at += across[None, :, None, None] * right - across[:, None, None, None] * up + size / 2
-        at = at / step - 0.5
+        through = float(np.linalg.norm(size))
+        self.length = max(STEP * float(step.min()), through / STEPS)
+        deep = np.arange(through / 2, -through / 2, -self.length)
+        # (EDGE, EDGE, n, 3), from the upper left and from before, in cells
+        pixels = (across[None, :, None, None] * right - across[:, None, None, None] * up + size / 2) / step - 0.5
+        at = pixels.astype(np.float32) + (deep[:, None] * eye / step).astype(np.float32)
         inside = ((at > -0.5) & (at < dims - 0.5)).all(axis=-1)
         self.ray = np.flatnonzero(inside) // len(deep)
         self.first = np.searchsorted(self.ray, self.ray)  # sample of the same ray
@@ -254,20 +251,23 @@ class Sketch:
             weight *= light["ambient"] + light["diffuse"] * self.facing
         colors = tf.color(x)[entry]
         pixels = np.stack([np.bincount(self.ray, weight * colors[:, c], EDGE * EDGE) for c in range(3)], axis=-1)
-        bytes_ = (255 * pixels.clip(0, 1)).round().astype(np.uint8).reshape(EDGE, EDGE, 3)
+        shown = (255 * pixels.clip(0, 1)).round().astype(np.uint8).reshape(EDGE, EDGE, 3)
         content = io.BytesIO()
-        Image.fromarray(bytes_).save(content, "WEBP", quality=QUALITY)
+        Image.fromarray(shown).save(content, "WEBP", quality=QUALITY)
         return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode("ascii")
 
 
 def _between(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return what a grid (nz, ny, nx, m) has at places (n, 3) in cells, x first, interpolated linearly: (n, m)."""
     low = np.floor(at).astype(np.int32)
-    share, top = (at - low).astype(np.float32), np.array(grid.shape[2::-1]) - 1
+    top, strides = np.array(grid.shape[2::-1]) - 1, np.array([1, grid.shape[2], grid.shape[2] * grid.shape[1]])
+    ends = [np.minimum(low + end, top) * strides for end in (0, 1)]
+    share, flat = (at - low).astype(np.float32), grid.reshape(-1, grid.shape[3])
     found = np.zeros((len(at), grid.shape[3]), np.float32)
     for corner in product((0, 1), repeat=3):
-        i, j, k = np.minimum(low + corner, top).T
-        found += np.where(corner, share, 1 - share).prod(axis=1)[:, None] * grid[k, j, i]
+        i, j, k = (ends[end][:, axis] for axis, end in enumerate(corner))
+        u, v, w = (share[:, axis] if end else 1 - share[:, axis] for axis, end in enumerate(corner))
+        found += (u * v * w)[:, None] * flat.take(i + j + k, axis=0)
     return found
 
 
