@@ -459,7 +459,7 @@ def test_cross_and_letters_have_the_colours_of_the_bodys_axes(
 ) -> None:
     """Of a volume whose index axes are not in the body's order; the letter I has serifs."""
     rects = opened(person, turned[0])
-    person("eval", "window.vvgt.where.slices.part.set('1,5000,8,-14,54,0')")  # black
+    person("eval", "window.vvgt.where.slices.part.set('1,5000,2,-14,54,0')")  # black
     picture = person.picture(tmp_path, "colours.png", bare=False)
     colors = np.array([[255, 157, 138], [155, 224, 138], [154, 196, 255]]) / 255
     for view, (along, up) in enumerate(AXES):

@@ -1,7 +1,7 @@
 // What one pointer, two fingers and the wheel do over a slice.
 const STILL = 6, TWICE = 500;  // px that a click stays within; milliseconds between two of them
 
-// click(x, y), twice(x, y); drag(x, y, begins): so far from where it began; move(x, y): by; zoom(times, x, y); step(by); hover(x, y), left()
+// click(x, y), twice(x, y); drag(x, y, begins): so far from where it began; move(x, y): by; zoom(times, x, y, from): so that what was at another pixel is there; step(by); hover(x, y), left()
 export function gesturesOf(canvas, { click, twice, drag, move, zoom, step, hover, left }) {
   const held = new Map();
   let kind = '', from = [0, 0], last = { time: -TWICE, at: [0, 0] };
@@ -22,7 +22,7 @@ export function gesturesOf(canvas, { click, twice, drag, move, zoom, step, hover
     const two = held.size > 1, [old, wide] = [middle(), two && apart()];
     held.set(pointerId, [x, y]);
     const now = middle();
-    if (two) zoom(apart() / Math.max(wide, 1), ...now);
+    if (two) return zoom(apart() / Math.max(wide, 1), ...now, old);
     if (kind === 'move') return move(now[0] - old[0], now[1] - old[1]);
     const begins = kind === 'press';
     if (begins && still([x, y])) return;

@@ -110,9 +110,9 @@ export function slicesOf(gridsOf, { world, cuts, rows, measures, moved, picked }
     draw();
     moved();
   }
-  // about a pixel of a view, which shows what it showed
-  function zoomAt(view, times, x, y) {
-    const old = frameOf(view).index(x, y);
+  // about a pixel of a view, which shows what it showed, or another one
+  function zoomAt(view, times, x, y, from = [x, y]) {
+    const old = frameOf(view).index(...from);
     zoom = Math.min(Math.max(zoom * times, 1), MOST);
     const now = frameOf(view).index(x, y);
     middle = middle.map((m, k) => m + old[k] - now[k]);
@@ -265,12 +265,16 @@ export function slicesOf(gridsOf, { world, cuts, rows, measures, moved, picked }
       click(x, y) { go(index(x, y)); picked(found(at)); },
       twice() { if (!measures()) swap(); },
       drag(x, y, begins) {
+        if (base.labels) {  // nothing to window
+          const [a, b] = begins ? [0, 0] : begun;
+          begun = [x, y];
+          return pan(made, x - a, y - b);
+        }
         if (begins) begun = window_;
-        if (base.labels) return;
         const most = Math.max(canvas.clientWidth, 1), [window, level] = begun;
         shade(window * Math.max(1 + (4 * x) / most, 0), level - (2 * window * y) / most);
       },
-      move: (x, y) => pan(made, x, y), zoom: (times, x, y) => zoomAt(made, times, x, y), step: (by) => step(across, by),
+      move: (x, y) => pan(made, x, y), zoom: (...how) => zoomAt(made, ...how), step: (by) => step(across, by),
       hover(x, y) { said.textContent = text(found(index(x, y))); },
       left() { said.textContent = text(found(at)); },
     });
