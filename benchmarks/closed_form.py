@@ -96,7 +96,7 @@ def table(path: str) -> str:
 @click.option("-o", "--output", help="CSV to write.")
 @click.option("--table", "stored", help="CSV to print as a Markdown table instead of measuring.")
 @click.option("--only", multiple=True, help="Scenes to measure (default: all).")
-@click.option("--method", multiple=True, default=("vbm",), help="vbm, wavelet, uniform.")
+@click.option("--method", multiple=True, default=("moments",), help="moments, wavelet, uniform.")
 @click.option("--max-gaussians", default=100_000)
 @click.option("--step", default=0.25, help="Step of the reference in voxels.")
 def main(paths, output, stored, only, method, max_gaussians, step):

@@ -11,12 +11,12 @@ from typing import Any
 
 from closed_form import read_options, scene_rows
 
-from vvgt_cli.field.source import Source, SourceRequest, load
+from vvgt_cli.field.source import SourceRequest, StyledVolume, load
 
 
 def read_scenes(
     listing: str, data: str, functions: str, names: tuple[str, ...] | None = None
-) -> Iterator[tuple[str, Source]]:
+) -> Iterator[tuple[str, StyledVolume]]:
     """Name and source of each scene of a tab-separated list (columns scene, volume, options, function)."""
     for name, volume, options, function in scene_rows(listing):
         if names is None or name in names:

@@ -23,12 +23,12 @@ from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.dvr.layers import Layer, grid_of
 from vvgt_cli.dvr.render import FIT_VIEWS
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 
 K, SIZE, VIEW = 100_000, 1080, 400
 
 
-def as_grid(source: Source) -> Scene:
+def as_grid(source: StyledVolume) -> Scene:
     """The optics grid of a scalar scene's voxels."""
     layer = Layer(source.volume, source.tf, source.unit_distance)
     grid = grid_of([layer], source.volume)
@@ -48,7 +48,7 @@ def used(call: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def measure(source: Source, repeats: int) -> list[dict[str, Any]]:
+def measure(source: StyledVolume, repeats: int) -> list[dict[str, Any]]:
     """Rows of one scene: as scalars, and as a grid."""
     camera = default_views("test", size=VIEW)[0]
     options = VbmOptions(max_gaussians=K, size=SIZE)

@@ -26,7 +26,7 @@ from vvgt_cli.cameras.sets import RADIUS
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.dvr import Scene, render_view
-from vvgt_cli.field.source import Source, SourceRequest, load
+from vvgt_cli.field.source import SourceRequest, StyledVolume, load
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats.levels import StreamedLevels
 from vvgt_cli.gaussians.formats.splats import gaussians_of
@@ -125,7 +125,7 @@ def plot(rows: list[dict[str, Any]], target: Path) -> None:
     figure.savefig(target, metadata={"Software": None})
 
 
-def shown(folder: Path, source: Source, scene: Scene, size: int) -> Iterator[str]:
+def shown(folder: Path, source: StyledVolume, scene: Scene, size: int) -> Iterator[str]:
     """A line a distance: mean PSNR (dB) of what the engine shows."""
     levels = StreamedLevels(folder / MANIFEST)
     turned = up_matrix(gaussians_of(levels.level(None), str(folder))[1].up) @ source.volume.axes
@@ -142,7 +142,7 @@ def shown(folder: Path, source: Source, scene: Scene, size: int) -> Iterator[str
         yield f"distance {distance}: {-10 * np.log10(np.mean(squares)):.1f} dB"
 
 
-def textures(folder: Path, whole: tuple[Path, ...], source: Source, scene: Scene, size: int) -> Iterator[str]:
+def textures(folder: Path, whole: tuple[Path, ...], source: StyledVolume, scene: Scene, size: int) -> Iterator[str]:
     """A line a level, and a line of each file at the pixels of the level of its place."""
     for level in range(read_manifest(folder / MANIFEST)["lodLevels"]):
         gaussians = to_box_frame(open_gaussians(f"{folder}#{level}")[0], source.volume)

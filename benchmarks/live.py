@@ -29,7 +29,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import ClosedFormStage
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import apply_look, baked
@@ -71,7 +71,7 @@ def functions(numbers: Statistics) -> dict[str, TransferFunction]:
 
 def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
-    source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
+    source = SourceRequest(OpenedFile((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
     request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, screen=SIZE))
     run = Run(Console(quiet=True), ConversionReport("convert"))
     with open_field(run, request) as opened:

@@ -21,7 +21,7 @@ from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussi
 from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
 from vvgt_cli.dvr import RenderSettings, Scene
 from vvgt_cli.errors import DataError
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.gaussians.formats import encoded, read_splats
 from vvgt_cli.gaussians.formats.choose import FORMATS
@@ -32,14 +32,14 @@ from vvgt_cli.score.views import score_test_views
 PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a picture, of JPEG
 
 
-def score(source: Source, scene: Scene, gaussians: Gaussians, size: int, rule: Rule) -> float:
+def score(source: StyledVolume, scene: Scene, gaussians: Gaussians, size: int, rule: Rule) -> float:
     """PSNR on three test views, dB."""
     inside = to_box_frame(gaussians, source.volume)
     settings = RenderSettings()
     return score_test_views(scene, inside, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS).psnr
 
 
-def rows(name: str, source: Source, scene: Scene, path: Path) -> Iterator[dict[str, Any]]:
+def rows(name: str, source: StyledVolume, scene: Scene, path: Path) -> Iterator[dict[str, Any]]:
     """A row a format that can be written here."""
     gaussians, header = open_gaussians(str(path))
     rule, size, layout = file_rule(header), header.screen_size or 400, layout_of(header)
@@ -57,7 +57,7 @@ def rows(name: str, source: Source, scene: Scene, path: Path) -> Iterator[dict[s
         yield {"scene": name, "format": known.suffix, "megabytes": megabytes, "psnr": psnr, "cost": best - psnr}
 
 
-def picture(source: Source, scene: Scene, path: Path, target: Path) -> None:
+def picture(source: StyledVolume, scene: Scene, path: Path, target: Path) -> None:
     """Volume, splats and eight times their difference from the side, as JPEG."""
     from PIL import Image
 

@@ -226,7 +226,7 @@ def held(folder, config, output, model, wanted):
 @click.option("-o", "--output", required=True, help="CSV to write.")
 @click.option("--model", help="Folder or name of a model; without it only its rivals run.")
 @click.option("--gaussians", "budget", default=50_000)
-@click.option("--init", "method", default="vbm", help="vbm or wavelet.")
+@click.option("--init", "method", default="moments", help="moments or wavelet.")
 @click.option("--only", multiple=True, help="Scenes to measure (default: all).")
 @click.option("--ways", "wanted", multiple=True, help="Of what is compared (default: all).")
 @click.option("--cache", type=Path, help="Folder for views and closed forms, which a second run takes from there.")

@@ -388,7 +388,7 @@ def checkpoint() -> list[Seed]:
         return state, Judge(state, None, record), record
 
     seeds = []
-    for method in ("frame", "3dgs"):
+    for method in ("axes", "3dgs"):
         state, judge, record = fresh(method)
         judge.kept = {name: array for name, array in state.saved().items() if name.startswith("array_")}
         with tempfile.TemporaryDirectory() as folder:

@@ -35,7 +35,7 @@ CAMERAS.append(look_at((3, 1, 1), width=8, height=8))
 
 def cases() -> dict[str, tuple[Gaussians, OptimizeOptions, np.ndarray | None, bool]]:
     """Start, options, those that are free, and whether views are weighted."""
-    usual = OptimizeOptions.of("frame", device="cuda")
+    usual = OptimizeOptions.of("axes", device="cuda")
     rule = replace(usual, rule=RULES["playcanvas"], l1=0.3, texture=0.0)
     return {
         "inria": (gaussians(), usual, None, False),

@@ -93,7 +93,7 @@ def test_report_to_standard_output(folder, vvgt):
     assert report["gaussians"] == len(read_ply("a.ply")[0])
 
 
-@pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
+@pytest.mark.parametrize("method", ["moments", "wavelet", "uniform"])
 def test_init_has_three_methods(method, folder, vvgt):
     assert method in vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply").err
     assert 0 < len(read_ply("a.ply")[0]) <= 300

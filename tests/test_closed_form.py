@@ -26,7 +26,7 @@ def same_bytes(a: Gaussians, b: Gaussians) -> bool:
     return all(getattr(a, field).tobytes() == getattr(b, field).tobytes() for field in FIELDS)
 
 
-def start(scene: Scene, count: int = 1500, method: str = "vbm", size: int = SIZE) -> Gaussians:
+def start(scene: Scene, count: int = 1500, method: str = "moments", size: int = SIZE) -> Gaussians:
     return initialise(scene, VbmOptions(count, size, method)).gaussians
 
 
@@ -103,7 +103,11 @@ def test_origin_and_direction_do_not_matter() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"method": "best"}, "vbm, wavelet, uniform"), ({"max_gaussians": 0}, "at least 1"), ({"size": 0}, "at least 1")],
+    [
+        ({"method": "best"}, "moments, wavelet, uniform"),
+        ({"max_gaussians": 0}, "at least 1"),
+        ({"size": 0}, "at least 1"),
+    ],
 )
 def test_options_are_checked(options: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
@@ -203,7 +207,7 @@ def test_extremes(name: str) -> None:
         fitted, _ = backproject(initialise(scene, VbmOptions(400, 32, method)), train, views)
         assert np.abs(fitted.means).max(initial=0) < 1.5
         assert 0 <= fitted.colors.min(initial=0) <= fitted.colors.max(initial=0) <= 2
-        if method == "vbm":
+        if method == "moments":
             assert len(fitted) > 0 or views[..., 3].max() < 1e-3
             assert score(fitted, test, truth) >= min(empty, 60)
 
@@ -240,17 +244,17 @@ SCENES = {
     "blob": (
         lambda: scene_of(shapes.blob(32, 0.3), Ramp(0.3)),
         1500,
-        {"vbm": (44.5, 46), "wavelet": (34, 41), "uniform": (29.5, 32)},
+        {"moments": (44.5, 46), "wavelet": (34, 41), "uniform": (29.5, 32)},
     ),
     "field": (
         lambda: scene_of(shapes.random_field(28, cycles=4), Tent(0.5, 0.15, 0.5)),
         5000,
-        {"vbm": (36.3, 37), "wavelet": (34, 34.5), "uniform": (30.2, 30.7)},
+        {"moments": (36.3, 37), "wavelet": (34, 34.5), "uniform": (30.2, 30.7)},
     ),
     "ball": (
         lambda: scene_of(shapes.sphere(32, 0.7), Above(1.0)),
         3000,
-        {"vbm": (30.5, 32.5), "wavelet": (17.9, 18.8), "uniform": (16.4, 17.2)},
+        {"moments": (30.5, 32.5), "wavelet": (17.9, 18.8), "uniform": (16.4, 17.2)},
     ),
 }
 
@@ -263,7 +267,7 @@ def test_quality(name: str) -> None:
         assert result[method][0] > first, result
         assert result[method][1] > fitted, result
         assert result[method][1] > result[method][0] - 0.1, result  # a field of cells that know colours: as good
-    assert result["vbm"][1] > result["wavelet"][1] + 1, result
+    assert result["moments"][1] > result["wavelet"][1] + 1, result
     assert result["wavelet"][1] > result["uniform"][1] + 0.5, result
 
 

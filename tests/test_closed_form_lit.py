@@ -64,7 +64,7 @@ def test_highlights_in_harmonics(degree):
     assert left.std() < 0.9 * exact.std() or degree == 0
 
 
-def made(scene, degree, method="vbm", budget=300):
+def made(scene, degree, method="moments", budget=300):
     return initialise(scene, VbmOptions(budget, 64, method, degree=degree)).gaussians
 
 

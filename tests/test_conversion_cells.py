@@ -49,7 +49,7 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
 
 
 def test_cells_are_cut_by_error_where_there_is_a_pyramid_and_steps_follow():
-    def cut(steps, init="vbm", model=None, **limits):
+    def cut(steps, init="moments", model=None, **limits):
         found = Planner(Limits(**limits), FitOptions(1000, 400, init, steps=steps, model=model)).plan(WORKLOAD, 1.0)
         return of(found, CellsByError)
 

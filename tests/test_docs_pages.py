@@ -96,7 +96,7 @@ def test_files_that_contributors_are_sent_to_are_there():
         assert list(ROOT.glob(name if "/" in name else f"tests/{name}")), name
 
 
-def test_the_map_for_contributors_has_every_room_in_its_order_and_every_test_file():
+def test_the_map_for_contributors_has_every_subpackage_in_its_order_and_every_test_file():
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     table = text.partition("## Map of the package")[2].partition("\n\n| where")[0]
     assert tuple(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?`) \| ", table, re.M)))) == SUBPACKAGES

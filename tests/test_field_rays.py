@@ -106,7 +106,7 @@ def test_pictures_that_were_not_expected_are_made_when_they_are_asked_for(tmp_pa
 
 
 @pytest.mark.parametrize("light", [LightOptions(), LIT], ids=["unlit", "lit"])
-@pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
+@pytest.mark.parametrize("method", ["moments", "wavelet", "uniform"])
 def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
     request = SourceRequest(volume_of((40, 36, 44)), light=light)
     source = load(request)

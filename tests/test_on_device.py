@@ -27,7 +27,7 @@ from vvgt_cli.refine.states import OwnAxes
 from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import render_reference
 
-OPTIONS = OptimizeOptions.of("frame")
+OPTIONS = OptimizeOptions.of("axes")
 
 
 @nb.njit

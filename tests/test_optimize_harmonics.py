@@ -37,7 +37,7 @@ def score(g: Gaussians, truth: Gaussians) -> float:
     return float(np.mean([psnr(render(truth, c)[..., :3], render(g, c)[..., :3]) for c in TEST]))
 
 
-@pytest.mark.parametrize(("method", "steps", "gain"), [("frame", 96, 4.0), ("adam", 200, 0.2)])
+@pytest.mark.parametrize(("method", "steps", "gain"), [("axes", 96, 4.0), ("adam", 200, 0.2)])
 def test_harmonics_are_found_and_degree_0_is_behind(method, steps, gain):
     truth = shiny()
     start, images, check = replace(truth, harmonics=None), views(truth, CAMERAS), (CHECKS, views(truth, CHECKS))

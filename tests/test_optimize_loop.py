@@ -71,7 +71,7 @@ def test_views_that_were_not_trained_on_come_nearer(scene, options, gain):
     assert score(result, CAMERAS, images) > score(start, CAMERAS, images) + gain
 
 
-@pytest.mark.parametrize("method", ["frame", "adam"])
+@pytest.mark.parametrize("method", ["axes", "adam"])
 def test_views_of_half_the_size_want_a_quarter_of_the_dilation(method):
     wide = truth(300)
     thin = Gaussians(wide.means, wide.log_scales - 1.2, wide.quaternions, wide.opacity_logits + 1, wide.colors)
@@ -107,7 +107,7 @@ def test_colours_are_negative_only_where_harmonics_may_lighten_them(degree):
     assert (state.arrays[3].min() < 0) == (degree is not None)
 
 
-@pytest.mark.parametrize("method", ["frame", "adam"])
+@pytest.mark.parametrize("method", ["axes", "adam"])
 def test_nothing_worse_than_the_input_is_returned(scene, method):
     start, images, check = scene
     misled = np.zeros_like(images)

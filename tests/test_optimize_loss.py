@@ -125,7 +125,7 @@ def test_steps_of_our_method_follow_the_texture_term():
     )
     camera = default_views("train", 1, size=40)[0]
     target = np.full((40, 40, 4), 0.5, np.float32)
-    usual = OptimizeOptions.of("frame", steps=4)
+    usual = OptimizeOptions.of("axes", steps=4)
     assert usual.texture == TEXTURE > 0
     assert OptimizeOptions.of("adam", steps=4).texture == OptimizeOptions.of("3dgs", steps=4).texture == 0
     ends = []

@@ -57,7 +57,7 @@ def test_stiff_scenes_stay_finite(stiff, method, rates, count, monkeypatch):
 
 @pytest.mark.parametrize("count", STEPS)
 @pytest.mark.parametrize(
-    ("kind", "method"), [*(("extreme", m) for m in METHODS), ("needles", "frame"), ("alike", "frame")]
+    ("kind", "method"), [*(("extreme", m) for m in METHODS), ("needles", "axes"), ("alike", "axes")]
 )
 def test_extreme_gaussians_stay_finite(stiff, kind, method, count, monkeypatch):
     _, cameras, views = stiff

@@ -95,7 +95,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     from vvgt_cli.field.block_store import COUNTS, BlockStore
     from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
-    from vvgt_cli.field.layered import Content
+    from vvgt_cli.field.layered import OpenedFile
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 
@@ -104,7 +104,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
         return values[slices].copy()
 
     volume = stored((100, 90, 80), np.float32, part)
-    monkeypatch.setattr(reader, "open_content", lambda source, options: Content((volume,)))
+    monkeypatch.setattr(reader, "open_content", lambda source, options: OpenedFile((volume,)))
     store = BlockStore(tmp_path)
     (store.folder / COUNTS).mkdir()
     place = reader.VolumeOrigin("counted once", ReadOptions(stored=True))

@@ -293,7 +293,7 @@ def test_a_run_learns_and_keeps_its_record(straight):
 
 @pytest.mark.parametrize("variant", ["full", "wo_3dt", "wo_vgf", "wo_vbm"])
 def test_the_papers_network_and_its_ablations_learn(variant, data):
-    start = "uniform" if variant == "wo_vbm" else "vbm"
+    start = "uniform" if variant == "wo_vbm" else "moments"
     config = replace(
         CONFIG, network=replace(TINY, variant=variant), loss=LossConfig(), scenes=replace(CONFIG.scenes, start=start)
     )

@@ -7,4 +7,4 @@ MAX_STEPS = 400  # where a target or a time budget decides when to end
 FEWEST_STEPS = 8  # fewer are not worth rendering views for
 WARM_STEPS = 50  # of a round from the previous frame, or from the previous look
 REPORT_STEPS = (25, STEPS, 200, 400)  # of 'vvgt report'
-INIT, RULE = "vbm", "inria"
+INIT, METHOD, RULE = "moments", "axes", "inria"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.gaussians import Gaussians
 
-METHODS = ("vbm", "wavelet", "uniform")
+METHODS = ("moments", "wavelet", "uniform")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class VbmOptions:
     Attributes:
         max_gaussians: budget.
         size: image edge in pixels at the default views; opacities allow for the renderer's dilation there.
-        method: "vbm", "wavelet" (isotropic bank) or "uniform" (random samples).
+        method: "moments", "wavelet" (isotropic bank) or "uniform" (random samples).
         seed: of the random samples.
         degree: of the harmonics that colours have under a light that depends on the view.
         values: cells are split where values differ, of which red is the value and green its square, shares of a range.
@@ -38,7 +38,7 @@ class VbmOptions:
 
     max_gaussians: int = MAX_GAUSSIANS
     size: int = SIZE
-    method: str = "vbm"
+    method: str = "moments"
     seed: int = 0
     degree: int = 0
     values: bool = False

@@ -52,7 +52,7 @@ def convert(
         time_budget: seconds of the whole run.
         max_megabytes: maximal size of a ``.ply`` or a page, 10^6 bytes.
         steps: maximum number of steps of gradient descent; None: the default.
-        init: closed form, "vbm", "wavelet" or "uniform".
+        init: closed form, "moments", "wavelet" or "uniform".
         model: network to run before the steps: a folder, or the name of a shipped one.
         rule: viewer to optimise for, by how it draws a Gaussian; None: the target's, or "inria".
         seed: random seed of ``init="uniform"``.

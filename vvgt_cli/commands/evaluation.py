@@ -20,7 +20,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture
 from vvgt_cli.field.open import FieldNeeds, opened
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, tf_record, volume_record
+from vvgt_cli.field.source import SourceRequest, StyledVolume, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.formats.levels import VIEW, split_name
 from vvgt_cli.gaussians.outputs import Output, check_outputs
@@ -117,7 +117,7 @@ def opened_as_recorded(
     if recorded:
         dark = replace(dark, unit_distance=repr(header.unit_distance))
 
-    def lit(source: Source) -> Source:
+    def lit(source: StyledVolume) -> StyledVolume:
         preset = source.lighting if header.version is None else header.light
         if other:
             preset = source.lighting or header.light
@@ -126,7 +126,7 @@ def opened_as_recorded(
             first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
         return replace(source, layers=(first, *others), lighting=request.light.lighting(preset, source.volume.space))
 
-    def kernels(source: Source, in_blocks: bool) -> tuple[str, ...]:
+    def kernels(source: StyledVolume, in_blocks: bool) -> tuple[str, ...]:
         return source.kernels(for_degree(EVALUATE, gaussians.degree))
 
     return opened(run, dark, options, FieldNeeds(len(gaussians), size), kernels, look=lit)
@@ -141,7 +141,7 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
         field.views.forget(picture)
 
 
-def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
+def shown(gaussians: Gaussians, header: PlyHeader, source: StyledVolume, request: SourceRequest) -> Gaussians:
     """Return live Gaussians under the requested function; without one, and for other files, the file's own look.
 
     Raises:
@@ -207,7 +207,7 @@ def score(
     return evaluation
 
 
-def _doubts(header: PlyHeader, source: Source) -> Iterator[str]:
+def _doubts(header: PlyHeader, source: StyledVolume) -> Iterator[str]:
     """Yield reasons to doubt that the file was made from this volume and look."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         yield f"its header's affine differs from that of {source.volume.name}; was it made from another volume?"

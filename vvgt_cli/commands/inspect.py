@@ -37,7 +37,7 @@ from vvgt_cli.volume.registry import contents, is_recognised
 from vvgt_cli.volume.space import axis_facts
 
 if TYPE_CHECKING:
-    from vvgt_cli.field.layered import Content
+    from vvgt_cli.field.layered import OpenedFile
 
 
 _PLY = (b"ply\n", b"ply\r")
@@ -225,7 +225,7 @@ def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, A
     return facts
 
 
-def _channels(content: Content) -> list[dict[str, Any]]:
+def _channels(content: OpenedFile) -> list[dict[str, Any]]:
     """Describe each channel of a volume: the option that selects it, its name, colour and range."""
     from vvgt_cli.volume import statistics
 

@@ -28,7 +28,7 @@ HOLD_OUT = 8  # of so many training views one decides, where the folder has no c
 
 def optimize(
     ply: PathLike | Result, views: PathLike, output: PathLike | None = None, *, steps: int | None = None,
-    time_budget: float | None = None, target_psnr: float | None = None, method: str = "frame",
+    time_budget: float | None = None, target_psnr: float | None = None, method: str = "axes",
     max_gaussians: int | None = None, checkpoint: PathLike | None = None, screen: int | None = None,
     rule: str | None = None, sh_degree: int | None = None, seed: int = 0, report: PathLike | None = None,
     device: str = "cpu", overwrite: bool = False, progress: bool | Console = False,
@@ -42,7 +42,7 @@ def optimize(
         steps: number of steps, of one view each; or give ``time_budget``.
         time_budget: seconds; or give ``steps``.
         target_psnr: dB on the check views at which to stop.
-        method: "frame", "adam" or "3dgs".
+        method: "axes", "adam" or "3dgs".
         max_gaussians: maximal number of Gaussians, for "3dgs".
         checkpoint: ``.npz`` to save progress in, from which the same call goes on.
         screen: pixels along the edge of the target screen; None: the file's.
@@ -50,7 +50,7 @@ def optimize(
         sh_degree: degree of the spherical harmonics that are refined, 0 to 3; None: the file's.
         seed: seed of the order of views.
         report: JSON to write.
-        device: "cpu", or "cuda" for the steps of "frame".
+        device: "cpu", or "cuda" for the steps of "axes".
         overwrite: replace files that exist.
         progress: print messages and bars on standard error.
 
@@ -97,7 +97,7 @@ def optimize(
     "--target-psnr", type=click.FloatRange(0, 150), metavar="DB", help="Stop when the check views reach this PSNR."
 )
 @click.option(
-    "--method", type=click.Choice(["frame", "adam", "3dgs"]), default="frame", show_default=True,
+    "--method", type=click.Choice(["axes", "adam", "3dgs"]), default="axes", show_default=True,
     help="Steps in each Gaussian's own frame or, for comparison, plain Adam or Adam with 3DGS' density control.",
 )  # fmt: skip
 @click.option(
@@ -121,7 +121,7 @@ def optimize(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
 )
 @click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
-@shared.device_option("steps of --method frame are taken")
+@shared.device_option("steps of --method axes are taken")
 @shared.overwrite_option
 @shared.common_options
 def command(console: Console, **options: Any) -> None:

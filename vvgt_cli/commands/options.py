@@ -396,7 +396,7 @@ fit_options = bundle(
         help=f"Screen size that the file is optimised for and scored at, in pixels along an edge. Default: {SIZE}.",
     ),
     init=click.option(
-        "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default=INIT, show_default=True,
+        "--init", type=click.Choice(["moments", "wavelet", "uniform"]), default=INIT, show_default=True,
         help="Closed form: multi-resolution moments, one isotropic Gaussian per wavelet atom, or random samples.",
     ),
     seed=click.option(

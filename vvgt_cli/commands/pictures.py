@@ -31,7 +31,7 @@ from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.rays import HALO
 from vvgt_cli.field.reader import Scalars, VoxelBox
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
+from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.formats.levels import by_view
@@ -352,7 +352,7 @@ def _movie(request: Drawing, pictures: Iterator[np.ndarray], cameras: list[Camer
     return f"{request.output}: {len(cameras) / rate:.1f} s, {size / 1e6:.2f} MB"
 
 
-def as_xray(source: Source) -> Source:
+def as_xray(source: StyledVolume) -> StyledVolume:
     """Return a volume under the extinction of its X-ray, unlit; raise UsageError for an optics grid."""
     source.require_scalar_field()
     layer = source.layers[0]
@@ -361,7 +361,7 @@ def as_xray(source: Source) -> Source:
     return replace(source, layers=(replace(layer, unit_distance=distance),), lighting=None)
 
 
-def mip_of(field: Blocked | Source) -> Draw:
+def mip_of(field: Blocked | StyledVolume) -> Draw:
     """Return the function that draws the MIP of a volume in blocks or in memory, for cameras in its box frame.
 
     Raises:
@@ -391,7 +391,7 @@ def _blocks(field: Blocked) -> Iterator[Part]:
         yield replace(box, optics=optics), lo, hi
 
 
-def _greatest(source: Source, parts: Iterable[Part], camera: Camera) -> np.ndarray:
+def _greatest(source: StyledVolume, parts: Iterable[Part], camera: Camera) -> np.ndarray:
     """Return the mean over a pixel of the greatest values along its rays, (h, w) float32 of the range of values."""
     from vvgt_cli.dvr.march import greatest
     from vvgt_cli.dvr.render import BoxFrame, camera_arrays

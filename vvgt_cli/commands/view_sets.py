@@ -36,7 +36,7 @@ from vvgt_cli.field.digests import cameras_digest, volume_digest
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load_all
+from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load_all
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.gaussians.outputs import check_folder
 from vvgt_cli.images import write_png
@@ -138,7 +138,7 @@ class Rays:
 class _Set:
     """One function's folder and the views to render there."""
 
-    source: Source
+    source: StyledVolume
     blocks: Blocked | None  # where the volume is not in memory
     manifest: Manifest
     layout: Layout
@@ -152,7 +152,7 @@ class _Set:
         return self.manifest.folder
 
 
-Opened = list[tuple[Source, Blocked | None]]
+Opened = list[tuple[StyledVolume, Blocked | None]]
 Points = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
@@ -202,7 +202,7 @@ def open_looks(
 
 
 def prepare(
-    run: Run, source: Source, blocks: Blocked | None, rays: Rays, cameras: Sequence[Camera]
+    run: Run, source: StyledVolume, blocks: Blocked | None, rays: Rays, cameras: Sequence[Camera]
 ) -> tuple[Draw, Points]:
     """Return what draws a view of ``cameras``, and what makes points to start from for a size in px."""
     from vvgt_cli.dvr import RenderSettings, render_view
@@ -271,7 +271,7 @@ def write_views(
                 one.blocks.run_pass.store.remove()
 
 
-def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
+def _settings(layout: Layout, rays: Rays, views: Sequence[View], source: StyledVolume, content: str) -> dict[str, Any]:
     """Return everything that the files depend on, named as on the command line."""
     cameras = {split: [view.camera for view in views if view.split == split] for split in ("train", "test")}
     sizes = dict.fromkeys(f"{view.camera.width} x {view.camera.height}" for view in views)

@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK
 from vvgt_cli.dvr.layers import Layer
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.look.function import TransferFunction
@@ -75,7 +75,7 @@ class Changes:
         return shown
 
 
-def changes(before: Source, after: Source) -> Changes:
+def changes(before: StyledVolume, after: StyledVolume) -> Changes:
     """Compare two frames on one grid under one function, slab by slab."""
     volume = after.volume
     dims = np.array(volume.dims)
@@ -90,7 +90,7 @@ def changes(before: Source, after: Source) -> Changes:
     return Changes(blocks, dims * step / 2, EDGE * step)
 
 
-def _slabs(before: Source, after: Source, reach: int) -> Iterator[tuple[int, int, np.ndarray]]:
+def _slabs(before: StyledVolume, after: StyledVolume, reach: int) -> Iterator[tuple[int, int, np.ndarray]]:
     """Yield the first and last slice of each slab, and (z, y, x) bool, the voxels near a difference."""
     dims = after.volume.dims
     slab = max(AT_ONCE // (dims[0] * dims[1]) // EDGE, 1) * EDGE
@@ -106,7 +106,7 @@ def _slabs(before: Source, after: Source, reach: int) -> Iterator[tuple[int, int
         yield z0, z1, changed[z0 - low : z1 - low]
 
 
-def _differ(old: Layer, new: Layer, source: Source, low: int, high: int) -> np.ndarray:
+def _differ(old: Layer, new: Layer, source: StyledVolume, low: int, high: int) -> np.ndarray:
     """Return (z, y, x) bool of slices ``low`` to ``high``: whether a layer looks different at or around a voxel."""
     if new.colors is not None:
         assert old.colors is not None

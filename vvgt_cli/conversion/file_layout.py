@@ -7,7 +7,7 @@ from dataclasses import replace
 from vvgt_cli.conversion.place import up_axis, with_place
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.field.layered import content_of
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.header import legend_text
 from vvgt_cli.look.labels import LabelTable
@@ -16,14 +16,14 @@ from vvgt_cli.look.resolve import unit_of_values
 VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
 
 
-def degree_of(request: ConvertRequest, source: Source) -> int:
+def degree_of(request: ConvertRequest, source: StyledVolume) -> int:
     """Return the degree of harmonics: 0 where the light does not depend on the view, else as requested or 2."""
     if source.lighting is None or not source.lighting.depends_on_view:
         return 0
     return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
 
 
-def harmonics_warning(degree: int, source: Source) -> str | None:
+def harmonics_warning(degree: int, source: StyledVolume) -> str | None:
     """Return a message where the requested degree cannot represent the light."""
     if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
         return None
@@ -33,7 +33,7 @@ def harmonics_warning(degree: int, source: Source) -> str | None:
     )
 
 
-def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
+def ply_options(request: ConvertRequest, source: StyledVolume) -> PlyOptions:
     """Return the layout of the file, with everything that follows from the source."""
     ply = replace(
         request.ply,
@@ -58,7 +58,7 @@ def _example(request: ConvertRequest) -> str | None:
     return volume.split(":")[1] if volume.startswith("example:") else None
 
 
-def _legend(source: Source) -> str | None:
+def _legend(source: StyledVolume) -> str | None:
     """Return the legend of one function, or of all label tables."""
     tf, stats = source.tf, source.statistics
     if len(source.layers) > 1 or isinstance(tf, LabelTable):

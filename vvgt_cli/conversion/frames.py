@@ -17,7 +17,7 @@ from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import ALL, Content, functions_of, open_content
+from vvgt_cli.field.layered import ALL, OpenedFile, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
@@ -75,7 +75,7 @@ class Survey:
 
     Attributes:
         count: number of frames.
-        ranges: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
+        ranges: range (lo, hi) of each component of each frame, in the order of `OpenedFile.classified`.
         whole: statistics of each component over all frames.
         first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
@@ -85,7 +85,7 @@ class Survey:
     count: int
     ranges: list[list[tuple[float, float]]]
     whole: tuple[Statistics, ...]
-    first: Content
+    first: OpenedFile
     content: str
     labels: tuple[int, ...] | None
 
@@ -227,7 +227,7 @@ def survey(
         DataError: a frame cannot be read, or is on another grid than the first.
         UsageError: the segments of a frame overlap.
     """
-    first: Content | None = None
+    first: OpenedFile | None = None
     stats, digests = [], []
     mapped, found = labels not in (None, NO_LABELS), set[int]()
     bar = console.bar("range")
@@ -257,7 +257,7 @@ def _without_values(volume: Volume) -> Volume:
     return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
 
 
-def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
+def _check_frame(step: Step, begin: Step, content: OpenedFile, first: OpenedFile) -> None:
     """Check that a frame has the grid and the components of the first."""
     content.volumes[0].check_grid(step.name, first.volumes[0], begin.name, "frames of one series share it")
     if (len(content.volumes), content.color) != (len(first.volumes), first.color):

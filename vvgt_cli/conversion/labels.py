@@ -22,7 +22,7 @@ from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, NothingVisible
-from vvgt_cli.field.layered import IN_MEMORY, Content, content_of, is_plain, layers_of, open_content, told_apart
+from vvgt_cli.field.layered import IN_MEMORY, OpenedFile, content_of, is_plain, layers_of, open_content, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
@@ -135,14 +135,14 @@ def check_lengths(first: Volume, other: Volume) -> None:
         )
 
 
-def _content(source: SourceRequest, stored: bool) -> Content:
+def _content(source: SourceRequest, stored: bool) -> OpenedFile:
     """Return the content of the map's file, or the map itself."""
     read = replace(source.read, stored=True, packed=True) if stored else source.read
     return open_content(source.path, read) if isinstance(source.volume, str) else content_of(source.volume)
 
 
 def _parts(
-    request: ConvertRequest, content: Content, layer: str, tables: list[str], used: set[tuple[float, float, float]]
+    request: ConvertRequest, content: OpenedFile, layer: str, tables: list[str], used: set[tuple[float, float, float]]
 ) -> list[LabelItem]:  # fmt: skip
     """Return the labels of a map, or a ``layer`` as a whole if it is none; add to ``tables`` and ``used`` colours.
 
@@ -185,7 +185,7 @@ def _parts(
     return found
 
 
-def _source(request: ConvertRequest, content: Content, volume: Volume) -> SourceRequest:
+def _source(request: ConvertRequest, content: OpenedFile, volume: Volume) -> SourceRequest:
     """Return the source of one label map of the file, in memory or in blocks."""
     source = request.source
     if request.blocks is None:

@@ -24,7 +24,7 @@ from vvgt_cli.conversion.stages import ClosedFormStage, TestViews
 from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NoLiveForm, NothingVisible
 from vvgt_cli.field.field import Field
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import LENGTH, Looks, Table, baked, lengths
@@ -62,7 +62,7 @@ def check_live(request: ConvertRequest) -> None:
         and not is_page(request.output),
         "--steps": fit.steps is not None,
         "--model": fit.model is not None,
-        "--init": fit.init != "vbm",
+        "--init": fit.init != "moments",
         "--checkpoint": request.checkpoint is not None,
         "--sh-degree": request.ply.sh_degree is not None,
         "--no-comments": not request.ply.comments,
@@ -73,7 +73,7 @@ def check_live(request: ConvertRequest) -> None:
         raise NoLiveForm(f"--live: the file is made for every function, without fitting; remove {', '.join(names)}")
 
 
-def live_refusal(request: ConvertRequest, source: Source) -> str | None:
+def live_refusal(request: ConvertRequest, source: StyledVolume) -> str | None:
     """Return the reason why a source has no live file; None where it has one."""
     try:
         check_live(request)
@@ -141,7 +141,7 @@ class LiveLook(Stage):
         work.live_psnr = live.psnr
 
 
-def _baked_look(source: Source, facts: LiveFacts) -> Looks:
+def _baked_look(source: StyledVolume, facts: LiveFacts) -> Looks:
     """Return the lookup table of a source's functions, for live Gaussians with these facts."""
     look: Look = source.tf
     if len(source.layers) > 1:
@@ -193,7 +193,7 @@ def _several_layers(run: Run, fit: FitOptions, field: Field) -> tuple[Gaussians,
     return concatenate(found), replace(first, others=tuple(others))
 
 
-def check_layers(source: Source) -> None:
+def check_layers(source: StyledVolume) -> None:
     """Raise NoLiveForm if a layer has colours, neither values nor labels."""
     if any(layer.colors for layer in source.layers):
         raise NoLiveForm(
@@ -202,7 +202,7 @@ def check_layers(source: Source) -> None:
         )
 
 
-def box_lighting(source: Source) -> Lighting | None:
+def box_lighting(source: StyledVolume) -> Lighting | None:
     """Return the light of a source, with directions in the box frame."""
     if source.lighting is None:
         return None
@@ -219,7 +219,7 @@ def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     return gaussians if lighting is None else relight(gaussians, gaussians.live[:, AXIS], lighting)
 
 
-def function_table(source: Source) -> Table:
+def function_table(source: StyledVolume) -> Table:
     """Return the lookup table of the function of a source, with lengths in the unit frame."""
     stats, tf, volume = source.overall, source.tf, source.volume
     assert isinstance(tf, TransferFunction)

@@ -14,7 +14,7 @@ from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.open import MIN_BLOCKED, FieldNeeds, opened, store_beside
-from vvgt_cli.field.source import Source, tf_record, volume_record
+from vvgt_cli.field.source import StyledVolume, tf_record, volume_record
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.jit.ahead import CONVERT, DRAW, INIT, LIVE, RENDER, for_degree
 from vvgt_cli.look.suggest import fitting
@@ -42,7 +42,7 @@ def open_field(
     if is_streamed(beside) and request.checkpoint is not None:
         beside = str(Path(request.checkpoint) / "levels")
 
-    def needed(source: Source, in_blocks: bool) -> tuple[str, ...]:
+    def needed(source: StyledVolume, in_blocks: bool) -> tuple[str, ...]:
         _report_source(run, request, source)
         alone = (RENDER, *INIT, *DRAW) if in_blocks else INIT  # views are cast with the blocks
         names = (CONVERT if request.scored else alone) if kernels is None else kernels
@@ -56,7 +56,7 @@ def open_field(
             field.run_pass.store.remove()
 
 
-def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
+def _report_source(run: Run, request: ConvertRequest, source: StyledVolume) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
     flattened = harmonics_warning(degree_of(request, source), source)

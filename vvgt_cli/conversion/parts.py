@@ -20,7 +20,7 @@ from vvgt_cli.conversion.level_selection import CUTS, STEP, CutErrors, errors_of
 from vvgt_cli.conversion.levels import NEAREST
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, thin
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, TOO_FAINT, halve_budget_while_faint
 from vvgt_cli.conversion.stages.network import Network
 from vvgt_cli.conversion.stages.refinement import Refinement
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
@@ -179,7 +179,7 @@ def closed_form_parts(run: Run, run_pass: Pass, cut: Cut) -> FinishedParts:
         logits = stored.field("opacity_logits-0")
         return (threshold, stored), len(logits), 2 * int((logits < FAINT_LOGIT).sum()) > len(logits)
 
-    (threshold, stored), removed = thin(cut.plan.budget, cut_for)
+    (threshold, stored), removed = halve_budget_while_faint(cut.plan.budget, cut_for)
     if removed:
         run.skip(f"{removed} Gaussians", TOO_FAINT)
     return FinishedParts(cut, threshold, stored, cut.over_tiles(threshold), removed)
@@ -210,7 +210,7 @@ def choose_levels(run: Run, run_pass: Pass, cut: Cut, refiner: Callable[[], Refi
         return errors, count, 2 * faint > count
 
     with run.stage("errors") as stage:
-        errors, removed = thin(cut.plan.budget, cut_for)
+        errors, removed = halve_budget_while_faint(cut.plan.budget, cut_for)
         choices = np.stack(errors.levels(removed), axis=1)
         stage.note = f"{choices.shape[1]} levels of {len(cut.pyramid)} nodes"
     if removed:

@@ -148,9 +148,9 @@ class Planner:
     parts: OutOfCore | None = None
 
     @property
-    def vbm(self) -> bool:
+    def by_moments(self) -> bool:
         """Return whether the closed form has a pyramid of cells, which can be cut again."""
-        return self.fit.init == "vbm"
+        return self.fit.init == "moments"
 
     def plan(self, workload: Workload, spent: float, begun: bool = False) -> Plan:
         """Return the stages that fit after ``spent`` seconds; with ``begun`` the closed form is done."""
@@ -199,12 +199,12 @@ class Planner:
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Return gradient descent with its views, and cells by error unless steps are few or a network runs."""
-        enough = steps >= ENOUGH_STEPS
+        enough = steps >= ENOUGH_STEPS and self.by_moments
         return [
             CheckViews(),
             TrainingViews(view_count(steps, small), view_edge(self.fit.screen, small)),
-            *([CellsByError(small, keep=not self._recuts())] if enough and self.vbm and self.fit.model is None else []),
-            Refinement(steps, most, small, overlap=enough and self.vbm),
+            *([CellsByError(small, keep=not self._recuts())] if enough and self.fit.model is None else []),
+            Refinement(steps, most, small, overlap=enough),
         ]
 
     def _recuts(self) -> bool:

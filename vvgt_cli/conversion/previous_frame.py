@@ -20,7 +20,7 @@ from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.rules import Rule
@@ -52,7 +52,7 @@ class _Frame:
         shown: for each turn of the views, the Gaussians when they were drawn last.
     """
 
-    source: Source
+    source: StyledVolume
     gaussians: Gaussians
     psnr: float
     cameras: list[Camera]
@@ -160,7 +160,7 @@ class PreviousFrame(WarmStart):
             steps = min(WARM_STEPS, left)
             left -= steps
             options = OptimizeOptions.of(
-                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
+                "axes", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
             result = refine(work.run, work.current(), Views(cameras, images), judged, options, free=free)
             result = as_stored(widen_small(result, work.fit.screen)[0])

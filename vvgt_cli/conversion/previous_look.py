@@ -20,7 +20,7 @@ from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.live import TAU
@@ -136,7 +136,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _look_alone(look: Source, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+def _look_alone(look: StyledVolume, gaussians: Gaussians, samples: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 8), and (K,) extinctions."""
     from vvgt_cli.closed_form.relight import relight
 

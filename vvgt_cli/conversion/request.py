@@ -32,7 +32,7 @@ class FitOptions:
     Attributes:
         max_gaussians: maximum number of Gaussians.
         screen: pixels along the edge of the screen that the file is made for.
-        init: "vbm", "wavelet" or "uniform".
+        init: "moments", "wavelet" or "uniform".
         rule: drawing rule (`vvgt_cli.gaussians.rules`) that is fitted to and scored by.
         seed: seed of random numbers.
         model: network that runs before the steps, a folder or the name of a shipped one; None for none.

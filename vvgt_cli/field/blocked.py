@@ -24,7 +24,7 @@ from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.reader import Scalars
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
@@ -101,13 +101,13 @@ class Blocked(Field):
         renderer: renders its pictures; None selects the field itself.
     """
 
-    source: Source
+    source: StyledVolume
     reader: Reader
     run_pass: Pass
     edge: int
     visible: float
     key: str
-    prepare_look: Callable[[Source], tuple[Source, Reader, float]]
+    prepare_look: Callable[[StyledVolume], tuple[StyledVolume, Reader, float]]
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
     renderer: ViewRenderer | None = None
@@ -301,7 +301,7 @@ class Blocked(Field):
         rule = self.reader.rule
         return values_of(samples.reshape(-1, POINTS), sums, gaussians, rule.slope, rule.intercept)
 
-    def with_look(self, source: Source) -> Blocked:
+    def with_look(self, source: StyledVolume) -> Blocked:
         """Implement `Field.with_look`; the new field's blocks go to a subfolder of this field's store."""
         source, reader, visible = self.prepare_look(source)
         volumes = [id(volume) for volume in self.source.volumes]

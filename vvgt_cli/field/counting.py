@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import Access, Content, content_of, open_content
+from vvgt_cli.field.layered import Access, OpenedFile, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
@@ -131,7 +131,7 @@ class BlockAccess(Access):
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
-    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
+    def open(self, source: str | Volume | OpenedFile, read: ReadOptions) -> OpenedFile:
         """Open a file without reading its values, or accept content in memory."""
         if not isinstance(source, str):
             content = content_of(source)

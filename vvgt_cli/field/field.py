@@ -13,7 +13,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.device import on_device
 from vvgt_cli.field.digests import digest, values_digest
-from vvgt_cli.field.source import Source
+from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
@@ -63,7 +63,7 @@ class Field(ViewRenderer, Protocol):
         renderer: renders its pictures; None selects the field itself.
     """
 
-    source: Source
+    source: StyledVolume
     renderer: ViewRenderer | None
 
     @property
@@ -83,7 +83,7 @@ class Field(ViewRenderer, Protocol):
         Raise UsageError for an optics grid.
         """
 
-    def with_look(self, source: Source) -> Field:
+    def with_look(self, source: StyledVolume) -> Field:
         """Return the field of the same volume with another look; statistics of a single layer are computed here."""
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
@@ -105,7 +105,7 @@ class Resident(Field):
         report: gets a line if the device fails.
     """
 
-    source: Source
+    source: StyledVolume
     scene: Scene
     renderer: ViewRenderer | None = None
     device: str = "cpu"
@@ -113,7 +113,7 @@ class Resident(Field):
     _drawn: dict[str, np.ndarray] = field(default_factory=dict)  # pixels of pictures' blocks, by `Picture.key`
 
     @classmethod
-    def of(cls, source: Source, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:
+    def of(cls, source: StyledVolume, device: str = "cpu", report: Callable[[str], None] = print) -> Resident:
         """Return the field of a source, with its values laid out for the kernels."""
         return cls(source, on_device(source.scene(), device, report), device=device, report=report)
 
@@ -176,7 +176,7 @@ class Resident(Field):
             values[k : k + len(part)] = values_of(*found, part, self.layout.slope, self.layout.intercept)
         return values
 
-    def with_look(self, source: Source) -> Resident:
+    def with_look(self, source: StyledVolume) -> Resident:
         """Implement `Field.with_look`."""
         from vvgt_cli.volume import statistics
 

@@ -42,7 +42,7 @@ DARK, BRIGHT = 0.5, 0.998  # quantiles of a channel's voxels between which its o
 
 
 @dataclass(frozen=True)
-class Content:
+class OpenedFile:
     """The content of a file.
 
     Attributes:
@@ -92,7 +92,7 @@ class Content:
 
         return PreparedVolume.of(self.volumes[0])
 
-    def loaded(self) -> Content:
+    def loaded(self) -> OpenedFile:
         """Return the same content, with lazily computed arrays loaded into memory."""
         volumes = tuple(map(loaded, self.volumes))
         return (
@@ -108,7 +108,7 @@ class Content:
 class Access:
     """Access to volumes and statistics of their values; here to volumes that are read whole."""
 
-    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
+    def open(self, source: str | Volume | OpenedFile, read: ReadOptions) -> OpenedFile:
         """Open a file, or content that is already open."""
         return open_content(source, read) if isinstance(source, str) else content_of(source).loaded()
 
@@ -124,12 +124,12 @@ class Access:
 IN_MEMORY = Access()
 
 
-def content_of(source: Volume | Content) -> Content:
+def content_of(source: Volume | OpenedFile) -> OpenedFile:
     """Wrap a volume as content, unless it is content already."""
-    return source if isinstance(source, Content) else Content((source,))
+    return source if isinstance(source, OpenedFile) else OpenedFile((source,))
 
 
-def open_content(source: str, read: ReadOptions) -> Content:
+def open_content(source: str, read: ReadOptions) -> OpenedFile:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
     Components are returned for "color", "all" and several names or numbers, for a file of colours, and by default for
@@ -161,21 +161,21 @@ def open_content(source: str, read: ReadOptions) -> Content:
                 return open_content(source, replace(read, component=numbers[0]))
         parts = tuple(read_volume(source, replace(read, component=k)) for k in numbers)
         if color:
-            return Content(parts, True, stored=read.stored)
+            return OpenedFile(parts, True, stored=read.stored)
         colors = [(error.colors and error.colors[k]) or CHANNEL_COLORS[k % len(CHANNEL_COLORS)] for k in numbers]
         names = [error.names[k] for k in numbers] if error.names else []
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in zip(numbers, parts, strict=True))
         message = str(error) if by_default else None
-        return Content(named, False, colors, source, overlapping, read.stored, names, numbers, message)
+        return OpenedFile(named, False, colors, source, overlapping, read.stored, names, numbers, message)
     if several:
         volume = read_volume(source, read)  # the name of its one channel, or an error
     elif asked:
         raise UsageError(f"{source}: one component; expected several: omit --component {asked}")
-    return Content((volume,), path=source, stored=read.stored)
+    return OpenedFile((volume,), path=source, stored=read.stored)
 
 
 def is_plain(
-    opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
+    opened: OpenedFile, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
     """Return whether the content is one scalar field under a function, and not a recognised label map."""
     if not opened.single_volume or layers or labels not in (None, NO_LABELS):
@@ -184,7 +184,7 @@ def is_plain(
 
 
 def layers_of(
-    opened: Content,
+    opened: OpenedFile,
     tf: str | TransferFunction | None,
     labels: str | LabelTable | None,
     tf_range: str | tuple[float, float] = "data",
@@ -200,7 +200,7 @@ def layers_of(
         labels: label table, its file, ``auto``, ``none`` or None.
         tf_range: range option of the functions.
         distance: unit distance option of the functions.
-        whole: statistics of `Content.classified` over a whole series, by default those of the volumes.
+        whole: statistics of `OpenedFile.classified` over a whole series, by default those of the volumes.
         access: access to the values.
 
     Raises:
@@ -232,7 +232,7 @@ def layers_of(
 
 
 def _chosen_labels(
-    opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None, access: Access
+    opened: OpenedFile, tf: str | TransferFunction | None, labels: str | LabelTable | None, access: Access
 ) -> str | LabelTable | None:
     """Return the requested labels, or ``auto`` for a recognised label map; arguments as in `layers_of`."""
     volume = opened.volumes[0]
@@ -255,12 +255,12 @@ def _chosen_labels(
 
 
 def functions_of(
-    opened: Content,
+    opened: OpenedFile,
     stats: Sequence[Statistics],
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float] = "data",
 ) -> list[TransferFunction]:
-    """Return a function on data values per volume of `Content.classified`; ``stats`` are the volumes' statistics."""
+    """Return a function on data values per volume of `OpenedFile.classified`; ``stats`` are the volumes' statistics."""
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
         return [resolve(tf, stats[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
@@ -276,7 +276,7 @@ def functions_of(
     return [_channel(k, name, color, its, tf, tf_range) for k, name, color, its in rows]
 
 
-def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
+def _warn_all_channels(opened: OpenedFile, tf: TransferFunction | None) -> None:
     """Warn that all channels are shown; refuse a function, which could belong to any of them."""
     if tf is not None:
         raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
@@ -290,7 +290,7 @@ def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
     )
 
 
-def _white(opened: Content) -> float:
+def _white(opened: OpenedFile) -> float:
     """Return the data value that stands for a colour of 1."""
     kind = opened.volumes[0].data.dtype
     return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0

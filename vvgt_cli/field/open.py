@@ -19,10 +19,10 @@ from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.grid import TILE_VOXELS
-from vvgt_cli.field.layered import Content, content_of, open_content
+from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.field.runners import Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_bytes, block_edge, worker_count
-from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
+from vvgt_cli.field.source import SourceRequest, StyledVolume, describe_source, load
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE, for_blocks
@@ -140,7 +140,7 @@ def blocked(
             stage.note = f"{describe_source(source)}; in blocks of {edge}{shared}"
         key = digest(str(sorted(settings.items())))
 
-        def look(other: Source) -> tuple[Source, Reader, float]:
+        def look(other: StyledVolume) -> tuple[StyledVolume, Reader, float]:
             if other.layers[0].volume is not source.layers[0].volume:
                 other = replace(other, statistics=access.statistics(other.volume))
             return other, *_reader(other, access)
@@ -151,8 +151,8 @@ def blocked(
 @contextmanager
 def opened(
     run: Run, request: SourceRequest, options: BlockOptions | None, needs: FieldNeeds,
-    kernels: Callable[[Source, bool], tuple[str, ...]], store: AbstractContextManager[BlockStore] | None = None,
-    device: str = "cpu", look: Callable[[Source], Source] = lambda source: source,
+    kernels: Callable[[StyledVolume, bool], tuple[str, ...]], store: AbstractContextManager[BlockStore] | None = None,
+    device: str = "cpu", look: Callable[[StyledVolume], StyledVolume] = lambda source: source,
 ) -> Iterator[Field]:  # fmt: skip
     """Open a volume under its look as a field, in memory, or in blocks if it is large.
 
@@ -241,7 +241,7 @@ def _absolute(path: str) -> str:
     return path if scheme else str(Path(path).absolute())
 
 
-def _reader(source: Source, access: BlockAccess) -> tuple[Reader, float]:
+def _reader(source: StyledVolume, access: BlockAccess) -> tuple[Reader, float]:
     """Return the reader of a source's boxes, and its approximate number of visible voxels."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
     from vvgt_cli.dvr.scene import kernel_rule
@@ -395,7 +395,7 @@ def _settings(request: SourceRequest, needs: FieldNeeds) -> dict[str, Any]:
 def _facts(volume: Any) -> list[Any]:
     """Return a file's name, size and time, or a digest of anything else."""
     if not isinstance(volume, str):
-        volumes = content_of(volume).volumes if isinstance(volume, Volume | Content) else ()
+        volumes = content_of(volume).volumes if isinstance(volume, Volume | OpenedFile) else ()
         return [digest(*(one.data for one in volumes)) if volumes else repr(volume)]
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
     files = next((some for name in outer if (some := files_of(name))), [])

@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
-from vvgt_cli.field.layered import Content, content_of, open_content
+from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
@@ -43,7 +43,7 @@ class VolumeOrigin:
 
 
 @lru_cache(maxsize=OPEN)
-def _opened(source: str, read: ReadOptions) -> Content:
+def _opened(source: str, read: ReadOptions) -> OpenedFile:
     return open_content(source, read)
 
 

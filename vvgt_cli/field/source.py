@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import IN_MEMORY, Access, Content, content_of, is_plain, layers_of, told_apart
+from vvgt_cli.field.layered import IN_MEMORY, Access, OpenedFile, content_of, is_plain, layers_of, told_apart
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
     from vvgt_cli.gaussians.formats.page_values import Values
 
-OPTICS = 12  # hexadecimal digits of `Source.optics`
+OPTICS = 12  # hexadecimal digits of `StyledVolume.optics`
 KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
 
 
@@ -46,7 +46,7 @@ class SourceRequest:
         layers: volumes laid over it, each with its own look but the same light.
     """
 
-    volume: str | Volume | Content
+    volume: str | Volume | OpenedFile
     read: ReadOptions = field(default_factory=ReadOptions)
     tf: str | TransferFunction | None = None
     tf_range: str = "data"
@@ -101,7 +101,7 @@ def parse_layer(text: str, space: str | None = None) -> SourceRequest:
 
 
 @dataclass(frozen=True)
-class Source:
+class StyledVolume:
     """A volume that was read and its look, which leaves at least something visible.
 
     Attributes:
@@ -125,10 +125,10 @@ class Source:
         """Statistics over the whole series, or of the volume if it is not part of one."""
         return self.series[0] if self.series else self.statistics
 
-    def single_layer(self, number: int) -> Source:
+    def single_layer(self, number: int) -> StyledVolume:
         """Return one of the layers as a source of its own, unlit, with the statistics of the first layer."""
         layer = self.layers[number]
-        return Source((layer,), layer.volume, self.statistics, series=self.series[number : number + 1])
+        return StyledVolume((layer,), layer.volume, self.statistics, series=self.series[number : number + 1])
 
     @property
     def volumes(self) -> list[Volume]:
@@ -200,7 +200,7 @@ class Source:
         ]
         return page_values.values_of(layers, room)
 
-    def with_function(self, tf: TransferFunction) -> Source:
+    def with_function(self, tf: TransferFunction) -> StyledVolume:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""
         from vvgt_cli.look import unit_distance
 
@@ -209,7 +209,7 @@ class Source:
         layer = replace(self.layers[0], tf=tf, unit_distance=distance, unit_label=label)
         return replace(self, layers=(layer,), lighting=None)
 
-    def with_tables(self, tables: Sequence[LabelTable]) -> Source:
+    def with_tables(self, tables: Sequence[LabelTable]) -> StyledVolume:
         """Return the same label maps under other tables, one per layer, unlit.
 
         Opacity is per `UNIT_SHARE` of the longest edge.
@@ -281,7 +281,7 @@ class Source:
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
 
 
-def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
+def load(request: SourceRequest, access: Access = IN_MEMORY) -> StyledVolume:
     """Read the function and the volume; ``access`` decides whether the volume is read whole or in blocks.
 
     Raises:
@@ -291,7 +291,7 @@ def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
     return load_all([request], access)[0]
 
 
-def load_all(requests: Sequence[SourceRequest], access: Access = IN_MEMORY) -> list[Source]:
+def load_all(requests: Sequence[SourceRequest], access: Access = IN_MEMORY) -> list[StyledVolume]:
     """Read one volume and return it under each of several looks.
 
     Raises:
@@ -332,14 +332,14 @@ def load_all(requests: Sequence[SourceRequest], access: Access = IN_MEMORY) -> l
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
         layout = content.layout if reused else None
         lighting = request.light.lighting(shown.lighting, volume.space)
-        sources.append(Source((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
+        sources.append(StyledVolume((layer,), volume, stats, lighting, layout, tuple(request.statistics)))
     return sources
 
 
 def _layered(
-    request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float],
+    request: SourceRequest, content: OpenedFile, tf: TransferFunction | None, tf_range: str | tuple[float, float],
     access: Access,
-) -> Source:  # fmt: skip
+) -> StyledVolume:  # fmt: skip
     """Return the optics grid that is the sum of a volume and its layers."""
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
@@ -359,7 +359,7 @@ def _layered(
     stats = access.statistics(layers[0].volume)
     _check_seen(layers, access, len(request.statistics))
     grid = common_grid(layers, content.stored)
-    return Source(tuple(layers), grid, stats, lighting, series=tuple(request.statistics))
+    return StyledVolume(tuple(layers), grid, stats, lighting, series=tuple(request.statistics))
 
 
 def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
@@ -386,7 +386,7 @@ def _check_seen(layers: Sequence[Layer], access: Access, frame: int) -> None:
         check_labels([layer.tf for layer in layers])
 
 
-def describe_source(source: Source) -> str:
+def describe_source(source: StyledVolume) -> str:
     """Return one line that describes a source: grid, type, values, function, unit distance."""
     volume, stats = source.volume, source.statistics
     grid = " x ".join(map(str, volume.dims))
@@ -399,7 +399,7 @@ def describe_source(source: Source) -> str:
     return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
 
 
-def volume_record(source: Source) -> dict[str, Any]:
+def volume_record(source: StyledVolume) -> dict[str, Any]:
     """Return the volume's entry in a report."""
     volume, stats = source.volume, source.statistics
     return {
@@ -414,7 +414,7 @@ def volume_record(source: Source) -> dict[str, Any]:
     }
 
 
-def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
+def tf_record(source: StyledVolume, request: SourceRequest) -> dict[str, Any]:
     """Return the transfer function's entry in a report."""
     return {
         "name": source.name if len(source.layers) > 1 else source.tf.name,

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.commands.convert import convert
 from vvgt_cli.conversion.result import Conversion
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.library.inputs import LightLike, Look, source_of
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume
@@ -22,7 +22,7 @@ FINER = 8  # times as fine as the first volume a layer may be
 SLACK = 1e-3  # voxels
 AROUND = "around"  # name of an empty volume that holds all
 
-Layer = tuple[Content, Look]
+Layer = tuple[OpenedFile, Look]
 
 
 def together(layers: Sequence[Layer], light: LightLike, **options: Any) -> Conversion:
@@ -60,4 +60,4 @@ def _ordered(layers: Sequence[Layer]) -> list[Layer]:
     )  # fmt: skip
     clear = PiecewiseOpacity(np.zeros(1), np.zeros(1))
     nothing = TransferFunction("none", clear, ColorMap(np.zeros(1), np.zeros((1, 3))))
-    return [(Content((around,)), Look(nothing)), *layers]
+    return [(OpenedFile((around,)), Look(nothing)), *layers]

@@ -25,7 +25,7 @@ from napari.utils.notifications import show_warning
 from vvgt_cli.commands.session import read_volume
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.integrations.layers import together
 from vvgt_cli.library.inputs import Look
 
@@ -76,7 +76,7 @@ def write(path: str, layers: Sequence[tuple[Any, dict[str, Any], str]]) -> list[
 def _converted(layers: Sequence[Any], step: int) -> Any:
     """Convert a time step of all layers, unlit: napari's views of images have no light."""
     volumes = [_volume(layer, step) for layer in layers]
-    return together([(Content((v,)), _look(layer, v)) for layer, v in zip(layers, volumes, strict=True)], "none")
+    return together([(OpenedFile((v,)), _look(layer, v)) for layer, v in zip(layers, volumes, strict=True)], "none")
 
 
 def _lost(layer: Any, layered: bool) -> list[str]:

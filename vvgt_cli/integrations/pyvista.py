@@ -14,7 +14,7 @@ from typing import Any
 
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content
+from vvgt_cli.field.layered import OpenedFile
 from vvgt_cli.gaussians.header import camera_of as camera_in
 from vvgt_cli.integrations.layers import Layer, together
 from vvgt_cli.integrations.vtk_property import property_json
@@ -99,7 +99,8 @@ def _layers(found: Drawn, prop: Any) -> tuple[list[Layer], list[str]]:
         reading["mask"] = found.mask
     each: list[Reading] = [reading] if count == 1 else [{**reading, "component": k} for k in range(count)]
     parts = [volume_of(found.data, one) for one in each]
-    contents = [Content(tuple(parts), color=True)] if count > 1 and colored else [Content((part,)) for part in parts]
+    mixed = count > 1 and colored
+    contents = [OpenedFile(tuple(parts), color=True)] if mixed else [OpenedFile((part,)) for part in parts]
     functions = [property_json(prop, k, found.scale) for k in range(len(contents))]
     notes = [note for _, some in functions for note in some]
     if len(contents) > 1:

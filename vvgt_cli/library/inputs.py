@@ -16,7 +16,7 @@ from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content, open_content
+from vvgt_cli.field.layered import OpenedFile, open_content
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
@@ -34,7 +34,7 @@ from vvgt_cli.volume.space import SPACES, unit_rows
 from vvgt_cli.volume.stored import Stored
 
 PathLike = str | os.PathLike[str]
-VolumeLike: TypeAlias = "PathLike | Volume | Content | ReadAlready | ArrayLike | VtkImage"
+VolumeLike: TypeAlias = "PathLike | Volume | OpenedFile | ReadAlready | ArrayLike | VtkImage"
 LightLike = LightOptions | Mapping[str, Any] | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
@@ -57,7 +57,7 @@ class ReadAlready(Protocol):
     """A `Session`."""
 
     @property
-    def content(self) -> Content:
+    def content(self) -> OpenedFile:
         """Return the content of its volume."""
 
 
@@ -204,7 +204,7 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 
 
-def content_of(volume: VolumeLike, reading: Reading) -> Content:
+def content_of(volume: VolumeLike, reading: Reading) -> OpenedFile:
     """Return the content of a volume, of a file with colours, channels or segments, or of a `Session`.
 
     Errors are those of `volume_of`.
@@ -212,8 +212,8 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
     if isinstance(volume, str | os.PathLike):
         return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
-    if not isinstance(content, Content):
-        return Content((volume_of(volume, reading),))
+    if not isinstance(content, OpenedFile):
+        return OpenedFile((volume_of(volume, reading),))
     if reading:
         raise UsageError(f"{', '.join(reading)}: the session's volume is read already; remove {', '.join(reading)}")
     return content

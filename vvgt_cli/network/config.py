@@ -165,7 +165,7 @@ class NetworkConfig:
     @property
     def start(self) -> str:
         """Return the method of `vvgt_cli.closed_form` whose Gaussians training starts from."""
-        return "uniform" if self.variant == "wo_vbm" else "vbm"
+        return "uniform" if self.variant == "wo_vbm" else "moments"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as checkpoints and model cards store them."""

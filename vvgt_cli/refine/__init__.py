@@ -40,7 +40,7 @@ def optimize(
             Gaussians are returned.
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
-        free: (K,) bool, those that move, of the method "frame"; None: all.
+        free: (K,) bool, those that move, of the method "axes"; None: all.
         weights: of each training view, (h, w) factors of differences in the loss; None: 1.
 
     Raises:

@@ -99,7 +99,7 @@ def begin(
     gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
 ) -> State:
     """Return the state that a method descends on: Gaussians that carry values with the look that they have."""
-    kinds: dict[str, Callable[..., OnHost]] = {"frame": OwnAxes, "adam": Fields, "3dgs": Densified}
+    kinds: dict[str, Callable[..., OnHost]] = {"axes": OwnAxes, "adam": Fields, "3dgs": Densified}
     gaussians = replace(gaussians, live=None)
     if options.device == "cpu":
         return kinds[options.method](gaussians, cameras, options, free)

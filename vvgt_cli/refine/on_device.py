@@ -258,7 +258,7 @@ KERNELS = *splatting, find_texture, grade, direct, regress, set_pace, move
 
 def unfit(gaussians: Gaussians, options: OptimizeOptions) -> str | None:
     """Return why descent from Gaussians by such options is the CPU's; None where a device does it."""
-    if options.method != "frame":
+    if options.method != "axes":
         return f"the method {options.method}"
     if gaussians.harmonics is not None:
         return "colours that depend on the view"

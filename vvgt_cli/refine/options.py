@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
     from vvgt_cli.cameras.blocks import Blocks
 
-METHODS = ("frame", "adam", "3dgs")
+METHODS = ("axes", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log/closed-form.md)
-LOSSES: dict[str, dict[str, float]] = {"frame": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
+LOSSES: dict[str, dict[str, float]] = {"axes": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
 Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None, Sequence[np.ndarray] | None]"
 
@@ -31,7 +31,7 @@ class OptimizeOptions:
 
     Attributes:
         steps: maximum number, one view each; rates fall to zero over them. None: as many as the time budget allows.
-        method: "frame" steps along each Gaussian's own axes, "adam" on the file's fields with the rates of 3DGS, "3dgs"
+        method: "axes" steps along each Gaussian's own axes, "adam" on the file's fields with the rates of 3DGS, "3dgs"
             as that, and the number of Gaussians grows and shrinks as in 3DGS.
         max_gaussians: the number that "3dgs" may grow to; None: as many as it begins with.
         time_budget: seconds from the first step on after which no other is begun; rates fall to zero over it if it
@@ -48,11 +48,11 @@ class OptimizeOptions:
         patience: scores in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
-        device: "cpu", or "cuda" for steps of the method "frame" there (`vvgt_cli.refine.on_device`).
+        device: "cpu", or "cuda" for steps of the method "axes" there (`vvgt_cli.refine.on_device`).
     """
 
     steps: int | None = STEPS
-    method: str = "frame"
+    method: str = "axes"
     max_gaussians: int | None = None
     time_budget: float | None = None
     target_psnr: float | None = None

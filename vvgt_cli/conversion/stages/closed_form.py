@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.conversion.resume import CELLS, CLOSED_FORM
 from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.defaults import INIT
 from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.workload import Workload
 
@@ -67,7 +68,7 @@ class ClosedFormStage(Stage):
                 raise NothingVisible(source.volume.name, source.name)
             found = len(start.gaussians)
             start, removed = thinned(start)
-            stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
+            stage.note = f"{len(start.gaussians)} Gaussians" + f" ({fit.init})" * (fit.init != INIT)
             if start.form is not None and not removed and found < NEARLY * fit.max_gaussians:
                 stage.note += f", no more: {bound(start.form)}"
         if removed:
@@ -78,7 +79,7 @@ class ClosedFormStage(Stage):
 
 
 def thinned(start: Start) -> tuple[Start, int]:
-    """Return a closed form with fewer Gaussians where they are faint (`thin`), and the number removed."""
+    """Return a closed form with fewer Gaussians where they are faint, and the number of Gaussians removed."""
 
     def cut(budget: int) -> tuple[Start, int, bool]:
         found, form = start, start.form
@@ -87,10 +88,10 @@ def thinned(start: Start) -> tuple[Start, int]:
             found = replace(start, form=form, gaussians=form.gaussians())
         return found, len(found.gaussians), bool(np.median(found.gaussians.opacity_logits) < FAINT_LOGIT)
 
-    return thin(0 if start.form is None else start.form.budget, cut)
+    return halve_budget_while_faint(0 if start.form is None else start.form.budget, cut)
 
 
-def thin(budget: int, cut: Callable[[int], tuple[T, int, bool]]) -> tuple[T, int]:
+def halve_budget_while_faint(budget: int, cut: Callable[[int], tuple[T, int, bool]]) -> tuple[T, int]:
     """Cut a pyramid for a budget, and for half of it again and again while most Gaussians are faint.
 
     Viewers discard what is below 1/255, 1/510 or 1/100 in a pixel: each shows another part of a fog of faint splats.

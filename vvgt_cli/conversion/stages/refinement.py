@@ -14,7 +14,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, STEPS
+from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
@@ -92,7 +92,7 @@ class Refinement(Stage):
             remaining = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
         target = work.limits.target_psnr
         options = OptimizeOptions.of(
-            "frame", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
+            "axes", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
             judge=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
@@ -168,7 +168,7 @@ def _on_its_device(
 
 
 def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
-    notes = [f"{record.steps} steps ({options.method})"]
+    notes = [f"{record.steps} steps" + f" ({options.method})" * (options.method != METHOD)]
     if 0 < record.kept < record.steps:
         notes.append(f"best after {record.kept}")
     if REASONS[record.reason]:

@@ -38,7 +38,7 @@ class SceneConfig:
 
     size: int | tuple[int, ...] = 256
     gaussians: tuple[int, int] = (8_000, 40_000)
-    start: str = "vbm"
+    start: str = "moments"
     back_projection: bool = True
     functions: int = 10
     held_functions: tuple[int, ...] = (3, 7)
