@@ -380,12 +380,12 @@ def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
     from vvgt_cli.refine import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.refine.checkpoint import Judge, resume, save
+    from vvgt_cli.refine.checkpoint import Checks, resume, save
     from vvgt_cli.refine.loop import begin
 
-    def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
+    def fresh(method: str) -> tuple[Any, Checks, OptimizeRecord]:
         record, state = OptimizeRecord(), begin(cloud(8), CAMERAS, OptimizeOptions.of(method, max_gaussians=16))
-        return state, Judge(state, None, record), record
+        return state, Checks(state, None, record), record
 
     seeds = []
     for method in ("axes", "3dgs"):

@@ -22,7 +22,10 @@ def _stages(kind, seconds, steps):
     if kind == "baseline":
         shares = {"read": 0.01, "samples": 0.02, "views": 0.1, "write": 0.01}
     if kind == "network":
-        shares = {name: share / 3 for name, share in shares.items()} | {"network": 0.7, "judge": 0.05}
+        shares = {name: share / 3 for name, share in shares.items()} | {
+            "network": 0.7,
+            "check views of a network": 0.05,
+        }
     if steps:
         shares |= {"refinement": 1 - sum(shares.values())}
     total = sum(shares.values())

@@ -58,7 +58,7 @@ def test_a_gain_is_kept_and_the_file_is_as_the_one_read(made, tmp_path, vvgt):
     options = json.loads((tmp_path / "r.json").read_text())["options"]
     assert options["psnr_after"] > options["psnr_before"] + 2
     assert len(options["read"]) == 3
-    assert not set(options["read"]) & set(options["judges"])
+    assert not set(options["read"]) & set(options["check_views"])
 
 
 def test_without_a_gain_the_input_is_written_and_it_is_said(made, tmp_path, vvgt):

@@ -249,7 +249,7 @@ def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, m
     asked = []
 
     def refine(run, gaussians, train, check, options, begin=None):
-        asked.append((options.rule, options.judge, options.texture, gaussians, begin))
+        asked.append((options.rule, options.check_rule, options.texture, gaussians, begin))
         return gaussians
 
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", refine)

@@ -1,5 +1,6 @@
 """The documentation holds what the program has: a page a command, every option, links that lead somewhere."""
 
+import json
 import os
 import re
 import runpy
@@ -11,6 +12,7 @@ import pytest
 from tests.test_architecture import SUBPACKAGES
 from vvgt_cli.commands.main import COMMANDS, cli
 from vvgt_cli.conversion.batch import CANNOT
+from vvgt_cli.version import VERSION
 
 ROOT = Path(__file__).parent.parent
 SITE = runpy.run_path(str(ROOT / "docs" / "conf.py"))
@@ -123,6 +125,17 @@ def test_examples_are_listed_and_executable_by_bash():
         assert f"`{script.name}`" in listed
         assert script.read_text().startswith("#!/usr/bin/env bash")
         assert os.access(script, os.X_OK)
+
+
+def test_every_file_states_the_version_and_keywords_of_the_package():
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    meta, cited = json.loads((ROOT / "codemeta.json").read_text()), (ROOT / "CITATION.cff").read_text()
+    assert meta["version"] == VERSION
+    assert f"\nversion: {VERSION}\n" in cited
+    assert meta["keywords"] == project["keywords"] == re.findall(r"^  - ([\w ]+)$", cited, re.M)
+    assert meta["description"] == project["description"]
 
 
 def test_constraints_pin_every_dependency_of_the_package():

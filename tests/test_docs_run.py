@@ -102,6 +102,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for cells in (tmp_path / "cavity").glob("*/cells"):
         cells.with_name("p").write_text(cells.read_text().replace("object cells", "object p"))
     (tmp_path / "bone.json").write_text(anatomy.TF)
+    (tmp_path / "story.json").write_text(blocks(ROOT / "docs" / "how-to.md", "json")[0][1])
     preset = {"RGBPoints": [0, 0.9, 0.8, 0.7, 900, 1, 1, 1], "Points": [0, 0, 0.5, 0, 900, 0.5, 0.5, 0]}
     (tmp_path / "presets.json").write_text(json.dumps([preset | {"Name": name} for name in ("bone", "skin")]))
     (tmp_path / "presets.xml").write_text(mrml())

@@ -222,7 +222,7 @@ def test_extinctions_of_labels_add_up_to_the_whole() -> None:
 @pytest.mark.parametrize(
     ("values", "text", "said"),
     [
-        (balls(), SLICER.replace("3 inner_core", "4 other"), "have no entry in t.ctbl: 3; add them"),
+        (balls(), SLICER.replace("3 inner_core", "4 other"), "in t.ctbl: 3; it has 1 (skin), 4 (other); add them"),
         (balls(), "9 other 1 2 3 255\n", "none of its labels (1, 3) is in t.ctbl, which has 9"),
         (balls() * 0, SLICER, "no label other than 0"),
     ],

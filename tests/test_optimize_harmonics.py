@@ -16,7 +16,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.checkpoint import Judge, fingerprint, resume, save
+from vvgt_cli.refine.checkpoint import Checks, fingerprint, resume, save
 from vvgt_cli.refine.loop import begin
 from vvgt_cli.refine.states import KNOWN_HARMONICS_RATE, SLOPE, Densified, densify
 from vvgt_cli.splat import render
@@ -122,7 +122,7 @@ def test_a_checkpoint_holds_them(method, tmp_path):
     walk = {"speed": 1.0, "elapsed": 0.0, "looked": 0}
     for n in range(3):
         states[0].step(CAMERAS[n], images[n], 0.1, 1.0)
-    judges = [Judge(state, None, OptimizeRecord()) for state in states]
+    judges = [Checks(state, None, OptimizeRecord()) for state in states]
     save(path, "key", states[0], judges[0], OptimizeRecord(), walk)
     assert resume(path, "key", states[1], judges[1], OptimizeRecord()) == walk
     for n in range(3, 6):

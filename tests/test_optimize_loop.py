@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.network.prepare import halved
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.refine.checkpoint import FALLEN, Judge
+from vvgt_cli.refine.checkpoint import FALLEN, Checks
 from vvgt_cli.refine.loop import spread_views
 from vvgt_cli.refine.shared import NONE
 from vvgt_cli.refine.states import Fields, OwnAxes
@@ -137,8 +137,8 @@ def test_a_run_that_ends_worse_than_it_was_returns_its_best(scene):
 def test_the_best_state_is_returned_not_the_last(scene, kind):
     start, _, check = scene
     state, record = kind(start, CAMERAS), OptimizeRecord()
-    assert not Judge(state, None, record).measure(0.0)
-    judge = Judge(state, check, record)
+    assert not Checks(state, None, record).measure(0.0)
+    judge = Checks(state, check, record)
     judge.measure(0.0)
     best, last = shaken(truth(), 0.02), shaken(truth(), 0.025)
     for record.steps, g in ((5, best), (10, last)):

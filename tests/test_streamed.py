@@ -20,6 +20,7 @@ from vvgt_cli.conversion.index import named_files
 from vvgt_cli.conversion.level_selection import SEEN_FROM, VIEW_PIXELS, CutErrors, level_errors
 from vvgt_cli.conversion.levels import WrittenFiles, divide
 from vvgt_cli.conversion.stored import StoredGaussians, save
+from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Pass
@@ -225,7 +226,7 @@ def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_
 def test_a_dry_run_of_levels_prints_their_plan_and_writes_nothing(vvgt, volume: Path, tmp_path: Path) -> None:
     line = ("convert", volume, *FIT, "--dry-run", "--for", "phone", "-o", tmp_path / "out" / "lod-meta.json")
     plan = vvgt.ok(*line).out.decode()
-    assert "levels, 152 steps" in plan
+    assert f"levels, {STEPS} steps" in plan
     assert "with 9000 Gaussians" in plan
     assert not list(tmp_path.iterdir())
 

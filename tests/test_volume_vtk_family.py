@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import pyvista as pv
+from vtkmodules import vtkIOXML
 
 from tests import vtk_files as files
 from tests.ramps import X, Y, Z, axes_of, check_grid, ramp
@@ -66,6 +67,17 @@ def check_samples(path: Path, step: int | None, *arrays: str) -> None:
         assert volume.name.endswith(f"(resampled to {' x '.join(map(str, dims))})")
         check_place(volume)
         np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)) + rise, atol=0.05)
+
+
+@pytest.mark.parametrize("suffix", ["vts", "vtu"])
+def test_a_mesh_that_was_cut_off_within_its_last_values_is_a_line(tmp_path: Path, suffix: str) -> None:
+    writer = vtkIOXML.vtkXMLStructuredGridWriter() if suffix == "vts" else vtkIOXML.vtkXMLUnstructuredGridWriter()
+    data = files.image().cast_to_structured_grid() if suffix == "vts" else files.hexahedra()
+    writer.SetCompressorTypeToNone()
+    path = files.write(writer, data, tmp_path / f"a.{suffix}", EncodeAppendedData=False)
+    assert read_volume(str(path), ReadOptions(array="ramp", dims=(4, 3, 2))).dims == (4, 3, 2)
+    path.write_bytes(path.read_bytes()[:-60])
+    refused(DataError, "was cut off", read_volume, str(path), ReadOptions(array="ramp", dims=(4, 3, 2)))
 
 
 @pytest.mark.parametrize("kind", MESHES)

@@ -1,7 +1,7 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; twice X Y; hover X Y; wheel DY [KEY]; drag X Y X Y [BUTTON]; pinch X Y FROM TO (two fingers, px apart); resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
-// (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads).
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; twice X Y; hover X Y; calm (less motion is asked for); wheel DY [KEY]; drag X Y X Y [BUTTON]; pinch X Y FROM TO (two fingers, px apart); resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
+// (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads); framed URL STEPS (eval, click and until in the frame of a site; their answers).
 import fs from 'node:fs';
 import path from 'node:path';
 import readline from 'node:readline';
@@ -56,6 +56,7 @@ const steps = {
     return job.touch ? page.touchscreen.tap(...at) : page.mouse.click(...at);
   },
   twice: (...at) => (job.touch ? Promise.all([0, 1].map(() => page.touchscreen.tap(...at))) : page.mouse.dblclick(...at)),
+  calm: () => page.emulateMedia({ reducedMotion: 'reduce' }),
   hover: (x, y) => page.mouse.move(x, y),
   wheel: async (by, key) => {
     if (key) await page.keyboard.down(key);
@@ -117,6 +118,16 @@ const steps = {
       if (!found.seen) unseen.push(found.name);
     }
     return { unseen, missed: await page.evaluate(() => [...window.missed].map((e) => `${e.tagName} ${e.getAttribute('aria-label') ?? e.title}`)) };
+  },
+  framed: async (url, what) => {
+    await page.goto(url);
+    const frame = page.frames()[1], answers = [];
+    await frame.waitForFunction('window.vvgt !== undefined');
+    const within = { eval: (text) => frame.evaluate(text), click: (selector) => (job.touch ? frame.tap(selector) : frame.click(selector)), until: async (text) => { await frame.waitForFunction(text); } };
+    for (const [name, ...rest] of what) answers.push((await within[name](...rest)) ?? null);
+    broken.splice(0, Infinity, ...broken.filter((line) => !/^(Download is disallowed|Permissions policy violation)/.test(line)));
+    await page.goto('about:blank');
+    return answers;
   },
   save: async (selector, file) => {
     const [download] = await Promise.all([page.waitForEvent('download'), steps.click(selector)]);

@@ -217,15 +217,15 @@ def compare_levels(scene: Scene) -> Figure:
 
 def convert_scene(scene: Scene) -> Figure:
     """Measure the loss between closed form and file on views that nothing was fitted to; no stage may lose."""
-    cameras, judges = (default_views(which, 4, size=SIZE) for which in ("train", "check"))
-    views, reference = render_views(scene, cameras), render_views(scene, judges)
+    cameras, checks = (default_views(which, 4, size=SIZE) for which in ("train", "check"))
+    views, reference = render_views(scene, cameras), render_views(scene, checks)
     start = initialise(scene, VbmOptions(BUDGET, SIZE))
     require(0 < len(start.gaussians) <= BUDGET, f"{len(start.gaussians)} Gaussians for a budget of {BUDGET}")
     refitted, _ = backproject(start, cameras, views)
     options = OptimizeOptions(steps=STEPS, check_every=5)
-    better, record = optimize(refitted, cameras, views, options, (judges, reference))
+    better, record = optimize(refitted, cameras, views, options, (checks, reference))
     gaussians, _ = read_ply(io.BytesIO(as_ply(as_stored(better))))
-    images = [render(gaussians, camera) for camera in judges]
+    images = [render(gaussians, camera) for camera in checks]
     require(all(np.isfinite(image).all() for image in images), "a picture that is not finite")
     score = score_views(reference, images, perceptual=False)
     assert record.psnr_before is not None

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion
     from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.gaussians.story import StoryLike
     from vvgt_cli.library.inputs import LooksLike, PathLike, Reading, VolumeLike
     from vvgt_cli.progress import Console
 
@@ -26,10 +27,10 @@ def convert(
     model: str | None = None, rule: str | None = None, seed: int = 0, device: str = "cpu", live: bool = False,
     split_labels: bool = False, after: Conversion | None = None, frame: str = "unit", up: str = "auto",
     camera: tuple[float, ...] | None = None, sh_degree: int | None = None, comments: bool = True, values: bool = True,
-    title: str | None = None, report: PathLike | None = None, preview: PathLike | None = None,
-    checkpoint: PathLike | None = None, shard: str | None = None, dry_run: bool = False, all_views: bool = False,
-    blocks: int | str | BlockOptions | None = None, overwrite: bool = False, progress: bool | Console = False,
-    command: str | None = None, **reading: Unpack[Reading],
+    title: str | None = None, story: StoryLike | None = None, report: PathLike | None = None,
+    preview: PathLike | None = None, checkpoint: PathLike | None = None, shard: str | None = None,
+    dry_run: bool = False, all_views: bool = False, blocks: int | str | BlockOptions | None = None,
+    overwrite: bool = False, progress: bool | Console = False, command: str | None = None, **reading: Unpack[Reading],
 ) -> Conversion | Clouds | str | None:  # fmt: skip
     """Convert a volume under a transfer function to 3D Gaussians: ``vvgt convert``.
 
@@ -68,6 +69,7 @@ def convert(
         comments: write comments (frame, unit distance, certificate, ...) into the file.
         values: write the volume's values into a page.
         title: title of pages.
+        story: for a page to tell: a ``story.json`` or its content (docs/live.md); needs a page as ``output``.
         report: JSON of times and errors to write.
         preview: PNG to write: volume, splats and difference.
         checkpoint: folder for the results of stages until the output is written.
@@ -94,6 +96,7 @@ def convert(
     from vvgt_cli.conversion.result import Conversion
     from vvgt_cli.errors import UsageError
     from vvgt_cli.gaussians import PlyOptions
+    from vvgt_cli.gaussians.story import read_story
     from vvgt_cli.library.inputs import console_of, requests_of
 
     if not isinstance(after, Conversion | None):
@@ -108,6 +111,7 @@ def convert(
     requests, several = requests_of(
         volume, look, reading, output=output, fit=fit, limits=Limits(target_psnr, time_budget, max_megabytes), ply=ply,
         up=up, report=report, preview=preview, checkpoint=checkpoint, live=live, values=values, title=title,
+        story=None if story is None else read_story(story),
         all_views=all_views, blocks=blocks, overwrite=overwrite, command=command,
     )  # fmt: skip
     return convert_all(
@@ -132,6 +136,7 @@ def convert(
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @shared.title_option
+@shared.story_option
 @shared.overwrite_option
 @shared.rule_option(f"Viewer to optimise for, by how it draws a Gaussian. Default: {RULE}.")
 @click.option(
@@ -189,6 +194,7 @@ def command(**options: Any) -> None:
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{step}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert four.nii -o four.html
+      vvgt convert head.nrrd --story story.json -o lesson.html
       vvgt convert cells.ome.tif --channel DAPI,GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
       vvgt convert atlas.nii.gz --labels lut.txt --split-labels -o atlas.glb

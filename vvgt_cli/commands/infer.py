@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vvgt_cli.progress import Console
     from vvgt_cli.score.record import Run
 
-JUDGES = 4  # views that the network is not shown, as many as the default check set
+CHECK_VIEWS = 4  # views that the network is not shown, as many as the default check set
 
 
 def infer(
@@ -38,7 +38,7 @@ def infer(
         progress: print messages and bars on standard error.
 
     Returns:
-        The better Gaussians, or those of the file if the views that judge them show no gain.
+        The better Gaussians, or those of the file if the check views show no gain.
 
     Raises:
         UsageError: an output that may not be written, or an unknown model or provider.
@@ -67,7 +67,7 @@ def infer(
 def command(console: Console, **options: Any) -> None:
     """Improve the Gaussians of IN.ply with a network that looks at views of their volume.
 
-    The network reads a fixed number of training views, chosen far apart. Up to four other views judge the result: if
+    The network reads a fixed number of training views, chosen far apart. Up to four other views check the result: if
     their PSNR does not rise, the Gaussians of IN.ply are written unchanged and a message says so. IN.ply may be "-".
 
     Example:
@@ -78,16 +78,16 @@ def command(console: Console, **options: Any) -> None:
 
 
 def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]]:
-    """Return the indices of the views that the network reads, and of those that judge it.
+    """Return the indices of the views that the network reads, and of those that check its result.
 
-    The judges are other views, as far apart as possible; if there are none, the views that it reads.
+    The check views are other views, as far apart as possible; if there are none, the views that it reads.
     """
     from vvgt_cli.cameras import farthest_cameras
 
     read = farthest_cameras(cameras, wanted)
     others = [i for i in range(len(cameras)) if i not in read]
-    judges = [others[i] for i in farthest_cameras([cameras[i] for i in others], JUDGES)] if others else read
-    return read, judges
+    check_views = [others[i] for i in farthest_cameras([cameras[i] for i in others], CHECK_VIEWS)] if others else read
+    return read, check_views
 
 
 def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Result:
@@ -107,23 +107,23 @@ def _improved(name: str, folder: str, model: str, provider: str, run: Run) -> Re
         network = Model.open(find_model(model), numba.get_num_threads(), provider)
         gaussians, header = open_gaussians(name)
         cameras, images = load_views(folder, "train")
-        read, judges = divide(cameras, network.card.network.total_views)
+        read, check_views = divide(cameras, network.card.network.total_views)
         stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {network.card.name}"
     run.compile(INFER)
     with run.stage("network") as stage:
         shown = [cameras[i] for i in read]
         better = network.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
         stage.note = f"reads {len(read)} views"
-    with run.stage("judge") as stage:
-        before, after = map(Views(cameras, images).take(judges).psnr, (gaussians, better))
+    with run.stage("check views") as stage:
+        before, after = map(Views(cameras, images).take(check_views).psnr, (gaussians, better))
         stage.psnr, stage.kept = after, after > before
-        own = "" if set(judges) - set(read) else ", all read by the network"
-        stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
+        own = "" if set(check_views) - set(read) else ", all read by the network"
+        stage.note = f"from {before:.2f} dB on {len(check_views)} views{own}"
     run.report.options = {
         "model": network.card.name,
         "provider": provider,
         "read": [cameras[i].name for i in read],
-        "judges": [cameras[i].name for i in judges],
+        "check_views": [cameras[i].name for i in check_views],
         "psnr_before": before,
         "psnr_after": after,
     }

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
@@ -297,6 +298,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
     }
 
 
+_SCENE = re.compile(r'id="scene">(.*?)</script>', re.S)
 OURS = ("vvgt ", "SplatRenderMode")
 FACE = (
     "shows what the volume shows, such as the face of a head whose skin is visible: --crop, --mask or a function "
@@ -320,6 +322,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     layers = () if header.live is None else header.live.layers
     page = Path(file).suffix.lower() == ".html"
     text = Path(file).read_text("utf-8") if page else ""
+    scene = json.loads(_SCENE.findall(text)[0]) if page else {}
     held = f'id="{ELEMENT}-0"' in text and "of the volume, also of what its look hides"
     names = [name for layer in layers for name in (layer.name, *(label.name for label in layer.labels))]
     legend = json.loads(header.legend or "{}")
@@ -330,6 +333,8 @@ def what_leaves(file: str) -> dict[str, Any]:
         "command": made and made.command, "checksum": made and made.sha256,
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
         "place": header.affine and f"position and directions in the {'scanner' if scanned else 'world'}",
+        "story": [step["text"] for step in scene.get("story", ())],
+        "saved view, with its rulers, notes and story": unquote(scene.get("link", "")),
         "camera": header.camera and "eye and target in the world",
         "values": held or (layers and "data values under each Gaussian, and their histogram"),
         "other": [line for line in header.comments if not line.startswith(OURS)],

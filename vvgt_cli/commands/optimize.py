@@ -163,9 +163,9 @@ def _refined(
     edge = train.cameras[0].width
     screen, asked = screen or header.screen_size or edge, file_rule(header, rule)
     fitted = asked.at(edge / screen)
-    named = {"rule": asked.name, "judge": asked.name, "screen": screen, "sh_degree": start.degree}
+    named = {"rule": asked.name, "check_rule": asked.name, "screen": screen, "sh_degree": start.degree}
     run.report.options = asdict(how) | named
-    gaussians = refine(run, start, train, check, replace(how, rule=fitted, judge=fitted))
+    gaussians = refine(run, start, train, check, replace(how, rule=fitted, check_rule=fitted))
     if test is not None:
         _score(run, test, start, gaussians, fitted)
     degree = header.sh_degree if sh_degree is None else sh_degree

@@ -227,6 +227,11 @@ title_option = click.option(
     help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
 )  # fmt: skip
 
+story_option = click.option(
+    "--story", metavar="STORY.json",
+    help="Steps of text, camera, cut, function, labels, light and slices for a page (.html) to tell.",
+)  # fmt: skip
+
 values_option = click.option(
     "--no-values", "values", is_flag=True, default=True, flag_value=False,
     help="Omit the volume's values from the page (.html) of one volume, and with them slices and changes of its look.",
@@ -317,12 +322,9 @@ def _number_or(word: str, number: str) -> Callable[[click.Context, click.Paramet
 
 
 def _shard(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    index, _, count = value.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
-        raise click.BadParameter(f"{value!r}; expected I/N with I from 1 to N, as 3/8")
-    return int(index), int(count)
+    from vvgt_cli.conversion.manifest import parse_shard
+
+    return None if value is None else (parse_shard(value).index, parse_shard(value).count)
 
 
 _options = {

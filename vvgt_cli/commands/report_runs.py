@@ -298,9 +298,9 @@ def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.screen, small=False))
     volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = render_check_views(volume.views, default_views("check", size=fit.screen), RenderSettings())
+        checks = render_check_views(volume.views, default_views("check", size=fit.screen), RenderSettings())
     with run.stage("views"):
-        return Views(train, render_views(volume.views, train)), judges
+        return Views(train, render_views(volume.views, train)), checks
 
 
 def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
@@ -329,7 +329,7 @@ def _baseline(
         train, check = _views(run, volume, fit)
     options = OptimizeOptions.of(
         "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,
-        rule=INRIA.at(train.cameras[0].width / fit.screen), judge=INRIA,
+        rule=INRIA.at(train.cameras[0].width / fit.screen), check_rule=INRIA,
     )  # fmt: skip
     return _finish(run, refine(run, start, train, check, options))
 

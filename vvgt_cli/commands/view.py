@@ -12,6 +12,7 @@ from vvgt_cli.commands import options as shared
 from vvgt_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from vvgt_cli.gaussians.story import StoryLike
     from vvgt_cli.library.inputs import LookLike, PathLike, Reading
     from vvgt_cli.progress import Console
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 def view(
     files: PathLike | Sequence[PathLike], look: LookLike = None, *, output: PathLike | None = None,
     port: int | None = None, browser: bool = True, values: bool = True, title: str | None = None,
-    overwrite: bool = False, progress: bool | Console = False, **reading: Unpack[Reading],
+    story: StoryLike | None = None, overwrite: bool = False, progress: bool | Console = False,
+    **reading: Unpack[Reading],
 ) -> None:  # fmt: skip
     """Show files of Gaussians or a volume in a browser until an interrupt, or write them: ``vvgt view``.
 
@@ -32,6 +34,7 @@ def view(
         browser: open one, if there is a display.
         values: let a page of a volume hold its values, for slices and other looks.
         title: of the page; None: the file's own.
+        story: for the page to tell, a story.json or its content (docs/live.md).
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
         **reading: of a volume, as in `convert`.
@@ -42,7 +45,9 @@ def view(
         DataError: a file that is not valid.
     """
     from vvgt_cli.commands import viewer
+    from vvgt_cli.conversion.gaussian_files import is_page
     from vvgt_cli.conversion.index import named_files
+    from vvgt_cli.gaussians.story import read_story
     from vvgt_cli.library.inputs import console_of, source_of
     from vvgt_cli.score.record import ConversionReport, Run
 
@@ -50,13 +55,16 @@ def view(
         raise UsageError("-o writes a file and starts no server; omit --port and --no-browser")
     if output is None and not values:
         raise UsageError("--no-values is for a page that is saved; give -o OUT.html, or omit it")
+    if story is not None and not is_page(None if output is None else os.fspath(output)):
+        raise UsageError("--story is for a page that is saved; give -o OUT.html, or omit it")
+    told = None if story is None else read_story(story)
     names = [files] if isinstance(files, str | os.PathLike) else files
     clouds, run = named_files([os.fspath(name) for name in names]), Run(console_of(progress), ConversionReport("view"))
     source = source_of(clouds[0][1], look, reading)
     if output is None:
         viewer.show(run, clouds, source, title, port or 0, browser, click.echo)
     else:
-        viewer.save(run, clouds, source, os.fspath(output), values=values, title=title, overwrite=overwrite)
+        viewer.save(run, clouds, source, os.fspath(output), values=values, title=title, story=told, overwrite=overwrite)
 
 
 @shared.command("view", short_help="Show Gaussians or a volume in a browser, or save a page.")
@@ -74,6 +82,7 @@ def view(
 )  # fmt: skip
 @shared.values_option
 @shared.title_option
+@shared.story_option
 @shared.tf_options
 @shared.light_options
 @shared.placed_read_options

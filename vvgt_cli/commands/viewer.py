@@ -37,6 +37,7 @@ from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed
+from vvgt_cli.gaussians.story import Story
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.score.record import Run
 
@@ -53,22 +54,23 @@ Clouds = Sequence[tuple[str, str]]  # name and file of each
 
 def save(
     run: Run, clouds: Clouds, source: SourceRequest, output: str, *, values: bool, title: str | None,
-    overwrite: bool,
+    story: Story | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """Write Gaussians, or a volume that is converted, as `vvgt_cli.view` does."""
     from vvgt_cli.conversion.convert_batch import convert_all
     from vvgt_cli.conversion.request import ConvertRequest
 
-    file, request = clouds[0][1], ConvertRequest(source, title=title)
+    values = values and is_page(output)
+    file, request = clouds[0][1], ConvertRequest(source, values=values, title=title, story=story)
     if len(clouds) > 1:
-        _join(run, output, clouds, source, overwrite)
+        _join(run, output, clouds, source, story, overwrite)
     elif _is_series(source):
         if not is_page(output):
             raise UsageError(f"-o {output}: holds one frame; expected a page (.html), or --time N")
-        convert_all({"": replace(request, output=output, overwrite=overwrite, values=values)}, console=run.console)
+        convert_all({"": replace(request, output=output, overwrite=overwrite)}, console=run.console)
     else:
         with claimed([Output("-o", output, SUFFIXES, splats=True)], [file], overwrite):
-            gaussians, options, held = _opened(run, file, request, values and is_page(output))
+            gaussians, options, held = _opened(run, file, request)
             write_gaussians(run, output, gaussians, options, overwrite, values=held)
             run.compile(for_degree(DRAW, gaussians.degree))
             report_agreement(run, output, gaussians, options)
@@ -106,7 +108,9 @@ def _is_series(source: SourceRequest) -> bool:
     )
 
 
-def _join(run: Run, output: str, clouds: Clouds, source: SourceRequest, overwrite: bool) -> None:
+def _join(
+    run: Run, output: str, clouds: Clouds, source: SourceRequest, story: Story | None, overwrite: bool
+) -> None:  # fmt: skip
     """Write several files into one page."""
     files = [file for _, file in clouds]
     _only_gaussians(files)
@@ -120,7 +124,9 @@ def _join(run: Run, output: str, clouds: Clouds, source: SourceRequest, overwrit
         names = [name for name, _ in clouds]
         if len(set(names)) < len(names):
             names = list(files)
-        write_page(run, output, list(zip(names, files, strict=True)), overwrite)
+        write_page(
+            run, output, list(zip(names, files, strict=True)), overwrite, story and story.checked((), len(files))
+        )
 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
@@ -145,7 +151,7 @@ def _only_gaussians(files: Sequence[str]) -> None:
         )
 
 
-def _opened(run: Run, name: str, request: ConvertRequest, values: bool) -> tuple[Gaussians, PlyOptions, Values | None]:
+def _opened(run: Run, name: str, request: ConvertRequest) -> tuple[Gaussians, PlyOptions, Values | None]:
     """Return Gaussians in the unit frame, how to write them, and values for a page; a volume is converted."""
     from vvgt_cli.conversion.convert import convert
 
@@ -153,9 +159,10 @@ def _opened(run: Run, name: str, request: ConvertRequest, values: bool) -> tuple
         _refuse_reading(request.source, name)
         gaussians, header = open_gaussians(name)
         options = layout_of(header)
-        return gaussians, replace(options, title=request.title or options.title), None
+        story = request.story and request.story.checked(())
+        return gaussians, replace(options, title=request.title or options.title, story=story), None
     conversion = convert(request, run.console)
-    return conversion.gaussians, conversion.ply, conversion.values(run) if values else None
+    return conversion.gaussians, conversion.ply, conversion.values(run) if request.values else None
 
 
 def _serve(

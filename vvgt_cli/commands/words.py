@@ -78,7 +78,7 @@ def _is_number(text: str) -> bool:
 
 
 ASIDE = {  # parameters that do not change what a file of Gaussians holds
-    *("output", "overwrite", "report", "preview", "checkpoint", "quiet"),
+    *("output", "overwrite", "report", "preview", "checkpoint", "quiet", "story"),
     *("threads", "memory", "workers", "scheduler", "block_size", "shard"),
 }
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
@@ -130,7 +130,8 @@ SECTIONS = {  # parameters by name, in the order shown; all others come first, u
     "Input": "dims dtype byte_order header_bytes spacing space array component time suv crop mask keep_largest",
     "Look": "iso tf_range opacity_unit_distance labels layers ambient diffuse specular specular_power occlusion",
     "Quality": "steps init model rule seed renderer samples step",
-    "Output": "frame up camera sh_degree comments split_labels values format half background points report conditions",
+    "Output": "frame up camera sh_degree comments split_labels values story format half background points report "
+    "conditions",
     "Running": "dry_run device checkpoint shard block_size workers scheduler level threads memory quiet",
 }
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ONE, LIVE, LEVELS, ONE_FILE = "one volume", "--live", "streamed levels", "one file of several clouds"
 LAYERS, NODES = "labels of layers", "one file with a node for each function"
+NO_PAGE = "a file that is no page"
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one cloud, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
@@ -66,6 +67,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--live": "their format has no place for values; write another, as -o out.ply",
         "--split-labels": "labels share the Gaussians of one finished cloud; write another format, as -o out_{}.ply",
     },
+    NO_PAGE: {"--story": "only pages show stories; write one, as -o out.html"},
     NODES: {"--for": "all nodes are drawn together, and a device's limit is of each; give --max-gaussians"},
     ONE_FILE: {
         "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
@@ -196,6 +198,7 @@ def options_in(request: ConvertRequest) -> set[str]:
         "--max-megabytes": limits.max_megabytes, "--time-budget": limits.time_budget,
         "--target-psnr": limits.target_psnr, "--device": fit.device != "cpu", "--for": fit.target,
         "--init": fit.init != INIT, "--frame world": request.ply.frame != "unit",
+        "--story": request.story,
     }  # fmt: skip
     return {option for option, value in used.items() if value}
 

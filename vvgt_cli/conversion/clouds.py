@@ -29,6 +29,7 @@ from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
+from vvgt_cli.gaussians.story import Story, StoryLike, read_story
 
 if TYPE_CHECKING:
     from vvgt_cli.look.function import TransferFunction
@@ -97,7 +98,9 @@ class Clouds(Mapping[str, Result]):
         """Return kind, volume and names."""
         return f"<{len(self)} {self.kind} of {self.volume}: {', '.join(self)}>"
 
-    def save(self, path: str | os.PathLike[str], *, overwrite: bool = True, **how: Any) -> int:
+    def save(
+        self, path: str | os.PathLike[str], *, story: StoryLike | None = None, overwrite: bool = True, **how: Any
+    ) -> int:  # fmt: skip
         """Write one file of all clouds, or a file of each with an index.
 
         Args:
@@ -105,6 +108,7 @@ class Clouds(Mapping[str, Result]):
                 ``.usdz``); or a pattern with a place for the name (``{}``, for frames also ``{:04d}``, ``{step}``,
                 ``{time}`` and ``{stem}``), where
                 ``x.ply`` means ``x_{}.ply``. The index is ``x_index.json``.
+            story: for pages to tell; see `Result.save`.
             overwrite: replace files that exist.
             **how: frame, up, sh_degree and comments of the files; see `Result.save`.
 
@@ -117,7 +121,8 @@ class Clouds(Mapping[str, Result]):
         """
         name = os.fspath(path)
         if is_page(name) and not is_pattern(name):
-            return self._page(name, overwrite, how)
+            return self._page(name, story, overwrite, how)
+        how |= {} if story is None else {"story": story}
         known = format_of(name)
         if not is_pattern(name) and known and known.write_nodes and self.kind != FRAMES:
             check_outputs([Output("save", name, SUFFIXES, splats=True)], [], overwrite)
@@ -175,18 +180,21 @@ class Clouds(Mapping[str, Result]):
             found.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
         return replace(self, clouds=found)
 
-    def _page(self, path: str, overwrite: bool, how: dict[str, Any]) -> int:
+    def _page(self, path: str, story: StoryLike | None, overwrite: bool, how: dict[str, Any]) -> int:
         """Write one page of all clouds."""
         if how:
             raise UsageError(f"{path}: a page shows the unit frame unchanged; remove {', '.join(how)}")
+        told = None if story is None else read_story(story).checked((), len(self.clouds))
         with atomic_write(path, overwrite) as temporary:
-            return temporary.write_bytes(self._html(path))
+            return temporary.write_bytes(self._html(path, told))
 
-    def _html(self, name: str) -> bytes:
+    def _html(self, name: str, story: Story | None = None) -> bytes:
         """Return one page of all clouds."""
         from vvgt_cli.gaussians.formats.page_look import page_of_several
 
-        return page_of_several([(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
+        plys = [cloud.ply if story is None else replace(cloud.ply, story=story) for cloud in self.clouds]
+        named = zip(self.clouds, plys, strict=True)
+        return page_of_several([(cloud.shown_name(), cloud.gaussians, ply) for cloud, ply in named], name)
 
     def _repr_html_(self) -> str | None:
         """Return the page for a notebook; None where a library is missing."""

@@ -14,6 +14,7 @@ from vvgt_cli.conversion.batch import (
     LAYERS,
     LEVELS,
     LIVE,
+    NO_PAGE,
     NODES,
     ONE,
     ONE_FILE,
@@ -213,6 +214,8 @@ class Memory:
         """
         batch.check_names()
         batch.prepare(run)
+        if batch.request.story is not None:
+            batch.request.story.checked((), len(batch.stems))
 
     def wants(self, batch: Batch, stem: str) -> bool:
         """Return True: every item is kept."""
@@ -303,7 +306,8 @@ def convert_all(
     kinds = [*([LEVELS] if is_streamed(output) else []), named, *([LIVE] if request.live else [])]
     together = kind != ONE and holds_several(output) and not numbered
     nodes = together and kind == FUNCTIONS and not is_page(output)
-    for one in [*kinds, *([ONE_FILE] if together else []), *([NODES] if nodes else [])]:
+    also = {NO_PAGE: not is_page(output), ONE_FILE: together, NODES: nodes}
+    for one in [*kinds, *(one for one, so in also.items() if so)]:
         check_options(one, used)
     check_opened(output, request.fit.target)
     if request.blocks is not None and request.blocks.shard is not None:

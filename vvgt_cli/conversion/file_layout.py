@@ -34,16 +34,22 @@ def harmonics_warning(degree: int, source: StyledVolume) -> str | None:
 
 
 def ply_options(request: ConvertRequest, source: StyledVolume) -> PlyOptions:
-    """Return the layout of the file, with everything that follows from the source."""
+    """Return the layout of the file, with everything that follows from the source.
+
+    Raise DataError for a story that shows what the page does not have.
+    """
+    alone = not request.shares_output
+    layers = source.page_layers if request.values and request.ply.comments and alone else ()
     ply = replace(
         request.ply,
+        story=request.story and request.story.checked(layers, 1 if alone else None),
         up=up_axis(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
         screen_size=request.fit.screen,
         rule=request.fit.rule,
         light=source.lighting,
-        function=source.name if len(source.layers) > 1 else source.tf.name,
+        function=source.look_name,
         optics=source.optics(),
         legend=_legend(source),
         title=request.title or _example(request) or source.title,

@@ -193,6 +193,7 @@ class FrameSeries(Batch):
             "opacity_unit_distance": self._distance,
             **({} if lighting is None else {"light": lighting.text()}),
             **({"live": True} if request.live else {}),
+            **({"story": list(request.story.steps)} if request.story else {}),
             **asdict(request.fit),
             **asdict(request.limits),
             "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,

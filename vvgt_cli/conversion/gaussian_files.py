@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO
 
@@ -32,6 +33,7 @@ from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
+from vvgt_cli.gaussians.story import Story
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import score_test_views
@@ -182,7 +184,9 @@ def holds_several(output: str) -> bool:
     return is_page(output) or (known is not None and known.write_nodes is not None)
 
 
-def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
+def write_page(
+    run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool, story: Story | None = None
+) -> None:  # fmt: skip
     """Write several files of Gaussians as one page.
 
     Args:
@@ -190,19 +194,18 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
         output: the page.
         clouds: (name in the page's list, file) of each cloud.
         overwrite: replace an existing page.
+        story: of the page.
 
     Raises:
-        DataError: a file does not hold Gaussians, or there is no file.
+        DataError: a file does not hold Gaussians.
     """
-    if not clouds:
-        raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
     with run.stage("write") as stage:
         shown: list[tuple[str, Gaussians, PlyOptions]] = []
         rules = set[str]()
         for name, file in clouds:
             gaussians, header = open_gaussians(file)
             rules.add(header.rule or INRIA.name)
-            shown.append((name, gaussians, layout_of(header)))
+            shown.append((name, gaussians, replace(layout_of(header), story=story)))
             run.report.gaussians += len(gaussians)
         with atomic_write(output, overwrite) as temporary:
             run.report.bytes = temporary.write_bytes(page_of_several(shown, output))

@@ -126,7 +126,7 @@ class LiveLook(Stage):
         assert work.ply.live is not None
         table, lighting = _baked_look(source, work.ply.live), box_lighting(source)
         shown = visible_cloud(work.current(), table, lighting, pixel_width(fit.screen))
-        name = source.name if len(source.layers) > 1 else source.tf.name
+        name = source.look_name
         with work.run.stage(self.name) as stage:
             live = score_test_views(
                 work.field.views,

@@ -226,8 +226,8 @@ class Planner:
         train = TrainingViews(view_count(0, small=False), view_edge(self.fit.screen, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
-        judge = self.limits.target_psnr is not None and (left is None or left >= views)
-        return [check] if judge else []
+        measured = self.limits.target_psnr is not None and (left is None or left >= views)
+        return [check] if measured else []
 
     def _network(self, plan: Plan, left: float | None) -> tuple[list[Stage], float | None]:
         """Return the network, if requested and in time, and the time that remains."""

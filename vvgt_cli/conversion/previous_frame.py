@@ -140,9 +140,9 @@ class PreviousFrame(WarmStart):
         turn, turns = self._turn % len(last.shown), len(last.shown)
         cameras = last.cameras[turn::turns]
         work.train_rule = last.rule
-        judge = CheckViews()
-        work.field.views.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
-        judge.run(work)
+        check = CheckViews()
+        work.field.views.expect([*check.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
+        check.run(work)
         if work.psnr(last.gaussians) < last.psnr - FAR:
             work.run.skip(WARM_START, "the frame differs too much")
             return False
@@ -153,16 +153,16 @@ class PreviousFrame(WarmStart):
                 _keep_unchanged(image, old, last.shown[turn], camera, last.rule)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the previous frame"
         assert work.check is not None
-        judged, psnr = _changed_blocks(work.check, found), 0.0
+        compared, psnr = _changed_blocks(work.check, found), 0.0
         asked = work.fit.steps
         left = ROUNDS * WARM_STEPS if asked is None else min(asked, ROUNDS * WARM_STEPS)
         while left > 0:
             steps = min(WARM_STEPS, left)
             left -= steps
             options = OptimizeOptions.of(
-                "axes", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
+                "axes", steps=steps, rule=last.rule, check_rule=work.rule, seed=work.fit.seed, check_every=WARM_STEPS
             )
-            result = refine(work.run, work.current(), Views(cameras, images), judged, options, free=free)
+            result = refine(work.run, work.current(), Views(cameras, images), compared, options, free=free)
             result = as_stored(widen_small(result, work.fit.screen)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
@@ -198,7 +198,7 @@ def _count_differing(first: Gaussians, second: Gaussians) -> int:
 
 
 def _changed_blocks(views: Views, found: Changes) -> Views:
-    """Return the blocks of views that show differences, to judge by; all views where none does."""
+    """Return the blocks of views that show differences, to compare; all views where none does."""
     cameras, images, blocks = [], [], []
     for k, camera in enumerate(views.cameras):
         shown = found.seen_by(camera)

@@ -89,9 +89,9 @@ class PreviousLook(WarmStart):
             TrainingViews(view_count(steps, small), view_edge(work.fit.screen, small)),
             Refinement(steps, steps, small),
         )
-        judge = CheckViews()
-        work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
-        judge.run(work)
+        check = CheckViews()
+        work.field.views.expect([view for stage in (check, *stages) for view in stage.views(work.fit)])
+        check.run(work)
         if work.psnr(work.current()) < standard - FAR:
             return "the look differs too much"
         work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])

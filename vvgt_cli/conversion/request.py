@@ -18,6 +18,7 @@ from vvgt_cli.gaussians.formats.page_file import page_bytes
 from vvgt_cli.gaussians.formats.page_values import SMALLEST as SMALLEST_VALUES
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output
+from vvgt_cli.gaussians.story import Story
 from vvgt_cli.gaussians.targets import target_of
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
@@ -132,6 +133,7 @@ class ConvertRequest:
         values: a page also holds the values of the volume.
         command: command line that the file records; None from Python.
         title: title of pages; None: kind and size of the volume, or the name of an example.
+        story: of pages, not yet checked against the volume.
         scored: score the result, for which views are rendered; without, it is the closed form alone.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.
         shares_output: the output holds other clouds, too, so that a device's limit of bytes is not for this one.
@@ -154,6 +156,7 @@ class ConvertRequest:
     shares_output: bool = False
     command: str | None = None
     title: str | None = None
+    story: Story | None = None
     blocks: BlockOptions | None = None
 
     def budget(self, degree: int | None = None) -> int:
@@ -168,7 +171,7 @@ class ConvertRequest:
         degree, known = (self.ply.sh_degree or 0) if degree is None else degree, format_of(self.output or "")
         if known is not None and known.suffix == ".html":
             header, each = page_bytes(degree)
-            header += SMALLEST_VALUES if self.values else 0
+            header += (SMALLEST_VALUES if self.values else 0) + (self.story.size if self.story else 0)
         elif self.limits.max_megabytes is not None and (known is not None or is_streamed(self.output)):
             raise UsageError(
                 f"--max-megabytes needs .ply or .html output; got -o {self.output}; try --max-gaussians instead"

@@ -18,10 +18,11 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import iframe
-from vvgt_cli.gaussians.formats.page_values import Values
+from vvgt_cli.gaussians.formats.page_values import Layer, Values
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import INRIA, rule_of
+from vvgt_cli.gaussians.story import StoryLike, read_story
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord
@@ -75,6 +76,7 @@ class Result:
         sh_degree: int | None = None,
         comments: bool | None = None,
         values: bool = True,
+        story: StoryLike | None = None,
         overwrite: bool = True,
     ) -> int:
         """Write a standard ``.ply``, or another format by the ending of the name, atomically.
@@ -87,6 +89,7 @@ class Result:
             sh_degree: degree in the file, 0 to 3: missing harmonics are zeros, those above it are dropped.
             comments: describe the file in its header.
             values: a page of a conversion also holds the values of its volume, so that its look can be changed.
+            story: for a page to tell: a ``story.json`` or its content (docs/live.md).
             overwrite: replace an existing file; the default, since cells of notebooks are run again.
 
         Returns:
@@ -94,7 +97,7 @@ class Result:
 
         Raises:
             UsageError: the file exists, a value is invalid, or no format has the name's ending.
-            DataError: a library that the format needs is not installed.
+            DataError: a library that the format needs is not installed, or the story is not valid.
         """
         if is_streamed(os.fspath(path)):
             raise UsageError(
@@ -103,10 +106,15 @@ class Result:
             )
         check_outputs([Output("save", os.fspath(path), SUFFIXES, splats=True)], [], overwrite)
         ply, known = self.layout(frame, up, sh_degree, comments), format_of(path)
+        page = known is not None and known.suffix == ".html"
+        if story is not None:
+            if not page:
+                raise UsageError(f"{os.fspath(path)}: only pages show stories; expected .html, or no story")
+            ply = replace(ply, story=read_story(story).checked(self.page_layers() if values and ply.comments else ()))
         with atomic_write(path, overwrite) as temporary:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
-            held = self.values() if values and known.suffix == ".html" and ply.comments else None
+            held = self.values() if values and page and ply.comments else None
             return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path), held))
 
     def layout(
@@ -156,6 +164,10 @@ class Result:
     def values(self, run: Run | None = None, limit: float | None = None) -> Values | None:
         """Return the values of the volume for a page of at most ``limit`` bytes; None where there are none."""
         return None
+
+    def page_layers(self) -> Sequence[Layer | None]:
+        """Return the layers whose values a page holds."""
+        return ()
 
     def normals(self) -> np.ndarray | None:
         """Return the normals (K, 3) for a `.ply`, unit frame; None for zeros."""
@@ -228,6 +240,10 @@ class Conversion(Result):
                 )
                 stage.note = str(found or f"none: {why}")
         return self._values[limit]
+
+    def page_layers(self) -> Sequence[Layer | None]:
+        """Implement `Result.page_layers`."""
+        return self.field.source.page_layers
 
     def normals(self) -> np.ndarray | None:
         """Return the direction (K, 3) of the mean gradient around each Gaussian, unit frame; None without a light."""

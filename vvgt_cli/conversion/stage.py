@@ -46,9 +46,9 @@ class Work:
         ending: expected seconds of the stages after the current one.
         start: the closed form, once made, with its pyramid.
         gaussians: current Gaussians, box frame.
-        check, train: views to judge by, and to fit to, once rendered.
+        check, train: views to measure PSNR on, and to fit to, once rendered.
         train_rule, train_settings: drawing rule of the training views, and settings of their references.
-        judged: the Gaussians and check views last compared, and their PSNR (dB).
+        compared: the Gaussians and check views last compared, and their PSNR (dB).
         ply: layout of the file.
         parts, levels: Gaussians made out of core, on disk.
         live_psnr: dB of a live file as `vvgt recolor` shows it, once scored.
@@ -70,7 +70,7 @@ class Work:
     train: Views | None = None
     train_rule: Rule | None = None
     train_settings: RenderSettings | None = None
-    judged: tuple[Gaussians, Views, float] | None = None
+    compared: tuple[Gaussians, Views, float] | None = None
     weigh: Callable[[Camera], np.ndarray] | None = None
     ply: PlyOptions = dataclasses.field(default_factory=PlyOptions)
     parts: FinishedParts | None = None
@@ -101,14 +101,14 @@ class Work:
 
     def psnr(self, gaussians: Gaussians) -> float:
         """Return the PSNR (dB) on the check views; the last one is cached."""
-        assert self.check is not None, "a stage that judges stands before the check views"
-        if self.judged is None or self.judged[0] is not gaussians or self.judged[1] is not self.check:
-            self.judged = gaussians, self.check, self.check.psnr(gaussians, self.check_rule)
-        return self.judged[2]
+        assert self.check is not None, "a stage that measures PSNR stands before the check views"
+        if self.compared is None or self.compared[0] is not gaussians or self.compared[1] is not self.check:
+            self.compared = gaussians, self.check, self.check.psnr(gaussians, self.check_rule)
+        return self.compared[2]
 
     def reset(self) -> None:
         """Discard the results of all stages."""
-        self.gaussians = self.check = self.train = self.train_rule = self.train_settings = self.judged = None
+        self.gaussians = self.check = self.train = self.train_rule = self.train_settings = self.compared = None
         self.run.report.refinement = None
 
     def target_reached(self) -> bool:

@@ -23,6 +23,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.scene import PreparedVolume
+    from vvgt_cli.gaussians.formats.page_values import Layer as PageLayer
     from vvgt_cli.gaussians.formats.page_values import Values
 
 OPTICS = 12  # hexadecimal digits of `StyledVolume.optics`
@@ -168,6 +169,11 @@ class StyledVolume:
         return " + ".join(layer.name for layer in self.layers) if self.gridded else self.tf.name
 
     @property
+    def look_name(self) -> str:
+        """Name of the function of one layer, or the names of several."""
+        return self.name if len(self.layers) > 1 else self.tf.name
+
+    @property
     def labels_alone(self) -> bool:
         """Whether every layer is a label map."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
@@ -184,21 +190,25 @@ class StyledVolume:
                 "field (try --labels none to read label numbers as values)"
             )
 
+    @property
+    def page_layers(self) -> list[PageLayer | None]:
+        """Layers for a page; None: one with colours."""
+        from vvgt_cli.gaussians.formats.page_values import Layer
+
+        known = self.overall if len(self.layers) == 1 else None
+        return [
+            None if layer.colors else Layer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
+            for layer in self.layers
+        ]
+
     def values(self, room: float | None = None) -> Values | None:
         """Return the grids of all layers for a page, read part by part; None if all layers have colours.
 
         ``room``: bytes that they may take there.
         """
-        from vvgt_cli.gaussians.formats import page_values
+        from vvgt_cli.gaussians.formats.page_values import values_of
 
-        known = self.overall if len(self.layers) == 1 else None
-        layers = [
-            None
-            if layer.colors
-            else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
-            for layer in self.layers
-        ]
-        return page_values.values_of(layers, room)
+        return values_of(self.page_layers, room)
 
     def with_function(self, tf: TransferFunction) -> StyledVolume:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""
@@ -395,8 +405,7 @@ def describe_source(source: StyledVolume) -> str:
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
     light += " (its own; --light none omits it)" if light and source.lighting == source.tf.lighting else ""
-    name = source.name if len(source.layers) > 1 else source.tf.name
-    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.look_name}: {distance}{light}"
 
 
 def volume_record(source: StyledVolume) -> dict[str, Any]:
@@ -417,7 +426,7 @@ def volume_record(source: StyledVolume) -> dict[str, Any]:
 def tf_record(source: StyledVolume, request: SourceRequest) -> dict[str, Any]:
     """Return the transfer function's entry in a report."""
     return {
-        "name": source.name if len(source.layers) > 1 else source.tf.name,
+        "name": source.look_name,
         "given": request.tf is not None,
         "tf_range": request.tf_range,
         "nodes": source.tf.node_range(),

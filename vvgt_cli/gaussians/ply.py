@@ -16,6 +16,7 @@ from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
 from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, LABEL_ROW, LAYER, LAYER_ID, NXYZ, VALUES, LiveFacts
+from vvgt_cli.gaussians.story import Story
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -32,10 +33,12 @@ class PlyOptions(FileFacts):
         sh_degree: degree of the harmonics in the file, 0 to 3: missing ones are zeros, and higher ones are dropped;
             None keeps the Gaussians' own degree.
         comments: whether the header states the facts and the version.
+        story: of a page.
     """
 
     sh_degree: int | None = None
     comments: bool = True
+    story: Story | None = None
 
     def __post_init__(self) -> None:
         """Check the axis, frame and degree."""

@@ -221,8 +221,6 @@ def content_of(volume: VolumeLike, reading: Reading) -> OpenedFile:
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:
     """Return the reading options of a caller; raise UsageError if one is unknown."""
-    import numpy as np
-
     given = dict(reading)
     if unknown := sorted(set(given) - set(Reading.__annotations__)):
         raise UsageError(f"{unknown[0]}: unknown option; expected one of {', '.join(Reading.__annotations__)}")

@@ -274,7 +274,7 @@ def table_of(parsed: Any, what: str, pick: str = "") -> LabelTable:
     nested = all(one and isinstance(one, dict) and not _INTEGER.fullmatch(key) for key, one in parsed.items())
     tables = parsed if nested and parsed else {"": parsed}  # TotalSegmentator's maps by name
     if pick not in tables and (pick or len(tables) > 1):
-        raise DataError(f"{what}: {pick!r}; expected FILE#NAME with one of {', '.join(tables)[:200] or 'no names'}")
+        raise DataError(f"{what}: {pick!r}; expected FILE#NAME with one of {listed(list(tables), ', ')}")
     return _table(_entries(list((tables[pick] if pick in tables else next(iter(tables.values()))).items()), what), what)
 
 

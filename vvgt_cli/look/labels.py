@@ -175,8 +175,10 @@ class LabelTable:
             has = listed(list(known), ", ")
             raise DataError(f"{where}: none of its labels ({shown}) is in {self.name}, which has {has}")
         if missing:
+            has = listed([f"{label.number} ({label.name})" for label in self.labels], ", ")
             raise DataError(
-                f"{where}: {len(missing)} labels have no entry in {self.name}: {shown}; add them (opacity 0 hides one)"
+                f"{where}: {len(missing)} labels have no entry in {self.name}: {shown}; it has {has}; add them "
+                "(opacity 0 hides one)"
             )
         return replace(self, labels=tuple(known[n] for n in numbers if n in known))
 

@@ -35,7 +35,7 @@ def optimize(
         cameras: of the training views.
         images: (n, h, w, 4) float32 premultiplied.
         options: how, and when to stop.
-        check: cameras and images to judge by, `Blocks` of each where the images hold only those, and weights as below:
+        check: cameras and images of check views, `Blocks` of each where the images hold only those, and weights:
             what is returned is the best that they have seen, the input included. Without a check the last step's
             Gaussians are returned.
         progress: called after each step with the steps taken and expected.

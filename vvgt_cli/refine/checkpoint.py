@@ -37,11 +37,11 @@ _FAULTS = (
 STEPPED = 6  # raised when the same start and options step otherwise, or what is kept has other names
 
 
-class Judge:
-    """Judge of a run by its check views, which keeps the best state that they have seen."""
+class Checks:
+    """Checks of a run by its check views, which keeps the best state that they have seen."""
 
     def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
-        """Judge ``state`` by the views of ``check``, drawn by ``rule``; scores go into ``record``."""
+        """Compare ``state`` with the views of ``check``, drawn by ``rule``, and put scores into ``record``."""
         self.state, self.check, self.record, self.rule = state, check, record, rule
         self.best: float | None = None
         self.kept: dict[str, np.ndarray] | None = None  # of what the state has saved, its arrays
@@ -102,17 +102,17 @@ def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> 
     return found.hexdigest()
 
 
-def save(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord, walk: dict[str, Any]) -> None:
+def save(path: str, key: str, state: State, checks: Checks, record: OptimizeRecord, walk: dict[str, Any]) -> None:
     """Replace the file at ``path``, or raise DataError; ``walk`` is plain values."""
     arrays: dict[str, Any] = {f"state_{name}": array for name, array in state.saved().items()}
-    arrays |= {f"best_{name}": array for name, array in (judge.kept or {}).items()}
-    about = {"key": key, "walk": walk, "best": judge.best, "idle": judge.idle, "record": asdict(record)}
+    arrays |= {f"best_{name}": array for name, array in (checks.kept or {}).items()}
+    about = {"key": key, "walk": walk, "best": checks.best, "idle": checks.idle, "record": asdict(record)}
     with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
 
-def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord) -> dict[str, Any] | None:
-    """Fill ``state``, ``judge`` and ``record`` from the file at ``path``; returns the walk, None without a file.
+def resume(path: str, key: str, state: State, checks: Checks, record: OptimizeRecord) -> dict[str, Any] | None:
+    """Fill ``state``, ``checks`` and ``record`` from the file at ``path``; returns the walk, None without a file.
 
     Raises:
         DataError: not a checkpoint.
@@ -137,7 +137,7 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
     except _FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
-    judge.best, judge.idle, judge.kept = best, idle, kept or None
+    checks.best, checks.idle, checks.kept = best, idle, kept or None
     for field, value in described.items():
         setattr(record, field, value)
     return walk

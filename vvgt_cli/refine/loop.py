@@ -13,7 +13,7 @@ from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
-from vvgt_cli.refine.checkpoint import Judge, fingerprint, resume, save
+from vvgt_cli.refine.checkpoint import Checks, fingerprint, resume, save
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Train
 from vvgt_cli.refine.states import Densified, Fields, OnHost, OwnAxes, State
 
@@ -35,19 +35,19 @@ def run(
         _fit("check", *check)
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options, free)
-    judge = Judge(state, check, record, options.judge)
-    keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
+    checks = Checks(state, check, record, options.check_rule)
+    keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, checks)
     entered, order = time.perf_counter(), spread_views(cameras, options.seed)
     if not record.checks:
-        judge.measure(0.0)
-        record.psnr_before = judge.best
+        checks.measure(0.0)
+        record.psnr_before = checks.best
     saved = entered
     spent, began = course.elapsed, time.perf_counter() - course.elapsed
     for _ in range(record.steps):
         next(order)
     while True:
         course.elapsed = time.perf_counter() - began
-        reason = _reason(options, judge, course.elapsed, stop)
+        reason = _reason(options, checks, course.elapsed, stop)
         if reason:
             record.reason = reason
             break
@@ -61,15 +61,15 @@ def run(
             progress(record.steps, expected)
         if record.steps >= course.scored + max(options.check_every, expected // SCORES):
             course.scored = record.steps
-            if judge.measure(time.perf_counter() - began, share >= SETTLING):
+            if checks.measure(time.perf_counter() - began, share >= SETTLING):
                 course.speed *= SLOWER
         elif time.perf_counter() < saved + KEEP:
             continue
         keep()
         saved = time.perf_counter()
     keep()  # before the last score: a run that goes on from here would not have it
-    judge.measure(time.perf_counter() - began)
-    result = judge.result(gaussians)
+    checks.measure(time.perf_counter() - began)
+    result = checks.result(gaussians)
     record.seconds = spent + time.perf_counter() - entered
     return result, record
 
@@ -84,15 +84,15 @@ class _Course:
 
 
 def _checkpoint(
-    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, judge: Judge
+    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, checks: Checks
 ) -> tuple[Callable[[], None], _Course]:
     """Return the run's checkpoint and its start: the end of the last one where there is a file, else the given one."""
     path = options.checkpoint
     if path is None:
         return lambda: None, _Course()
     key = fingerprint(gaussians, options, train, check)
-    course = _Course(**(resume(path, key, state, judge, judge.record) or {}))
-    return lambda: save(path, key, state, judge, judge.record, asdict(course)), course
+    course = _Course(**(resume(path, key, state, checks, checks.record) or {}))
+    return lambda: save(path, key, state, checks, checks.record, asdict(course)), course
 
 
 def begin(
@@ -140,15 +140,15 @@ def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
     return max(steps, round(steps / share)) if options.time_budget and share > 0 else options.steps or steps
 
 
-def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
+def _reason(options: OptimizeOptions, checks: Checks, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
     """Return why to stop before the next step; None to go on."""
-    if options.steps is not None and judge.record.steps >= options.steps:
+    if options.steps is not None and checks.record.steps >= options.steps:
         return "steps"
     if options.time_budget is not None and elapsed >= options.time_budget:
         return "time"
-    if options.target_psnr is not None and judge.best is not None and judge.best >= options.target_psnr:
+    if options.target_psnr is not None and checks.best is not None and checks.best >= options.target_psnr:
         return "target"
-    if judge.idle >= options.patience:
+    if checks.idle >= options.patience:
         return "no gain"
     return "interrupted" if stop and stop() else None
 

@@ -43,7 +43,7 @@ class OptimizeOptions:
             (`vvgt_cli.refine.loss`).
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.
-        judge: by which the check views are drawn.
+        check_rule: by which the check views are drawn.
         check_every: fewest steps between two scores on the check views, of which a run takes eight or so.
         patience: scores in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
@@ -62,7 +62,7 @@ class OptimizeOptions:
     alpha: float = 0.5
     texture: float = 0.0
     rule: Rule = INRIA
-    judge: Rule = INRIA
+    check_rule: Rule = INRIA
     check_every: int = 25
     patience: int = 3
     checkpoint: str | None = None

@@ -24,7 +24,7 @@ KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
 STAGES = {  # colours of known stages, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
-    "judge": "#e3b5cd", "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
+    "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
     "write": "#777c83", "test views": "#dddddd", "conditions": "#e8e8e8", "certificate": "#c4c4c4",
 }  # fmt: skip
 OTHER = "#a05d3b"

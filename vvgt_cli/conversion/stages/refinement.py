@@ -93,7 +93,7 @@ class Refinement(Stage):
         target = work.limits.target_psnr
         options = OptimizeOptions.of(
             "axes", steps=self.most, time_budget=remaining, target_psnr=target, rule=work.train_rule,
-            judge=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
+            check_rule=work.check_rule, seed=work.fit.seed, checkpoint=work.checkpoint.descent, device=work.fit.device,
             check_every=CHECK_EVERY if target is not None else max(CHECK_EVERY, self.most // 2),
         )  # fmt: skip
         start = work.current()
@@ -121,7 +121,7 @@ def refine(
         run: gets the stage.
         start: Gaussians to improve, returned where nothing was better.
         train: views to fit to.
-        check: views to judge by.
+        check: views to measure PSNR on.
         options: options of descent.
         begin: wider Gaussians that descent begins with, and the dB of ``start`` on the check views.
         free: (K,) bool, the Gaussians that may move; None for all.

@@ -1,4 +1,4 @@
-"""The stages that render views of the volume: check views to judge by, and training views to fit to."""
+"""The stages that render views of the volume: check views to measure PSNR on, and training views to fit to."""
 
 from __future__ import annotations
 

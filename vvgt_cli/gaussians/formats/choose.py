@@ -106,7 +106,9 @@ def encoded(
             warnings.warn(f"{name}: {why}; only the current look was written", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     splats = splats_of(gaussians, known.layout(options))
-    return known.write(splats, name) if values is None else page_look.html(splats, name, values, options)
+    if known.write is page_look.html:
+        return page_look.html(splats, name, values, options)
+    return known.write(splats, name)
 
 
 def is_splats(path: str | Path) -> bool:

@@ -227,7 +227,9 @@ def iframe(content: bytes, name: str) -> str:
     """Return an iframe for notebooks that shows a page without access to the enclosing page or the network."""
     text = escape(content.decode("utf-8"))
     style = "width: 100%; height: 540px; border: 0; background: #000"
-    allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen; clipboard-write; xr-spatial-tracking"'
+    allowed = (
+        'sandbox="allow-scripts allow-downloads" allow="fullscreen; clipboard-write; web-share; xr-spatial-tracking"'
+    )
     return f'<iframe title="{escape(name)}" {allowed} style="{style}" srcdoc="{text}"></iframe>'
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import repeat
 from typing import Any
@@ -13,13 +13,14 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
-from vvgt_cli.gaussians.formats.page_presets import function_nodes
+from vvgt_cli.gaussians.formats.page_presets import function_nodes, told
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, Lighting
 from vvgt_cli.look.readers.minimal import read
+from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
@@ -44,6 +45,7 @@ def contents(options: PlyOptions, name: str, names: Sequence[str] = (), values: 
     stated = [one["title"] for one in values.facts if one["title"]] if values else list(names)
     parts += [f"the names {listed(stated, ', ', 3)}"] if stated else []
     parts += ["a checksum of the volume"] if options.certificate else []
+    parts += [f"a story of {len(options.story.steps)} steps"] if options.story else []
     return f"{name} holds {', '.join(parts)}; its title is {options.title or title_of(name)!r} (--title)"
 
 
@@ -56,11 +58,12 @@ def html(splats: Splats, name: str, values: Values | None = None, options: PlyOp
 
 
 def page_contents(values: Values | None, options: PlyOptions) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Return the contents of elements by their ids, and entries of the scene, for the values of a volume."""
+    """Return the contents of elements by their ids, and entries of the scene, for a volume's values and a story."""
+    story: dict[str, Any] = {"story": options.story.steps} if options.story else {}
     if values is None:
-        return {}, {}
+        return {}, story
     look = {} if values.look is None else {"look": look_entry(values, options)}
-    return values.elements, values.scene | look
+    return values.elements, values.scene | look | story
 
 
 def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
@@ -69,7 +72,7 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
         (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
         for cloud, gaussians, options in clouds
     ]
-    return html_of_several(baked, name)
+    return html_of_several(baked, name, *page_contents(None, clouds[0][2]))
 
 
 def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
@@ -78,19 +81,20 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
     scale, axes = options.scale or 1.0, _axes(upright(options).up)
     if options.light is not None and options.light.headlight + len(options.light.directions) > 1:
         warnings.warn("the page shows one light at a time under other looks, and begins with the first", stacklevel=2)
-    first = values.facts[0]
+    steps = options.story.steps if options.story else ()
+    first, shown = values.facts[0], {str(step.get("function")) for step in steps}
     half = np.linalg.norm(np.reshape(first["affine"], (3, 4))[:, :3], axis=0) * first["dims"] * scale / 2
     return {
         "layers": [
-            _layer_entry(layer, scale, offered)
+            _layer_entry(layer, scale, offered, shown)
             for layer, offered in zip(values.look.layers, values.offered or repeat({}), strict=False)
         ],
         "light": _light(options.light, axes), "axes": axes.tolist(), "box": [(-half).tolist(), half.tolist()],
     }  # fmt: skip
 
 
-def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a layer of `look_entry`; ``offered``: of `page_presets.offers`."""
+def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any], shown: Collection[str]) -> dict[str, Any]:
+    """Return a layer of `look_entry`; of what `page_presets.offers` returned; ``shown``: by a story."""
     distance = layer.distance or 1.0
     entry: dict[str, Any] = {
         "title": layer.name, "labels": [label.page_entry() for label in layer.labels],
@@ -98,7 +102,12 @@ def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any]) -> 
         "histogram": list(layer.histogram), "name": layer.baked().get("name", ""),
         "unit_distance": distance * scale, "opacity_unit_distance": distance, "nodes": [],
     }  # fmt: skip
-    return entry if layer.labels else entry | {"nodes": nodes_of(layer)} | offered
+    if layer.labels:
+        return entry
+    presets = list(offered.get("presets", ()))
+    known = {one["name"] for one in presets}
+    presets += [told(name, layer, distance, 2 / scale) for name in names() if name in shown and name not in known]
+    return entry | {"nodes": nodes_of(layer)} | offered | {"presets": presets}
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:

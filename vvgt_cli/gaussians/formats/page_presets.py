@@ -65,15 +65,30 @@ def presets_of(facts: LiveFacts, distance: float, edge: float, kind: str, name: 
         tf = named_function(name)
         if tf.otherwise is not None and not hounsfield:  # a guess
             continue
-        tf = resolve(tf, known, hounsfield=True)
-        assert tf.opacity_unit_share is not None
-        times = distance / (edge * tf.opacity_unit_share)
-        tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
-        light = tf.lighting and {key: getattr(tf.lighting, key) for key in _HEADLIGHT}
+        tf = _per(resolve(tf, known, hounsfield=True), distance, edge)
         if tf.support(facts.lo, facts.hi) and not _is_own(tf, facts):
-            about = {"name": name, "title": titles()[name], "shows": named[name]}
-            found.append(about | {"nodes": function_nodes(tf, FEW), "light": light})
+            found.append(_entry(name, tf))
     return _by_shares(facts)[: 0 if hounsfield else 1 if found else None] + found
+
+
+def told(name: str, facts: LiveFacts, distance: float, edge: float) -> dict[str, Any]:
+    """Return a named function as `presets_of` does, without a picture, whatever the values are."""
+    hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(facts.statistics()))
+    tf = resolve(named_function(name), facts.statistics(), hounsfield=hounsfield)
+    return _entry(name, _per(tf, distance, edge))
+
+
+def _per(tf: TransferFunction, distance: float, edge: float) -> TransferFunction:
+    """Return one of our functions with opacity per a distance, in a box of a longest edge."""
+    assert tf.opacity_unit_share is not None
+    return replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, distance / (edge * tf.opacity_unit_share)))
+
+
+def _entry(name: str, tf: TransferFunction) -> dict[str, Any]:
+    """Return a function of ours as the page has it."""
+    light = tf.lighting and {key: getattr(tf.lighting, key) for key in _HEADLIGHT}
+    about = {"name": name, "title": titles()[name], "shows": names()[name]}
+    return about | {"nodes": function_nodes(tf, FEW), "light": light}
 
 
 def _by_shares(facts: LiveFacts) -> list[dict[str, Any]]:

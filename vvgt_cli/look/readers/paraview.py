@@ -15,11 +15,12 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.function import SPACES, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.fields import Elements, attribute, named, rgb, table
+from vvgt_cli.volume.components import listed
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
 RAMP = " (opacity not in the file: linear ramp)"  # behind the name of a function
+LISTED = 60  # names in an error
 UNUSED = ("IndexedColors", "UseAboveRangeColor", "UseBelowRangeColor")
-LISTED, LONGEST = 60, 1000  # names, characters of them, in an error
 # other names in files: of VTK, of older ParaViews' presets and XML
 OTHER_NAMES = {"ciede2000": "Lab/CIEDE2000", "cielab": "Lab", "wrapped": "HSV", "wrapped hsv": "HSV", "hsvwrap": "HSV"}
 SPACE_OF = {name.lower(): name for name in SPACES} | OTHER_NAMES
@@ -113,15 +114,11 @@ def _of_xml(parsed: Elements, what: str) -> list[dict[str, Any]]:
 def choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any]:
     """Return the preset that ``pick`` names, or the only one."""
     names = [str(p.get("Name", "")) for p in presets]
+    has = listed(list(map(repr, names)), ", ", LISTED)
     if pick:
         if pick not in names:
-            raise DataError(f"{what}: no preset {pick!r}; it has {_listed(names)}")
+            raise DataError(f"{what}: no preset {pick!r}; it has {has}")
         return presets[names.index(pick)]
     if len(presets) > 1:
-        raise DataError(f"{what}: {len(presets)} presets, {_listed(names)}; pick one as FILE#NAME")
+        raise DataError(f"{what}: {len(presets)} presets, {has}; pick one as FILE#NAME")
     return presets[0]
-
-
-def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(n) for n in names[:LISTED])
-    return shown[:LONGEST] + (", ..." if len(names) > LISTED or len(shown) > LONGEST else "")

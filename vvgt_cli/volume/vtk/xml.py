@@ -34,6 +34,7 @@ _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vt
 DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
 GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
 HIDDEN = {"point": 2, "cell": 32}
+TAIL = 4096  # bytes in which a file with appended data ends
 
 
 @dataclass
@@ -99,6 +100,10 @@ def scan(path: Path) -> Scan:
         with open(path, "rb") as file:
             file.seek(found.data_start)
             mark = re.match(rb"[^>]*>\s*_", file.read(4096))
+            file.seek(max(path.stat().st_size - TAIL, 0))
+            ends = b"</VTKFile" in file.read()
+        if not ends:  # VTK's readers leave what is missing as it is in memory
+            raise DataError(f"{path}: it does not end with </VTKFile>; the file was cut off, copy or write it again")
         if mark is None:  # VTK's reader would begin elsewhere
             raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
         found.data_start += mark.end()

@@ -1,5 +1,5 @@
 // What is shown: a list of names and values, of what the file says of itself.
-import { shown } from './facts.mjs';
+import { DIAGNOSIS, isMedical, shown } from './facts.mjs';
 import { edgesOf, tiltOf } from './volume.mjs';
 
 export function rowsOf(name, { facts, world, count, look, values }) {
@@ -9,6 +9,7 @@ export function rowsOf(name, { facts, world, count, look, values }) {
   return [
     ['name', name],
     ['contains', ['Gaussians', ...(values ? ['values of the volume'] : []), ...(kinds.has('labels') ? ['names of labels'] : []), ...(facts.quality ? ['a checksum of the volume'] : [])].join(', ')],
+    ['use', isMedical(world, values) && DIAGNOSIS],
     ['look', look ? `${[...kinds, 'light'].join(' and ')} can be changed` : 'fixed'],
     ['function', look ? look.layers.map(({ name }) => name).filter(Boolean).join('; ') : facts.function],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],

@@ -63,6 +63,9 @@ export function worldOf(facts, enlarged = 1) {
   };
 }
 
+export const DIAGNOSIS = 'not for diagnosis';
+export const isMedical = ({ anatomical }, values) => anatomical || Boolean(values?.some?.(({ unit }) => unit === 'HU'));
+
 // A length or a coordinate as it is read
 export function shown(x, digits = 4) {
   const text = String(Number(x.toPrecision(digits)));

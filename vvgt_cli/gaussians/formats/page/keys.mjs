@@ -12,6 +12,7 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
     ...(picks ? [['click', `show the position${live ? ' and the value or label' : ''} there`], ['Enter', 'click in the middle of the view'], ['double click', 'turn about that point from now on']] : []),
     ['arrow keys', 'turn; with Shift: move'], ['+ −', 'zoom'],
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
+    ['Page Up and Down, swipe', 'previous and next step of a story'],
     ...(live?.next ? [['K', 'switch between colours, MIP and X-ray']] : []),
     ...(live ? [['Ctrl+Z', 'undo']] : []),
     ...(sliced ? [['in a slice', 'drag across for the window, up or down for the level; click to move the cross; wheel or arrow keys to step; Ctrl and wheel, pinch or + − to zoom, 0 for all of it; right drag, two fingers or Shift and arrow keys to move; double click or Enter to enlarge']] : []),

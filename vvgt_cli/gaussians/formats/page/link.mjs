@@ -1,4 +1,4 @@
-// A link that restores what is seen: #marks=...&slices=...&view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
+// A link that restores what is seen: #story=...&step=...&marks=...&slices=...&view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
 // which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 
@@ -60,16 +60,23 @@ export function copied(text) {
   return done;
 }
 
-// what the address says, else what a saved page begins with
-export async function restore(parts, begins = '') {
-  let said;
-  try {
-    const hash = location.hash.slice(1), plain = hash.includes('=') ? hash : decodeURIComponent(hash);  // some programs encode a link whole
-    said = new Map((/(^|&)view=/.test(plain) ? plain : begins).split('&').map((part) => [part.split('=')[0], decodeURIComponent(part.slice(part.indexOf('=') + 1))]));
-  } catch { return; }  // not a link of ours
-  if (!said.has('view')) return;
+// the texts of a link's parts by their keys
+export const partsOf = (link) => new Map(link.split('&').map((part) => [part.split('=')[0], decodeURIComponent(part.slice(part.indexOf('=') + 1))]));
+
+export async function put(parts, said) {
   for (const { key, get, set } of parts) {
     const text = said.get(key) ?? '';
     if (text !== decodeURIComponent(get())) await Promise.resolve(text).then(set).catch(() => {});  // a damaged part is left as it is
   }
+}
+
+// what the address says, else what a saved page begins with; returns whether there is any
+export async function restore(parts, begins = '') {
+  let said;
+  try {
+    const hash = location.hash.slice(1), plain = hash.includes('=') ? hash : decodeURIComponent(hash);  // some programs encode a link whole
+    said = partsOf(/(^|&)view=/.test(plain) ? plain : begins);
+  } catch { return false; }  // not a link of ours
+  if (said.has('view')) await put(parts, said);
+  return said.has('view');
 }

@@ -30,7 +30,7 @@ function nodesFrom({ points }) {
   });
 }
 
-// views: {name: shows that view}; axes: of the file's world in the viewer's; returns say(what, facts), to the site
+// views: {name: shows that view}; axes: of the file's world in the viewer's; returns say(what, facts), to the site, and apply(what), of a message
 export function messages({ live, lens, views, axes, moving }, app) {
   const say = (vvgt, facts) => { if (parent !== window) parent.postMessage({ vvgt, ...facts }, '*'); };
   const toWorld = (d) => axes().map((axis) => dot(axis, d)), fromWorld = (d) => [0, 1, 2].map((c) => axes().reduce((sum, axis, k) => sum + axis[c] * d[k], 0));
@@ -75,17 +75,21 @@ export function messages({ live, lens, views, axes, moving }, app) {
       layer.set(to);
     },
   };
+  function apply(data) {
+    for (const key of Object.keys(set).filter((name) => data[name] !== undefined)) {
+      const layer = live?.layers[data.layer ?? 0];
+      if (key !== 'camera' && !layer) throw new Error(live ? `layer ${data.layer}: not there` : `${key}: cannot be changed on this page`);
+      try {
+        set[key](data[key], layer);
+      } catch (error) { throw error instanceof TypeError ? new Error(`${key}: not in the documented form (${error.message})`) : error; }
+    }
+    moving();
+  }
   addEventListener('message', ({ source, data }) => {
     if (source !== parent || parent === window || data?.vvgt !== 'set') return;
-    let key;
     try {
-      for (key of Object.keys(set).filter((name) => data[name] !== undefined)) {
-        const layer = live?.layers[data.layer ?? 0];
-        if (key !== 'camera' && !layer) throw new Error(live ? `layer ${data.layer}: not there` : `${key}: cannot be changed on this page`);
-        set[key](data[key], layer);
-      }
-      moving();
-    } catch (error) { say('error', { message: error instanceof TypeError ? `${key}: not in the documented form (${error.message})` : error.message }); }
+      apply(data);
+    } catch ({ message }) { say('error', { message }); }
   });
   let told = '', last = 0;
   if (parent !== window) {
@@ -98,7 +102,7 @@ export function messages({ live, lens, views, axes, moving }, app) {
     });
   }
   return {
-    say,
+    say, apply,
     loaded() {
       const now = state();
       told = JSON.stringify(now);

@@ -1,7 +1,10 @@
 // The picture as a PNG: what the engine draws, and the drawing over it.
-async function drawingOf(svg, scale) {
+import { label } from './svg.mjs';
+
+async function drawingOf(svg, scale, under) {
   const copy = svg.cloneNode(true), { width, height } = svg.getBoundingClientRect();
   for (const [key, value] of Object.entries({ xmlns: 'http://www.w3.org/2000/svg', width: width * scale, height: height * scale, viewBox: `0 0 ${width} ${height}` })) copy.setAttribute(key, value);
+  if (under) copy.append(label(under, width / 2, height - 5, { 'font-size': 11, 'text-anchor': 'middle', opacity: 0.8 }));
   const image = new Image();
   image.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
   await image.decode();
@@ -38,10 +41,10 @@ async function drawn(app, size) {
 }
 const tooLarge = (size) => new Error(`this browser cannot draw ${size.join(' × ')} px: choose a smaller picture`);
 
-// a PNG of `size`, by default the window's, of the volume itself where that is shown
-export const pictureOf = ({ app }, svg, size, look) => alone(async () => {
+// a PNG of `size`, by default the window's, of the volume itself where that is shown, with a line `under` it
+export const pictureOf = ({ app }, svg, size, look, under = '') => alone(async () => {
   const { canvas } = app.graphicsDevice, all = size ?? [canvas.width, canvas.height], picture = await (look?.shows ? look.picture(all) : drawn(app, all));
-  picture.getContext('2d').drawImage(await drawingOf(svg, all[0] / canvas.clientWidth), 0, 0, ...all);
+  picture.getContext('2d').drawImage(await drawingOf(svg, all[0] / canvas.clientWidth, under), 0, 0, ...all);
   const blob = await new Promise((done) => picture.toBlob(done, 'image/png'));
   if (!blob) throw tooLarge(all);
   return blob;

@@ -1,19 +1,21 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
 import { rowsOf } from './about.mjs';
-import { factsOf, worldOf } from './facts.mjs';
+import { DIAGNOSIS, factsOf, isMedical, worldOf } from './facts.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
 import { firstAngles, stayFree } from './free.mjs';
 import { handlesOf } from './handles.mjs';
 import { helpRows, listed, listen } from './keys.mjs';
 import { lensOf } from './lens.mjs';
 import { messages } from './messages.mjs';
-import { copied, frameParts, linkOf, liveParts, restore, saidBy, viewParts } from './link.mjs';
+import { frameParts, linkOf, liveParts, restore, saidBy, viewParts } from './link.mjs';
 import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
+import { sharing } from './share.mjs';
 import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
 import { slicesOf } from './slices.mjs';
+import { storyOf } from './story.mjs';
 import { element } from './svg.mjs';
 
 const LEFT = 12, NARROW = 700;  // px; of a picture in which the panel would lie over what is clicked
@@ -23,7 +25,7 @@ const ICONS = {
   perspective: icon('M2 15L6 4h6l4 11Z'), orthographic: icon('M3.5 3.5h11v11h-11Z'), measure: icon('M2.5 12.5l10-10 3 3-10 10ZM6 9l1.5 1.5M9 6l1.5 1.5'),
   picture: icon('M2 6h3l1.5-2h5L13 6h3v9H2ZM9 7.5a2.5 2.5 0 1 0 .01 0'), link: icon('M7.5 10.5l3-3M8 5l2-2a3 3 0 0 1 5 4l-2.5 2M10 13l-2 2a3 3 0 0 1-5-4l2.5-2'),
   fit: icon('M3 6V3h3M12 3h3v3M15 12v3h-3M6 15H3v-3M6.5 6.5h5v5h-5Z'), reset: icon('M4 3v4h4M4.2 7A5.5 5.5 0 1 1 3.6 10.5'), help: icon('M6.3 6.3a2.8 2.8 0 1 1 3.9 2.5Q9 9.4 9 11M9 13.5v.5'),
-  slices: icon('M2.5 2.5h13v13h-13ZM9 2.5v13M2.5 9h13'), full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
+  slices: icon('M2.5 2.5h13v13h-13ZM9 2.5v13M2.5 9h13'), share: icon('M9 11V2M6 5l3-3 3 3M5 8H3.5v7.5h11V8H13'), story: icon('M3 3h12v9H8l-3 3v-3H3ZM6 6h6M6 9h4'), full: icon('M3 7V3h4M11 3h4v4M15 11v4h-4M7 15H3v-4'), about: icon('M9 8v5M9 5v.5M9 1.5a7.5 7.5 0 1 0 .01 0'),
 };
 
 export function where(viewer, scene, live, show, grids) {
@@ -45,7 +47,7 @@ export function where(viewer, scene, live, show, grids) {
   const frame = () => (show ? document.querySelector('#series select').selectedIndex : 0);
   const again = (text = '') => { told = text; stamp++; app.renderNextFrame = true; };
   const name = () => scene.frames[frame()].name.replace(/\.(ply|html)$/, '').replace(/[^\w.-]+/g, '-');
-  const marks = marksOf(() => world, () => again(), window.vvgtSource ? () => save(pageOf(window.vvgtSource, saidBy(parts)), `${name()}.html`) : null);
+  const saved = window.vvgtSource ? () => save(pageOf(window.vvgtSource, saidBy(parts)), `${name()}.html`) : null, marks = marksOf(() => world, () => again(), saved);
   box.after(marks.root);
   let clicked = null;
   const pick = pickerOf(lens, () => world, dataNow, live?.look ?? null, (place) => {
@@ -67,7 +69,8 @@ export function where(viewer, scene, live, show, grids) {
     },
   });
   let faced = 'null';
-  const parts = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const seen = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const story = storyOf({ lens, live, seen, apply: (what) => site.apply(what), slices, moving: again, begins: scene.story, page: saved }), parts = [...story.parts, ...seen];
 
   if (live) live.begins = () => saidBy(parts.filter(({ key }) => !/^(function|labels|light|drawn)/.test(key)));  // of a page that the server makes for the look
 
@@ -123,7 +126,11 @@ export function where(viewer, scene, live, show, grids) {
   const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(true));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume', 's', () => slices.toggle());
-  const picture = (size) => pictureOf(viewer, svg, size, live?.look).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
+  const drawing = (size) => pictureOf(viewer, svg, size, live?.look, isMedical(world, scene.values) ? DIAGNOSIS : '');
+  const picture = (size) => drawing(size).then((blob) => {
+    save(blob, `${name()}.png`);
+    if (origin === 'null' && parent !== window) again('no file? This frame forbids downloads: copy the picture (e), or open the page in a tab of its own');
+  }, ({ message }) => again(message));
   sizes.of(button('picture', 'save a picture (PNG)', 'p', () => {
     sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
       const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
@@ -133,12 +140,10 @@ export function where(viewer, scene, live, show, grids) {
     sizes.toggle();
     sizes.root.querySelector('button').focus();
   }));
-  button('link', 'copy a link to this view', 'l', () => {
-    const link = linkOf(parts);
-    try { history.replaceState(null, '', link); } catch { /* a frame without an address of its own */ }
-    again(copied(link) ? 'link to this view copied' : parent === window ? 'the address bar now links to this view' : 'this frame is not allowed to copy a link');
-    setTimeout(again, 4000);
-  }).hidden = location.protocol === 'about:';  // of a notebook's cell, which has no address
+  const shared = sharing({ link: () => linkOf(parts), picture: () => drawing(), name, say: again });
+  button('link', 'copy a link to this view', 'l', shared.link).hidden = location.protocol === 'about:';  // of a notebook's cell, which has no address
+  shared.of(button('share', 'share the picture or the page', 'e', shared.toggle));
+  story.write.of(button('story', 'write a story', 't', story.write.toggle));
   const whole = document.documentElement;
   if (document.fullscreenEnabled && whole.requestFullscreen) button('full', 'full screen', '', () => (document.fullscreenElement ? document.exitFullscreen() : whole.requestFullscreen()).catch(() => {}));
   for (const kind of ['VR', 'AR']) {
@@ -160,14 +165,14 @@ export function where(viewer, scene, live, show, grids) {
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
   const act = Object.fromEntries(buttons.filter(({ key, made }) => key && !made.hidden).map(({ key, press }) => [key, press]));
-  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => measure(false), again);
+  listen(lens, { ...act, ...(live?.next ? { k: live.next } : {}), pagedown: story.next, pageup: story.back, '?': help.toggle, enter: ({ target }) => target === lens.canvas && pick(...lens.middle) }, () => measure(false), again);
   const views = Object.fromEntries(['front', 'left', 'top'].flatMap((name, k) => [[name, () => view(k, false)], [['back', 'right', 'bottom'][k], () => view(k, true)]]));
   const site = messages({ live, lens, views: { ...views, fit: () => look(lens.pose()), reset: act.r }, axes: () => world.axes, moving: again }, app);
   lens.canvas.addEventListener('dblclick', () => {
     if (clicked && !marks.open) lens.set({ ...lens.pose(), target: clicked.place });
   });
   for (const event of ['focus', 'blur']) lens.canvas.addEventListener(event, () => { if (marks.open) again(told); });
-  addEventListener('hashchange', () => restore(parts).then(again));
+  addEventListener('hashchange', () => restore(parts).then(() => again()));
 
   function legend(group, wide, high) {
     const baked = live ? null : facts.legend, boxes = buttons.map(({ made }) => made.getBoundingClientRect()), low = Math.max(...boxes.map((one) => one.bottom));
@@ -225,6 +230,6 @@ export function where(viewer, scene, live, show, grids) {
   addEventListener('resize', spread);
   const fit = stayFree(lens, scene, draw);
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, restored: restore(parts, scene.link), link: () => linkOf(parts), picture: (size) => pictureOf(viewer, svg, size, live?.look), get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, story, restored: restore(parts, scene.link).then((found) => found || story.begin()), link: () => linkOf(parts), picture: drawing, get world() { return world; }, get facts() { return facts; } });
   return state;
 }
