@@ -450,6 +450,9 @@ def test_the_value_under_the_pointer_is_the_nearest_voxels(
     values = person("eval", f"{world.tolist()}.map((place) => window.vvgt.where.slices.found(place)?.value)")
     np.testing.assert_array_equal(values, data[tuple(np.round(index).astype(int).T)])
     middle = np.round(index) @ affine[:3, :3].T + affine[:3, 3]
+    person(
+        "eval", "(({ lens }) => window.vvgt.live.look.pick(lens.ray(...lens.middle)))(window.vvgt.where)"
+    )  # reads grids
     at = "(place) => window.vvgt.live.look.at(window.vvgt.where.world.at(place)).value"
     np.testing.assert_allclose(person("eval", f"{middle.tolist()}.map({at})"), values, atol=1e-6)
 
