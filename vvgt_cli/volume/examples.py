@@ -56,7 +56,7 @@ def _bundled(name: str, filename: str) -> Maker:
         for folder in folders:
             path = Path(folder) / "examples" / filename
             if path.is_file():
-                return read_volume(str(path), options)
+                return read_volume(str(path), replace(options, crop=None, mask=None, keep_largest=None))  # done later
         raise DataError(f"example:{name}: pyvista is installed without examples/{filename}; install pyvista >= 0.45")
 
     return make
