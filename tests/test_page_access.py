@@ -54,18 +54,19 @@ READ = """(async () => {
   return window.vvgt.where.clicked?.world;
 })()"""
 STOP = "document.querySelector('#live linearGradient').lastElementChild.getAttribute"
-DRAWN = (
-    "[...document.querySelectorAll('#live .presets canvas')].every((one) => one.getContext('2d')"
-    ".getImageData(0, 0, 84, 84).data.some((x, k) => x && k % 4 < 3))"
-)
+DRAWN = "[...document.querySelectorAll('#live .presets img')].every((one) => one.complete && one.naturalWidth === 84)"
 NAMES = "[...document.querySelectorAll('#live .presets button')].map((one) => one.textContent)"
 CHOSEN = "[document.activeElement.textContent, document.activeElement.getAttribute('aria-pressed')]"
-PICTURE = "document.activeElement.querySelector('canvas').toDataURL().split(',')[1]"
+PICTURE = """(() => {
+  const made = Object.assign(document.createElement('canvas'), { width: 84, height: 84 });
+  made.getContext('2d').drawImage(document.activeElement.querySelector('img'), 0, 0);
+  return made.toDataURL().split(',')[1];
+})()"""
 SEEN = "(({ middle, canvas }) => [middle, canvas.clientWidth, canvas.clientHeight])(window.vvgt.where.lens)"
 
 
 def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: Path) -> None:
-    """A scan of the file's function over soft tissue: the pictures are what the page then shows."""
+    """A scan of the file's function over soft tissue: pictures, there at once, are near what is then seen."""
     nib = pytest.importorskip("nibabel")
     radius = np.linalg.norm(np.stack(np.meshgrid(*3 * [np.linspace(-1, 1, 24)], indexing="ij")), axis=0)
     values = np.select([radius < 0.4, radius < 0.55, radius < 0.8], [40.0, 900.0, 60.0], -1000.0)
@@ -79,10 +80,10 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     assert place is not None
     person("eval", "document.querySelector('#live .preset').focus()")
     person("press", "Enter")
-    person("until", DRAWN)
+    assert person("eval", DRAWN)
     assert np.abs(person.picture(tmp_path, "drawn.png") - before).max() < 0.02  # as it was
     assert person("eval", READ) == place  # still under the function that is chosen
-    named = ["as in the file", "ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "step", "ramp", "band"]
+    named = ["as in the file", "bone", "soft tissue", "vessels", "lungs"]
     assert person("eval", NAMES) == named
     assert person("axe") == []
     pictures = []
@@ -100,12 +101,12 @@ def test_presets_have_pictures_and_are_chosen_by_keys(person: Person, tmp_path: 
     for k, (wanted, small) in enumerate(pictures):
         own, other = psnr(wanted, small), psnr(pictures[1 - k][0], small)
         print(f"{person.size} {named[k + 1]}: {own:.1f} dB from what the page shows then, {other:.1f} from the other")
-        assert own > max(24, other + 6)
+        assert own > max(16, other + 3)  # from another side, of a ball
     assert person("eval", "[window.vvgt.live.lamp.state().kind, window.vvgt.live.nodes()[0].x]") == ["none", -30]
     right = "document.querySelector('#live .function svg').getBoundingClientRect().right"
     dots = "[...document.querySelectorAll('#live .node .dot')].map((dot) => dot.getBoundingClientRect().right)"
     assert person("eval", f"Math.max(...{dots}) < {right}")  # of 3000 HU, too, beyond all values
-    assert person("eval", "window.vvgt.live.at().named().name") == named[2]  # as what is saved is named
+    assert person("eval", "window.vvgt.live.at().named().name") == "ct-soft-tissue"  # as what is saved is named
     offset, color = person("eval", f"[{STOP}('offset'), {STOP}('stop-color')]")
     assert offset == "1"  # of 900 HU, the greatest value
     np.testing.assert_allclose(list(bytes.fromhex(color[1:])), (245, 217, 173), atol=8)

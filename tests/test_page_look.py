@@ -1,5 +1,7 @@
 """The look of a page: what it holds, and its program's arithmetic against ours."""
 
+import base64
+import io
 import json
 import re
 import shutil
@@ -10,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.test_live import COLORS, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
-from vvgt_cli.gaussians.formats.page_look import html, nodes_of, presets_of
+from vvgt_cli.gaussians.formats.page_look import html, nodes_of
+from vvgt_cli.gaussians.formats.page_presets import Sketch, kind_of, presets_of
 from vvgt_cli.gaussians.formats.page_values import Layer, values_of
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.frames import up_matrix
@@ -43,6 +47,7 @@ def options(**given: Any) -> PlyOptions:
     return replace(PlyOptions(up="y", scale=0.1, unit_distance=0.5, affine=affine), **given)
 
 
+SHARES = ["soft surface", "hard surface", "one layer"]
 CT = ["ct-bone", "ct-soft-tissue", "ct-vessels", "ct-lung", "ct-skin"]
 
 
@@ -51,7 +56,7 @@ def presets(
 ) -> list[dict[str, Any]]:
     """Presets of a scan of a function, per a distance so many times as long as theirs."""
     known = replace(facts(), lo=-1000.0, hi=400.0, unit=unit, function=function_text(function, -1000.0, 400.0), **more)
-    return presets_of(known, {"name": name, "unit_distance": longer * 2 / 256})
+    return presets_of(known, longer * 2 / 256, 2.0, kind_of(known, Volume(np.zeros((2, 2, 2)))), name)
 
 
 def test_presets_suit_the_values_and_are_those_that_the_file_does_not_have() -> None:
@@ -64,10 +69,14 @@ def test_presets_suit_the_values_and_are_those_that_the_file_does_not_have() -> 
     assert (nodes[250], nodes[450]) == (0.06, 0.25)
     assert [found["name"] for found in presets(bone, "ct-skin")] == CT[1:]
     assert [found["name"] for found in presets(skin, "ct-skin", longer=2)] == CT
-    assert [presets(bone, name, unit="") for name in ("ct-bone", "bone")] == [[], []]
+    for name in ("ct-bone", "bone"):
+        assert [found["title"] for found in presets(bone, name, unit="")] == SHARES
     scan = tuple(np.histogram(np.repeat([-995, 40.0], [300, 200]), 256, (-1000, 400))[0].tolist())
     assert [found["name"] for found in presets(bone, "bone", unit="", histogram=scan)] == CT[1:]
-    assert presets(bone, "bone", unit="K", histogram=scan) == []
+    assert [found["title"] for found in presets(bone, "bone", unit="K", histogram=scan)] == SHARES
+    found = presets_of(replace(facts(), function=function_text(RAMP, LO, HI), histogram=scan), 1, 2, "mr")
+    assert [one["name"] for one in found] == [*SHARES[:1], "mr-head", "mr-angio"]
+    assert found[0]["light"] == {"ambient": 0.2, "diffuse": 1.0, "specular": 0.0}
 
 
 @pytest.mark.parametrize("longer", [0.2, 8, 16])
@@ -148,3 +157,31 @@ def test_the_pages_program_looks_values_up_as_the_ray_caster_does(tf: TransferFu
 def test_the_pages_program_exposes_an_x_ray_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
     found = by_the_page(tf, tmp_path, "console.log(exposed(layer.nodes, layer));")
     assert float(found) == pytest.approx(exposed_distance(tf, facts(tf).statistics(), 2.0), rel=1e-6)
+
+
+def test_small_pictures_show_what_their_functions_do() -> None:
+    """A ball in a block of which one function shows the ball, one the block; the eye is before and left of the body."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (20, 24, 28)], indexing="ij")
+    values = np.where(np.hypot(x - 0.5, np.hypot(y, z)) < 0.35, 100.0, np.where(np.abs(z) < 0.5, 40.0, 0.0))
+    volume = Volume(values.astype(np.float32), spacing=(24 / 28, 1.0, 1.2), space="LPS")
+    colors = ColorMap(np.array([60.0, 80.0]), np.array([[0, 0, 1.0], [1.0, 0, 0]]))
+    both = TransferFunction("both", PiecewiseOpacity(np.array([10.0, 30]), np.array([0.0, 0.9])), colors)
+    ball = replace(both, opacity_nodes=PiecewiseOpacity(np.array([70.0, 80]), np.array([0.0, 0.9])))
+    sketch = Sketch(values, volume.affine[:3], volume.extent, volume.space)
+    red, blue = {}, {}
+    for name, tf in (("both", both), ("ball", ball)):
+        address = sketch.picture(tf, 1.0, max(volume.extent), None)
+        assert len(address) < 4000
+        content = base64.b64decode(address.removeprefix("data:image/webp;base64,"))
+        pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.float32) / 255
+        red[name], blue[name] = (np.argwhere(pixels[..., c] > pixels[..., 2 - c] + 0.3) for c in (0, 2))
+    assert len(red["both"]) < 60 < len(red["ball"])
+    assert len(blue["both"]) > 1000 > 0 == len(blue["ball"])
+    row, column = red["ball"].mean(axis=0)  # the left of the body is on the right
+    assert column > 50
+    assert row == pytest.approx(41.5, abs=8)
+    lit = sketch.picture(ball, 1.0, max(volume.extent), {"ambient": 0.0, "diffuse": 1.0})
+    shades = np.asarray(Image.open(io.BytesIO(base64.b64decode(lit.split(",")[1]))).convert("RGB"), np.float32)[..., 0]
+    rows, columns = red["ball"].T
+    edge, middle = shades[rows, columns].min(), shades[round(row), round(column)]
+    assert middle > 180 > 140 > edge

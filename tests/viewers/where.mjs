@@ -1,6 +1,6 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "motion": whether pages may turn of themselves, "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; served URL (of vvgt view); refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; calm (less motion is asked for); wheel DY; drag X Y X Y; resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; served URL (of vvgt view); refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; twice X Y; hover X Y; calm (less motion is asked for); wheel DY [KEY]; drag X Y X Y [BUTTON]; pinch X Y FROM TO (two fingers, px apart); resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); axe (findings of axe-core); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads);
 // frame URL (a page that shows one in a frame), within JS (in that frame); framed URL STEPS (eval, click and until in the frame of a site; their answers).
 import fs from 'node:fs';
@@ -58,10 +58,21 @@ const steps = {
     if (at.length === 1) return job.touch ? page.tap(at[0]) : page.click(at[0]);
     return job.touch ? page.touchscreen.tap(...at) : page.mouse.click(...at);
   },
+  twice: (...at) => (job.touch ? Promise.all([0, 1].map(() => page.touchscreen.tap(...at))) : page.mouse.dblclick(...at)),
   calm: () => page.emulateMedia({ reducedMotion: 'reduce' }),
   hover: (x, y) => page.mouse.move(x, y),
-  wheel: (by) => page.mouse.wheel(0, by),
-  drag: async (x, y, toX, toY) => {
+  wheel: async (by, key) => {
+    if (key) await page.keyboard.down(key);
+    await page.mouse.wheel(0, by);
+    if (key) await page.keyboard.up(key);
+  },
+  pinch: async (x, y, from, to) => {
+    const fingers = await context.newCDPSession(page), at = (wide) => [-1, 1].map((side) => ({ x: x + (side * wide) / 2, y, id: side + 1 }));
+    await fingers.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: at(from) });
+    for (let k = 1; k <= 8; k++) await fingers.send('Input.dispatchTouchEvent', { type: 'touchMove', touchPoints: at(from + (k / 8) * (to - from)) });
+    await fingers.send('Input.dispatchTouchEvent', { type: 'touchEnd', touchPoints: [] });
+  },
+  drag: async (x, y, toX, toY, button = 'left') => {
     if (job.touch) {
       const fingers = await context.newCDPSession(page), at = (k) => [{ x: x + (k / 8) * (toX - x), y: y + (k / 8) * (toY - y) }];
       await fingers.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: at(0) });
@@ -70,9 +81,9 @@ const steps = {
       return;
     }
     await page.mouse.move(x, y);
-    await page.mouse.down();
+    await page.mouse.down({ button });
     await page.mouse.move(toX, toY, { steps: 8 });
-    await page.mouse.up();
+    await page.mouse.up({ button });
   },
   resize: (width, height) => page.setViewportSize({ width, height }),
   eval: (text) => page.evaluate(text),

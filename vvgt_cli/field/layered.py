@@ -26,7 +26,9 @@ from vvgt_cli.look.label_files import holds_table, table_beside, table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable, default_name, distinct, hex_color, palette
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, read_volume, statistics
 from vvgt_cli.volume.components import channel_numbers
+from vvgt_cli.volume.examples import tissues
 from vvgt_cli.volume.label_maps import labels_in, recognised
+from vvgt_cli.volume.segments import Segment
 from vvgt_cli.volume.stored import Stored, chunks_of, loaded, read_block
 
 if TYPE_CHECKING:
@@ -213,7 +215,8 @@ def layers_of(
         beside = None if labels != AUTO or maps[0].segments else table_beside(opened.path)
         if beside:
             warnings.warn(f"{opened.path}: {beside} may name its labels (try --labels {beside})", stacklevel=3)
-        found = [_labelled(volume, labels, distance, access, empty=bool(whole)) for volume in maps]
+        known = tissues(opened.path)
+        found = [_labelled(volume, labels, distance, access, known, empty=bool(whole)) for volume in maps]
         return told_apart(found, set()) if opened.overlapping else found
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
@@ -294,15 +297,19 @@ def _white(opened: OpenedFile) -> float:
 
 
 def _labelled(
-    volume: Volume, labels: str | LabelTable, distance: str | None, access: Access, empty: bool = False
-) -> Layer:
-    """Return a label map under its table; raise DataError if it has no labels, unless it may be ``empty``."""
+    volume: Volume, labels: str | LabelTable, distance: str | None, access: Access, known: Sequence[Segment],
+    empty: bool = False,
+) -> Layer:  # fmt: skip
+    """Return a label map under its table; ``known``: its labels, if its file describes none.
+
+    Raise DataError if it has no labels, unless it may be ``empty``.
+    """
     labels_there = access.labels(volume)
     if not any(labels_there) and not empty:
         raise DataError(f"{volume.name}: no label other than 0; expected some to show")
     table = distinct(labels_there)
     if any(labels_there):
-        table = table_for(labels, labels_there, volume.name, volume.segments)
+        table = table_for(labels, labels_there, volume.name, volume.segments or known)
     shows = any(label.opacity > 0 for label in table.labels)
     return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
 

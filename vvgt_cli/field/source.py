@@ -204,7 +204,8 @@ class StyledVolume:
 
         known = self.overall if len(self.layers) == 1 else None
         return [
-            None if layer.colors else Layer(layer.volume, layer.tf, layer.unit_distance, known) for layer in self.layers
+            None if layer.colors else Layer(layer.volume, layer.tf, layer.unit_distance, known, self.lighting)
+            for layer in self.layers
         ]
 
     def values(self, room: float | None = None) -> Values | None:

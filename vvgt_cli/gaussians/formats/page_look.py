@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -12,23 +13,19 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
+from vvgt_cli.gaussians.formats.page_presets import function_nodes, told
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import up_matrix
-from vvgt_cli.gaussians.live import OPAQUE
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.function import PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import MATTE, MAX_LIGHT, Lighting
 from vvgt_cli.look.readers.minimal import read
-from vvgt_cli.look.readers.names import named_function, names
-from vvgt_cli.look.resolve import look_like_hounsfield, resolve
-from vvgt_cli.look.tables import extinction
+from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.types import triple
 
 PLY = PlyOptions()
-SAMPLED, FEW = 96, 12  # nodes for colours that are not interpolated linearly in RGB: of the file's function, of presets
-ALIKE = 0.01  # difference of opacity and colour up to which functions are the same
+SAMPLED = 96  # nodes for colours that are not interpolated linearly in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer shows PLY (x, y, z) at (-x, -y, z)
 
@@ -88,13 +85,16 @@ def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:
     first, shown = values.facts[0], {str(step.get("function")) for step in steps}
     half = np.linalg.norm(np.reshape(first["affine"], (3, 4))[:, :3], axis=0) * first["dims"] * scale / 2
     return {
-        "layers": [_layer_entry(layer, scale, shown) for layer in values.look.layers],
+        "layers": [
+            _layer_entry(layer, scale, offered, shown)
+            for layer, offered in zip(values.look.layers, values.offered or repeat({}), strict=False)
+        ],
         "light": _light(options.light, axes), "axes": axes.tolist(), "box": [(-half).tolist(), half.tolist()],
     }  # fmt: skip
 
 
-def _layer_entry(layer: LiveFacts, scale: float, shown: Collection[str]) -> dict[str, Any]:
-    """Return a layer of `look_entry`, with presets that a story has ``shown``."""
+def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any], shown: Collection[str]) -> dict[str, Any]:
+    """Return a layer of `look_entry`; of what `page_presets.offers` returned; ``shown``: by a story."""
     distance = layer.distance or 1.0
     entry: dict[str, Any] = {
         "title": layer.name, "labels": [label.page_entry() for label in layer.labels],
@@ -102,7 +102,12 @@ def _layer_entry(layer: LiveFacts, scale: float, shown: Collection[str]) -> dict
         "histogram": list(layer.histogram), "name": layer.baked().get("name", ""),
         "unit_distance": distance * scale, "opacity_unit_distance": distance, "nodes": [],
     }  # fmt: skip
-    return entry if layer.labels else entry | {"nodes": nodes_of(layer), "presets": presets_of(layer, entry, shown)}
+    if layer.labels:
+        return entry
+    presets = list(offered.get("presets", ()))
+    known = {one["name"] for one in presets}
+    presets += [told(name, layer, distance, 2 / scale) for name in names() if name in shown and name not in known]
+    return entry | {"nodes": nodes_of(layer)} | offered | {"presets": presets}
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
@@ -147,67 +152,6 @@ def _axes(up: str) -> np.ndarray:
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
     """Return nodes with opacity and colour, between which both are linear; there are two at a step."""
-    return _nodes(read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED)
-
-
-def presets_of(facts: LiveFacts, entry: Mapping[str, Any], shown: Collection[str] = ()) -> list[dict[str, Any]]:
-    """Return the named functions for values that are or look like Hounsfield units, or of the kind of the file's name.
-
-    The file's own function is not among them, unless it was changed and has kept the name.
-
-    Args:
-        facts: of the layer.
-        entry: its part of the scene, whose ``unit_distance`` opacities become per.
-        shown: names of further ones.
-    """
-    named, found, known = names(), [], facts.statistics()
-    hounsfield = facts.unit == "HU" or (not facts.unit and look_like_hounsfield(known))
-    kind = "ct" if hounsfield else entry["name"].split("-")[0] if entry["name"] in named else ""
-    for name in [name for name in named if name.split("-")[0] == kind or name in shown]:
-        tf = named_function(name)
-        if tf.otherwise is not None and not hounsfield and name not in shown:  # a guess
-            continue
-        tf = resolve(tf, known, hounsfield=hounsfield or name not in shown)
-        assert tf.opacity_unit_share is not None
-        times = entry["unit_distance"] / (2 * tf.opacity_unit_share)  # the longest edge is 2
-        tf = replace(tf, opacity_nodes=_per_longer(tf.opacity_nodes, times))
-        light = tf.lighting and {key: getattr(tf.lighting, key) for key in ("ambient", "diffuse", "specular")}
-        if (name in shown or tf.support(facts.lo, facts.hi)) and not _is_own(tf, facts):
-            found.append({"name": name, "shows": named[name], "nodes": _nodes(tf, FEW), "light": light})
-    return found
-
-
-def _is_own(tf: TransferFunction, facts: LiveFacts) -> bool:
-    """Return whether a function of the same unit distance shows what the file's own does, to `ALIKE`."""
-    if not facts.function:
-        return False
-    x, own = np.linspace(facts.lo, facts.hi, 257), facts.tf("the file")
-    there, other = tf.opacity(x)[:, None], own.opacity(x)[:, None]
-    off = np.hstack([there - other, there * tf.color(x) - other * own.color(x)])
-    return bool(np.abs(off).max() < ALIKE)
-
-
-def _per_longer(nodes: PiecewiseOpacity, times: float) -> PiecewiseOpacity:
-    """Return opacity per a unit distance so many times as long, with nodes until its extinction is right to 1 %."""
-    x, y = nodes.x, np.minimum(nodes.y, OPAQUE)
-    while True:
-        y_between = (y[1:] + y[:-1]) / 2
-        longer, between = (-np.expm1(times * np.log1p(-part)) for part in (y, y_between))
-        found, wanted = extinction((longer[1:] + longer[:-1]) / 2, 1.0), extinction(between, 1.0)
-        far = np.flatnonzero((np.abs(found - wanted) > 0.004 * wanted) & (x[1:] > x[:-1]))  # twice that beside 0
-        if not far.size:
-            return PiecewiseOpacity(x, longer)
-        x, y = np.insert(x, far + 1, (x[far] + x[far + 1]) / 2), np.insert(y, far + 1, y_between[far])
-
-
-def _nodes(tf: TransferFunction, sampled: int) -> list[dict[str, Any]]:
-    """Return nodes, with so many more for colours that are not interpolated linearly in RGB."""
-    places = [tf.opacity_nodes.x, tf.color_map.x]
-    if tf.color_map.space != "RGB":
-        places.append(np.linspace(tf.color_map.x[0], tf.color_map.x[-1], sampled))
-    nodes = []
-    at = np.unique(np.concatenate(places))
-    for x, limits in zip(at.tolist(), tf.limits(at).tolist(), strict=True):
-        below, above = ({"x": x, "y": float(f"{y:.8g}"), "rgb": [round(c, 4) for c in rgb]} for y, *rgb in limits)
-        nodes += [below] if below == above else [below, above]
-    return nodes
+    return function_nodes(
+        read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function"), SAMPLED
+    )

@@ -18,9 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vvgt_cli.errors import NoLiveForm
+from vvgt_cli.gaussians.formats.page_presets import offers
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.recognise import in_hounsfield
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
@@ -47,12 +49,14 @@ class Layer(NamedTuple):
         look: function, or table of a label map.
         distance: world length that its opacity refers to.
         statistics: of the scalars; None: those of the grid.
+        lighting: that they are shown with; None: none.
     """
 
     volume: Volume
     look: TransferFunction | LabelTable
     distance: float
     statistics: Statistics | None = None
+    lighting: Lighting | None = None
 
 
 class Values(NamedTuple):
@@ -63,17 +67,19 @@ class Values(NamedTuple):
         contents: of each, the packed codes.
         look: of all layers, which the page begins with; None where it cannot be changed there.
         limited: grids are coarser for want of room.
+        offered: of each layer, what `page_presets.offers` returns.
     """
 
     facts: tuple[dict[str, Any], ...]
     contents: tuple[bytes, ...]
     look: LiveFacts | None = None
     limited: bool = False
+    offered: tuple[dict[str, Any], ...] = ()
 
     @property
     def size(self) -> float:
         """Bytes on a page."""
-        return len(json.dumps(self.facts)) + sum(map(len, self.contents)) * 4 / 3
+        return len(json.dumps((self.facts, self.offered))) + sum(map(len, self.contents)) * 4 / 3
 
     @property
     def labels(self) -> int:
@@ -121,17 +127,20 @@ def values_of(layers: Sequence[Layer | None], room: float | None = None) -> Valu
 def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> Values | None:
     """Return the grids of layers, of at most so many cells together, as `values_of` does."""
     shown = [(number, layer) for number, layer in enumerate(layers) if layer is not None]
-    facts, contents, looks = [], [], []
-    for number, (volume, look, distance, statistics) in shown:
+    facts, contents, looks, offered = [], [], [], []
+    for number, (volume, look, distance, statistics, lighting) in shown:
         dims = coarser(volume, most // len(shown))
+        values = None if isinstance(look, LabelTable) else averaged(volume, dims)
         if isinstance(look, LabelTable):
             own, codes, known = *_labels(look, volume, dims), OF_LABELS
         else:
-            own, codes, known = _values(volume, look, dims)
+            assert values is not None
+            own, codes, known = _values(volume, look, values)
         name = volume.name if len(layers) > 1 else ""
         with suppress(NoLiveForm):  # of too many labels
             one = LiveFacts.of(volume, statistics or known, look, len(layers))
             looks.append(replace(one, name=name, distance=distance))
+            offered.append({} if values is None else offers(looks[-1], volume, values, lighting))
         stretch = np.array(volume.dims) / dims
         affine = volume.affine[:3] @ np.vstack([np.diag([*stretch, 1.0])[:3], [0, 0, 0, 1.0]])
         affine[:, 3] += volume.affine[:3, :3] @ ((stretch - 1) / 2)  # the middle of the first cell
@@ -143,14 +152,11 @@ def _grids(layers: Sequence[Layer | None], most: int, limited: bool = False) -> 
         )  # fmt: skip
         contents.append(packed(codes))
     begun = replace(looks[0], others=tuple(looks[1:])) if len(looks) == len(layers) else None
-    return Values(tuple(facts), tuple(contents), begun, limited) if facts else None
+    return Values(tuple(facts), tuple(contents), begun, limited, tuple(offered)) if facts else None
 
 
-def _values(
-    volume: Volume, tf: TransferFunction, dims: tuple[int, int, int]
-) -> tuple[dict[str, Any], np.ndarray, Statistics]:
-    """Return facts and codes (nz, ny, nx) of the means of values, and their statistics."""
-    values = averaged(volume, dims)
+def _values(volume: Volume, tf: TransferFunction, values: np.ndarray) -> tuple[dict[str, Any], np.ndarray, Statistics]:
+    """Return facts and codes (nz, ny, nx) of the means of values (nz, ny, nx), and their statistics."""
     known = values[np.isfinite(values)]
     lo, hi = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     edges = edges_of(lo, hi)

@@ -39,6 +39,11 @@ def names() -> dict[str, str]:
     return {name: str(entry["shows"]) for name, entry in _entries().items()}
 
 
+def titles() -> dict[str, str]:
+    """Return one or two words for what each named function shows, by name: what pages call it."""
+    return {name: str(entry["title"]) for name, entry in _entries().items()}
+
+
 def named_function(name: str) -> TransferFunction:
     """Return one of our functions, with opacity per a share of the box's edge; raise KeyError for an unknown name."""
     return minimal.read(_entries()[name]["function"], name)

@@ -1,8 +1,10 @@
 // What is shown: a list of names and values, of what the file says of itself.
 import { DIAGNOSIS, isMedical, shown } from './facts.mjs';
+import { edgesOf, tiltOf } from './volume.mjs';
 
 export function rowsOf(name, { facts, world, count, look, values }) {
   const number = (n) => n.toLocaleString('en'), length = (n) => `${shown(n)}${world.unit && ` ${world.unit}`}`;
+  const affine = facts.affine?.split(/\s+/).map(Number), tilt = affine?.every(Number.isFinite) ? tiltOf({ affine, edges: edgesOf(affine) }) : 0;
   const kinds = new Set(look?.layers.map(({ labels }) => (labels.length ? 'labels' : 'function')));
   return [
     ['name', name],
@@ -15,7 +17,7 @@ export function rowsOf(name, { facts, world, count, look, values }) {
     ['quality', facts.quality],
     ['Gaussians', count && number(count)],
     ['made for', facts.size && `screens of ${facts.size} px; drawing rule: ${facts.rule}`],
-    ['axes', world.anatomical ? `${facts.space}, in mm` : `the file's own${world.unit && `, in ${world.unit}`}`],
+    ['axes', `${world.anatomical ? `${facts.space}, in mm` : `the file's own${world.unit && `, in ${world.unit}`}`}${tilt ? `; the volume lies oblique, ${tilt}°` : ''}`],
     ['drawn with', 'SuperSplat viewer and PlayCanvas engine (MIT)'],
     ['written by', facts.version && `vvgt ${facts.version}`],
   ].filter(([, value]) => value);

@@ -12,7 +12,7 @@ const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacit
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
 <div><button class="preset" aria-expanded="false" title="presets"></button><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><button class="redo" aria-label="redo" title="redo (Ctrl+Y, Ctrl+Shift+Z)">↷</button>
 <button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div><div class="presets" role="group" aria-label="presets" hidden></div>`;
-const PRESET = `<canvas width="84" height="84" aria-hidden="true"></canvas><span></span>`;
+const PRESET = '<img width="84" height="84" alt=""><span></span>';
 
 const height = (y) => HIGH - 4 - (HIGH - 8) * Math.cbrt(y), opacity = (h) => Math.min(Math.max((HIGH - 4 - h) / (HIGH - 8), 0), 1) ** 3;
 const copy = (nodes) => nodes.map(({ x, y, rgb }) => ({ x, y, rgb: [...rgb] }));
@@ -34,23 +34,8 @@ function fewer(nodes) {
   return copy(nodes.filter((_, k) => kept.has(k)));
 }
 
-// Functions to begin with, {name, shows, nodes, light}: the file's own, those that suit its values, and three at places of the values but the commonest (background)
-function presets({ values: [lo, hi], histogram, nodes, light, presets: named = [] }) {
-  const most = histogram.indexOf(Math.max(...histogram)), counts = histogram.map((n, k) => (k === most ? 0 : n));
-  const all = counts.reduce((a, b) => a + b, 0) || 1, share = (q) => {
-    let sum = 0;
-    const k = counts.findIndex((n) => (sum += n) >= q * all);
-    return lo + ((hi - lo) * (k + 0.5)) / counts.length;
-  };
-  const made = (...list) => list.map(([x, y]) => ({ x, y, rgb: functionAt(nodes, x).rgb }));
-  const middle = share(0.5), wide = Math.max((share(0.7) - share(0.3)) / 2, (hi - lo) / 40);
-  return [
-    { name: 'as in the file', nodes, light }, ...named,
-    { name: 'step', nodes: made([lo, 0], [middle, 0], [Math.min(middle + (hi - lo) / 100, hi), 0.8], [hi, 0.8]) },
-    { name: 'ramp', nodes: made([lo, 0], [share(0.1), 0], [hi, 0.5]) },
-    { name: 'band', nodes: made([lo, 0], [Math.max(middle - wide, lo), 0], [middle, 0.5], [Math.min(middle + wide, hi), 0], [hi, 0]) },
-  ];
-}
+// Functions to begin with, {title, name, shows, nodes, light, picture: an address}: the file's own and those that the page was made with
+const presets = ({ nodes, picture, presets: made = [] }) => [{ title: 'as in the file', nodes, picture }, ...made];
 
 // nodes as a link has them, and back
 const digits = (x, n) => String(Number(x.toFixed(n)));
@@ -99,8 +84,7 @@ export function editor(apply, layer, key, history) {
     find('input[type=color]').value = hex(nodes[chosen].rgb);
     find('.remove').disabled = nodes.length < 3;
     const begun = ready.findIndex((one) => one.nodes === exact);
-    opener.textContent = ready[begun]?.name ?? EDITED;
-    opener.setAttribute('aria-label', `presets: ${opener.textContent}`);
+    opener.textContent = `presets: ${ready[begun]?.title ?? EDITED}`;
     [...menu.children].forEach((button, k) => button.setAttribute('aria-pressed', String(k === begun)));
   }
 
@@ -212,22 +196,21 @@ export function editor(apply, layer, key, history) {
   });
   find('input[type=color]').addEventListener('change', () => { coloring = false; });
 
-  const pictures = ready.map(({ name, shows, nodes, light }) => {
-    const button = Object.assign(document.createElement('button'), { innerHTML: PRESET, title: shows ?? name });
-    button.lastChild.textContent = name;
+  menu.append(...ready.map(({ title, shows, nodes, light, picture }) => {
+    const button = Object.assign(document.createElement('button'), { innerHTML: PRESET, title: shows ?? title });
+    if (picture) button.firstChild.src = picture;
+    button.lastChild.textContent = title;
     button.addEventListener('click', () => {
       history.keep();
       now = whole(nodes);
       show();
       history.light(light);
     });
-    menu.append(button);
-    return button.firstChild.getContext('2d');
-  });
+    return button;
+  }));
   function open(now) {
     menu.hidden = !now;
     opener.setAttribute('aria-expanded', String(now));
-    if (now) history.sketch(ready, (k, picture) => pictures[k].drawImage(picture, 0, 0), () => !menu.hidden);
   }
   opener.addEventListener('click', () => open(menu.hidden));
   root.addEventListener('keydown', (event) => {
@@ -248,6 +231,6 @@ export function editor(apply, layer, key, history) {
     read: (said) => (said ? { nodes: read(said), exact: null, chosen: 0 } : whole(layer.nodes)),
   });
   draw();
-  const named = () => ({ ...layer, name: ready.find((one) => one.shows && one.nodes === now.exact)?.name ?? layer.name });  // the preset's name, if one is chosen
+  const named = () => ({ ...layer, name: ready.find((one) => one.nodes === now.exact)?.name ?? layer.name });  // the preset's name, if one is chosen
   return { root, nodes, named, told: () => text(now.nodes[now.chosen]), set: (to) => { history.keep(); now = { nodes: copy(to), exact: null, chosen: 0 }; show(); } };
 }

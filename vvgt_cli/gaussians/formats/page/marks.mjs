@@ -70,6 +70,8 @@ export function marksOf(worldNow, changed, save) {
     get open() { return !root.hidden; },
     get list() { return list; },
     get begun() { return begun; },
+    // what is drawn: of each mark, and of the next one's points, {kind, places, told}
+    get drawn() { return [...list.map((mark, k) => ({ kind: mark.kind, places: mark.places, told: number(k) + text(mark) })), ...(begun.length ? [{ kind: 'begun', places: begun, told: '' }] : [])]; },
     // what is still to be done, in words
     get hint() { return list.length < MOST ? `${kind}: click point ${begun.length + 1} of ${POINTS[kind]}` : `at most ${MOST}`; },
     take({ world }) {

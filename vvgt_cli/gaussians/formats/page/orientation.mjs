@@ -2,7 +2,8 @@
 import { dot } from './lens.mjs';
 import { element, label } from './svg.mjs';
 
-const RADIUS = 30, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];
+export const COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];  // of the axes of the world
+const RADIUS = 30;
 const HIDDEN = 0.45;  // projected length below which the end that looks away is covered by the other
 
 export function drawLetters(group, { lens, world, left, high }) {

@@ -7,7 +7,7 @@ import { organs } from './organs.mjs';
 const HTML = `<header><span class="named"><h1></h1><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
 <output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="draw as" title="draw as (k)"></select>`;
 const KINDS = ['colours', 'MIP', 'X-ray'];
-const STEPS = 200, SMALL = 84;  // that undo goes back; px of a small picture
+const STEPS = 200;  // that undo goes back
 
 // the title line
 export function named() {
@@ -55,21 +55,15 @@ export function panel(look, viewer, live) {
     const after = k ? `-${k}` : '';
     layers.push({ layer, ...(layer.labels.length
       ? organs((rows) => look.labels(rows, k), layer.labels, `labels${after}`, history)
-      : editor((nodes) => look.apply(nodes, k), layer, `function${after}`, { ...history, sketch: (...what) => sketch(k, ...what) })) });
+      : editor((nodes) => look.apply(nodes, k), layer, `function${after}`, history)) });
   });
   root.append(...layers.map((one) => one.root), cut.root, light(look, viewer, live.light, history));
   const lamp = parts.at(-1), begun = lamp.state();
-  // the light under a preset's: its coefficients, null for none, undefined for as it is
+  // the light under a preset's: its coefficients, null for none, undefined for the file's
   function lit(to) {
-    const now = lamp.state(), kind = to === undefined ? now.kind : to === null ? 'none' : to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
+    if (to === undefined) return begun;
+    const now = lamp.state(), kind = to === null ? 'none' : to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
     return [begun, now].find((one) => JSON.stringify(one) === JSON.stringify(next)) ?? next;
-  }
-  // small pictures of presets {nodes, light} of a layer: done(number, canvas), while going()
-  async function sketch(k, looks, done, going) {
-    for (let j = 0; j < looks.length && going() && !look.said; j++) {
-      const picture = await look.sketch(k, looks[j].nodes, lit(looks[j].light), SMALL).catch(() => null);
-      if (picture) done(j, picture);
-    }
   }
 
   function choose(k) {

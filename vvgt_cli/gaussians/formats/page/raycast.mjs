@@ -5,7 +5,7 @@ import shader from './raycast.glsl';
 import { exposed, extinction, functionAt, TABLE, tableOf, WIDE } from './table.mjs';
 
 const BLOCK = 8, ROWS = TABLE / WIDE;  // edge of what is skipped where it is empty; rows of a table
-const REST = 150, COARSE = 3, MOST = 32, QUIET = 2, SKETCH = 4;  // ms without a change; part of the resolution; frames at most, and without a change; of a small picture
+const REST = 150, COARSE = 3, MOST = 32, QUIET = 2;  // ms without a change; part of the resolution; frames at most, and without a change
 const FAST = 60, SLOW = 200, THIN = 8;  // ms in which a band of a frame may be done, to be twice, or half as high; its least rows
 const HOLE = -65504;  // of what is unknown, which no value near it makes visible
 const cells = (dims) => dims.map((n) => Math.ceil(n / BLOCK));
@@ -156,7 +156,7 @@ function uploaded(gl, grid, layer, k) {
 }
 
 // {layers, nodes, rows, planes: what is shown; apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), draw(kind), face({layer, from, to} or null): values on the cut; show(now);
-// picture(size), sketch(k, nodes, light, edge): canvases; pick(ray): a place; at(place): its value; rested: nothing changes any more; said: why it cannot}; begin(lens, world, covering(now)) comes first
+// picture(size): a canvas; pick(ray): a place; at(place): its value; rested: nothing changes any more; said: why it cannot}; begin(lens, world, covering(now)) comes first
 export function raycaster(facts, gridsOf, { app }) {
   const canvas = Object.assign(document.createElement('canvas'), { id: 'volume', hidden: true });
   let gl = null, ray = null, put = null, looks = null, drawn = [], grids = [], lens = null, world = null, covering = null, starting = null, deep = 0;
@@ -250,7 +250,7 @@ export function raycaster(facts, gridsOf, { app }) {
     return ['origin', 'direction'].map((name) => [...a[name], ...minus(b[name], a[name]), ...minus(c[name], a[name])]);
   }
   // rows of frame n, added to what the first texture has, in the second one
-  function band([from, { to, size }], rays, n, first, many, times, light = lamp) {
+  function band([from, { to, size }], rays, n, first, many, times) {
     const cuts = Array.from({ length: 6 }, (_, k) => (look.planes[k] ? [...look.planes[k].normal, look.planes[k].place] : [0, 0, 0, 1]));
     ray('3fv', 'origin', rays[0]);
     ray('3fv', 'direction', rays[1]);
@@ -260,8 +260,8 @@ export function raycaster(facts, gridsOf, { app }) {
     ray('1f', 'again', n);
     ray('1i', 'kind', kind);
     ray('4fv', 'cuts', cuts.flat());
-    ray('4f', 'light', ...(light.kind === 'none' ? [-1, 0, 0, 1] : [light.ambient, light.diffuse, light.specular, light.power]));
-    ray('4f', 'toward', ...light.from, light.kind === 'headlight' ? 1 : 0);
+    ray('4f', 'light', ...(lamp.kind === 'none' ? [-1, 0, 0, 1] : [lamp.ambient, lamp.diffuse, lamp.specular, lamp.power]));
+    ray('4f', 'toward', ...lamp.from, lamp.kind === 'headlight' ? 1 : 0);
     ray('4f', 'face', ...(face ? [face.from, 1 / Math.max(face.to - face.from, 1e-6), 0, 1] : [0, 0, 0, 0]));
     ray('1i', 'faced', face ? grids.findIndex(({ layer }) => layer === face.layer) : 0);
     bound(0, looks);
@@ -329,14 +329,14 @@ export function raycaster(facts, gridsOf, { app }) {
   }
 
   // a canvas of a part of the window, of so many frames
-  async function drawing(size, part, frames, light) {
+  async function drawing(size, part, frames) {
     if (!deep) frames = 1;
     const rays = raysOf(part), pixels = new Uint8ClampedArray(4 * size[0] * size[1]), made = Object.assign(document.createElement('canvas'), { width: size[0], height: size[1] });
     const sums = targets(size, deep), [last, spare] = targets(size, 0), pause = () => new Promise((next) => { setTimeout(next, 4); });
     for (let n = 0; n < frames; n++, sums.reverse()) {
       for (let first = 0, many = 0; first < size[1]; first += many) {
         many = rows;
-        band(sums, rays, n, first, many, 0.5, light);
+        band(sums, rays, n, first, many, 0.5);
         while (gl && !done()) await pause();
         if (!gl) throw new Error(look.said);
       }
@@ -385,12 +385,6 @@ export function raycaster(facts, gridsOf, { app }) {
     get shows() { return covers; },
     get rested() { return Boolean(look.said) || !wanted || (covers && !still && (frame >= (deep ? MOST : 1) || quiet >= QUIET) && key.endsWith(`,${version}]`)); },
     picture: (size) => alone(() => drawing(size, [0, 0, lens.canvas.clientWidth, lens.canvas.clientHeight], 16)),
-    // the middle of the view, under other nodes and a light
-    sketch: (k, nodes, light, edge) => alone(async () => {
-      const [x, y] = lens.middle, { clientWidth: w, clientHeight: h } = lens.canvas, half = Math.min(x, w - x, y, h - y);
-      tabulate(k, nodes);
-      try { return await drawing([edge, edge], [x - half, y - half, x + half, y + half], SKETCH, light); } finally { tabulate(k); }
-    }),
     // where half of what a ray meets is in front, of a MIP where its greatest value is; null: nothing
     async pick({ origin, direction }) {
       grids = (await gridsOf()).filter(({ layer }) => look.layers[layer]);

@@ -12,6 +12,8 @@ function inverted(m) {
   return rows.flatMap((row) => [...row, -row.reduce((sum, x, k) => sum + x * m[4 * k + 3], 0)]);
 }
 
+export const edgesOf = (affine) => [0, 1, 2].map((k) => Math.hypot(affine[k], affine[4 + k], affine[8 + k]));
+
 // the matrix of the one after the other
 const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 * r] * n[c] + m[4 * r + 1] * n[4 + c] + m[4 * r + 2] * n[8 + c] + (c === 3 ? m[4 * r + 3] : 0)));
 
@@ -52,7 +54,7 @@ async function gridOf(facts) {
     },
     toWorld: (index) => through(affine, index), toIndex: (place) => through(inverse, place),
     from: (other) => { const m = chained(inverse, other.affine); return (index) => through(m, index); },
-    edges: [0, 1, 2].map((k) => Math.hypot(affine[k], affine[4 + k], affine[8 + k])),
+    edges: edgesOf(affine),
   };
 }
 
@@ -75,13 +77,30 @@ export function sharedGrids(values) {
   return () => (read ??= all());
 }
 
-// The three slices along a grid's own axes, each named after the axis of the world that is nearest: {name, across, along, up: {axis, sign}, letters: of its four sides}
-export function viewsOf({ affine, edges }, { letters, anatomical }) {
-  const share = (k, axis) => Math.abs(affine[4 * k + axis]) / edges[axis], total = (order) => order.reduce((sum, axis, k) => sum + share(k, axis), 0);
-  const order = ORDERS.reduce((best, one) => (total(one) > total(best) + 1e-9 ? one : best));
+// how much an axis of a grid is one of the world's, 0 to 1; and the grid's axis that is nearest to each of the world's
+const share = ({ affine, edges }, k, axis) => Math.abs(affine[4 * k + axis]) / edges[axis];
+function orderOf(grid) {
+  const total = (order) => order.reduce((sum, axis, k) => sum + share(grid, k, axis), 0);
+  return ORDERS.reduce((best, one) => (total(one) > total(best) + 1e-9 ? one : best));
+}
+
+// The largest angle between an axis of a grid and the world's that is nearest, whole degrees
+export const tiltOf = (grid) => Math.round(Math.max(...orderOf(grid).map((axis, k) => (Math.acos(Math.min(share(grid, k, axis), 1)) * 180) / Math.PI)));
+
+// A grid without codes along the world's axes, around a grid and as fine
+export function uprightOf(grid) {
+  const ends = Array.from({ length: 8 }, (_, n) => grid.toWorld(grid.dims.map((size, k) => ((n >> k) & 1 ? size - 0.5 : -0.5)))), edges = orderOf(grid).map((axis) => grid.edges[axis]);
+  const [low, high] = [Math.min, Math.max].map((pick) => [0, 1, 2].map((k) => pick(...ends.map((p) => p[k])))), dims = edges.map((edge, k) => Math.ceil((high[k] - low[k]) / edge - 1e-6));
+  const first = dims.map((n, k) => (low[k] + high[k] - (n - 1) * edges[k]) / 2), affine = edges.flatMap((edge, k) => [...[0, 1, 2].map((c) => (c === k ? edge : 0)), first[k]]);
+  return { dims, edges, affine, toWorld: (index) => through(affine, index), toIndex: (p) => p.map((x, k) => (x - first[k]) / edges[k]) };
+}
+
+// The three slices along a grid's own axes, each named after the axis of the world that is nearest: {name, across, along, up: {axis, world: that axis, sign}, letters: of its four sides}
+export function viewsOf(grid, { letters, anatomical }) {
+  const { affine } = grid, order = orderOf(grid);
   const towards = (letter) => {
     const k = letters.findIndex((pair) => pair.includes(letter)), axis = order[k], end = letters[k].indexOf(letter);
-    return { axis, sign: (end ? 1 : -1) * (affine[4 * k + axis] < 0 ? -1 : 1), ends: [letters[k][1 - end], letter] };
+    return { axis, world: k, sign: (end ? 1 : -1) * (affine[4 * k + axis] < 0 ? -1 : 1), ends: [letters[k][1 - end], letter] };
   };
   return (anatomical ? BODY : OTHER).map(([name, right, above]) => {
     const along = towards(right), up = towards(above);

@@ -64,7 +64,7 @@ export function where(viewer, scene, live, show, grids) {
   const report = (place, more) => site.say('picked', { text: placeText(place, world), place: place.world, unit: world.unit, value: place.value, in: place.in, layer: place.layer, ...more });
   const labelled = (layer) => live?.look.rows[layer];
   const slices = grids && slicesOf(grids, {
-    world: () => world, cuts: Boolean(live), rows: labelled, moved: () => again(),
+    world: () => world, cuts: Boolean(live), rows: labelled, measures: () => marks.open, moved: () => again(),
     picked(place) {
       if (place && marks.open) marks.take(place);
       if (place) report(place, { text: slices.text(place), value: place.value ?? place.names[0] ?? null });
@@ -203,7 +203,8 @@ export function where(viewer, scene, live, show, grids) {
     state.legend = legend(colors, wide, high);
     marks.draw(rest, { ...all, cross: marks.open && lens.canvas.matches(':focus-visible') && lens.middle });
     const at = clicked && !marks.open && lens.project(clicked.place);
-    if (at) drawPlace(rest, at, valueText(clicked));
+    if (at) drawPlace(rest, at, `${valueText(clicked)}${clicked.mean ? ` (${clicked.mean})` : ''}`);
+    slices?.mark(marks.drawn);
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
     moveApart([...rest.querySelectorAll('text')], [...svg.querySelectorAll('.over text')]);
