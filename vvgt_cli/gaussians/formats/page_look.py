@@ -107,7 +107,7 @@ def _layer_entry(layer: LiveFacts, scale: float, offered: Mapping[str, Any], sho
     presets = list(offered.get("presets", ()))
     known = {one["name"] for one in presets}
     presets += [told(name, layer, distance, 2 / scale) for name in names() if name in shown and name not in known]
-    return entry | {"nodes": nodes_of(layer)} | offered | {"presets": presets}
+    return {**entry, "nodes": nodes_of(layer), **offered, "presets": presets}
 
 
 def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
