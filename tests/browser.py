@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.images import read_png
 
 PAGES = Path(__file__).parent / "viewers"
@@ -79,6 +79,12 @@ def page_picture(url: str, folder: Path, size: int, **job: Any) -> tuple[np.ndar
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr
     return read_png(out)[..., :3], json.loads(done.stdout.splitlines()[-1])
+
+
+def first_of_orbit() -> dict[str, object]:
+    """The first view of `vvgt render --orbit`, as `page.mjs` takes it."""
+    x, y, z = orbit_views(1)[0].position.tolist()
+    return {"position": [-x, z, y], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 40}
 
 
 def _pose(camera: Camera) -> dict[str, object]:

@@ -57,7 +57,7 @@ def test_convert_leaves_file_report_and_preview(converted):
     assert report["transfer_function"]["given"] is False
     assert report["seconds"] >= sum(stage["seconds"] for stage in report["stages"]) * 0.99
     assert report["versions"]["vvgt"] == header.version
-    assert read_png(folder / "a.png").shape == (3 * 48, 3 * 48, 3)
+    assert read_png(folder / "a.png").shape == (3 * (18 + 48), 3 * 48, 3)
     lines = [line for line in talk.splitlines() if not line.startswith("skipped") and not line.endswith(" %")]
     assert [line[:16].strip() for line in lines] == [stage["name"] for stage in report["stages"]]
     assert f"PSNR {report['scores']['psnr']:.2f} dB" in talk
@@ -172,8 +172,8 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
     options += ("--preview", picture)
     document = json.loads(vvgt(*options, "--json").out)
     sheet = read_png(picture)[..., :3]
-    assert sheet.shape[:2] == (2 * 48, 3 * 48)
-    far, near = sheet[:48], sheet[48:]
+    assert sheet.shape[:2] == (2 * (18 + 48), 3 * 48)  # a line above each row
+    far, near = sheet[18:66], sheet[84:]
     assert psnr(far[:, :48], far[:, 48:96]) == pytest.approx(document["scores"]["per_view"][4]["psnr"], abs=0.3)
     np.testing.assert_allclose(far[:, 96:], np.clip(8 * abs(far[:, :48] - far[:, 48:96]), 0, 1), atol=10 / 255)
     middle = far[18:30, 18:30]  # what 10 degrees of 40 show

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import page_picture
+from browser import first_of_orbit, page_picture
 
 from tests.test_formats_server import shown
 from vvgt_cli.cameras import orbit_views
@@ -27,8 +27,8 @@ pytestmark = pytest.mark.long
 
 
 def shoot(url: str, folder: Path, frame: int | None = None, before: str = "") -> tuple[np.ndarray, dict[str, Any]]:
-    """Picture (SIZE, SIZE, 3) where the page begins, and what the browser noted."""
-    picture, noted = page_picture(url, folder, SIZE, frame=frame, before=before)
+    """Picture (SIZE, SIZE, 3) from the first view of an orbit, and what the browser noted."""
+    picture, noted = page_picture(url, folder, SIZE, camera=first_of_orbit(), frame=frame, before=before)
     assert noted["asked"] == noted["errors"] == []
     assert noted["text"] == ""
     return picture, noted

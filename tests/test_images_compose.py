@@ -6,7 +6,7 @@ import pytest
 from tests.refused import refused
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.images import contact_sheet, over, side_by_side
+from vvgt_cli.images import captioned, contact_sheet, over, side_by_side
 
 
 def test_over_black_white_and_colour():
@@ -24,6 +24,22 @@ def test_side_by_side_holds_both_and_the_difference():
     np.testing.assert_allclose(strip[0, [0, 3, 6], 0], [0.5, 0.25, 0.5])
     assert side_by_side(left, right, gain=100)[..., 6:, :].max() == 1
     refused(DataError, "same size", side_by_side, left, right[:1])
+
+
+def test_captions_say_what_is_seen_and_how_near_it_is():
+    one, two = (side_by_side(np.full((60, 200, 3), 0.5), np.full((60, 200, 3), x)) for x in (0.51, 0.6))
+    sheet = captioned(np.concatenate([one, two]), 2)
+    assert sheet.shape == (2 * (60 + 18), 600, 3)
+    np.testing.assert_array_equal(sheet[18:78], one)
+    np.testing.assert_array_equal(sheet[96:], two)
+    upper, lower = sheet[:18], sheet[78:96]
+    lit = [(upper[:, 200 * k : 200 * k + 200] > 0.5).any() for k in range(3)]
+    assert lit == [True] * 3
+    assert [np.array_equal(upper[:, 200 * k : 200 * k + 200], lower[:, 200 * k : 200 * k + 200]) for k in range(3)] == [
+        True,
+        False,
+        True,
+    ]  # 40.0 and 20.0 dB
 
 
 def test_contact_sheet_places_images_row_by_row():

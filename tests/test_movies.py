@@ -76,6 +76,7 @@ def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
     assert even_steps(pictures)
     assert not even_steps(pictures[:15])
     assert list(tmp_path.glob("*.json")) == []
+    assert not pictures[:, :2, :2].any()  # what is empty is black
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from vvgt_cli.commands.main import run
 from vvgt_cli.images.metrics import psnr
 
 pytestmark = pytest.mark.long
+TABS = {"slices": 3, "marks": 4}
 PAGES = ("slices", "series", "labels", "fixed")
 
 
@@ -200,7 +201,9 @@ def test_a_drag_beside_the_nodes_shifts_and_widens_the_function(person: Person, 
     person("drag", x, y, x, y - 40)
     wider = np.array(person("eval", nodes))
     middle = (shifted[0] + shifted[-1]) / 2
-    np.testing.assert_allclose(wider - middle, (shifted - middle) * np.exp(40 / 60), atol=1.5)
+    np.testing.assert_allclose(
+        wider - middle, (shifted - middle) * np.exp(40 / 60 * 276 / wide), atol=1.5
+    )  # of a drawing 276 px wide
     person("press", "Control+z")
     np.testing.assert_allclose(person("eval", nodes), shifted)
     person("eval", "document.querySelector('#live .node').focus()")
@@ -218,5 +221,7 @@ def test_escape_closes_what_is_open_and_the_focus_goes_back(person: Person, page
         assert person("eval", f"document.getElementById('{name}').contains(document.activeElement)"), name
         person("press", "Escape")
         back = {"marks": "#tools .measure", "slices": "#tools .slices"}.get(name, "#view canvas")
+        if person.touch and name in TABS:
+            back = f"#tabs button:nth-child({TABS[name]})"
         closed = f"[document.getElementById('{name}').hidden, document.activeElement.matches('{back}')]"
         assert person("eval", closed) == [True, True], name

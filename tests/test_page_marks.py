@@ -25,8 +25,9 @@ ACTIVE = "[document.activeElement.tagName, document.activeElement.getAttribute('
 
 
 def placed(person: Person, page: str, folder: Path) -> list[list[float]]:
-    """The page of two dots, from a side; where they are seen, px."""
+    """The page of two dots, from a side, with the list open; where they are seen, px."""
     person("open", page)
+    person("press", "m")
     away = 3 * max(person.size) / min(person.size)
     pose = f"{{ ...window.vvgt.where.lens.pose(), yaw: 37, pitch: -22, distance: {away} }}"
     person("eval", f"window.vvgt.where.lens.set({pose})")
@@ -39,7 +40,6 @@ def placed(person: Person, page: str, folder: Path) -> list[list[float]]:
 
 def test_several_are_drawn_listed_linked_saved_and_removed(dots: str, person: Person, tmp_path: Path) -> None:
     red, blue = placed(person, dots, tmp_path)
-    person("click", "#tools .measure")
     for place in (red, blue):
         person("click", *place)
     person("click", "#marks [data-kind=angle]")
@@ -62,18 +62,19 @@ def test_several_are_drawn_listed_linked_saved_and_removed(dots: str, person: Pe
         f"1: {told[0].removeprefix('ruler ')}", f"2: {told[1].removeprefix('angle ')}", f"3: {NOTE}"
     ]  # fmt: skip
     for text, x, y in before:
-        if text.startswith("3: "):
-            np.testing.assert_allclose([x - 8, y + 6], blue, atol=2)
+        if text.startswith("3: ") and not person.touch:  # beside its place, above or below the angle's text
+            np.testing.assert_allclose([x - 8, y + 6], blue, atol=(2, 40))
     link = person("eval", "window.vvgt.where.link()")
     saved = tmp_path / "again.html"
-    person("click", "#tools .measure")
+    person("press", "m")
     assert person("save", "#marks .save", str(saved)).endswith(".html")
     for address in (link, saved.as_uri()):
         person("open", address)
         assert person("eval", LIST) == told
         again = person("eval", TEXTS)
         assert [text for text, *_ in again] == [text for text, *_ in before]
-        np.testing.assert_allclose([at for _, *at in again], [at for _, *at in before], atol=0.6)
+        if address == link or not person.touch:  # a phone's page is saved beside the list, in a smaller picture
+            np.testing.assert_allclose([at for _, *at in again], [at for _, *at in before], atol=0.6)
     person("shot", str(tmp_path / "marks.png"))
     person("press", "x")  # they turn with what they are of
     person("settled")

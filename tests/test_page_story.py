@@ -91,7 +91,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="module", params=[pytest.param(SMALL, id="desk"), pytest.param(PHONE, id="phone")])
 def person(request: pytest.FixtureRequest) -> Iterator[Person]:
-    someone = Person(request.param)
+    someone = Person(request.param, motion=True)
     yield someone
     someone.process.communicate(timeout=60)
 
@@ -158,14 +158,15 @@ def test_the_caption_lies_below_the_picture(pages: dict[str, str], person: Perso
     person("open", pages["volume"])
     person("eval", f"window.vvgt.where.story.parts[0].set(JSON.stringify([{{ text: {json.dumps('word ' * 300)} }}]))")
     person("settled")
-    tops = "['#view', '#tools', '#story'].map((one) => document.querySelector(one).getBoundingClientRect())"
-    view, tools, story = person("eval", f"{tops}.map(({{ top, bottom }}) => [top, bottom])")
-    assert view[1] == pytest.approx(story[0], abs=1)
-    assert tools[1] <= story[0]
+    tops = "['#view', '#tools', '#tabs', '#story'].map((one) => document.querySelector(one).getBoundingClientRect())"
+    view, tools, tabs, story = person("eval", f"{tops}.map(({{ top, bottom }}) => [top, bottom])")
+    assert view[1] == pytest.approx(tabs[0], abs=1)
+    assert tabs[1] == pytest.approx(story[0], abs=1)
+    assert tools[1] <= tabs[0]
     assert story[1] == pytest.approx(person.size[1], abs=1)
     assert story[0] > 0.6 * person.size[1]
     assert person("eval", "document.querySelector('#story > div').scrollHeight") > story[1] - story[0]
-    assert person("eval", "window.vvgt.where.lens.canvas.clientHeight") == pytest.approx(story[0], abs=1)
+    assert person("eval", "window.vvgt.where.lens.canvas.clientHeight") == pytest.approx(tabs[0], abs=1)
 
 
 def test_pages_without_values_of_labels_and_of_a_series_tell_theirs(pages: dict[str, str], person: Person) -> None:
@@ -315,10 +316,11 @@ def test_a_sandboxed_frame_tells_its_story(pages: dict[str, str], person: Person
     """Without an origin; a picture that the frame may not save says so."""
     source = f'<iframe src="{pages["bare"]}" sandbox="allow-scripts" style="width:100%;height:90vh"></iframe>'
     (tmp_path / "site.html").write_text(f"<!doctype html>{source}")
-    forbidden = "not allowed to copy pictures"
+    forbidden, offered = "not allowed to copy pictures", "document.querySelector('#saved')?.innerText"
     frame: Any = person("framed", (tmp_path / "site.html").as_uri(), [
         ["eval", "window.vvgt.where.story.show(1)"], ["eval", SAID], ["click", "#tools .picture"],
-        ["click", "#sizes button"], ["until", f"{PLACES}.includes('forbids downloads')"],
-        ["click", "#tools .share"], ["click", "#share .picture"], ["until", f"{PLACES}.includes('{forbidden}')"],
+        ["click", "#sizes button"], ["until", f"{offered}.includes('forbids downloads')"],
+        ["click", "#saved button:nth-of-type(3)"], ["click", "#tabs button:last-child"],
+        ["click", "#share .picture"], ["until", f"{PLACES}.includes('{forbidden}')"],
     ])  # fmt: skip
     assert frame[1] == ["2 / 2", "From above."]

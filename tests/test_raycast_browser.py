@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import page_picture
+from browser import first_of_orbit, page_picture
 
 from vvgt_cli.commands.main import run
 from vvgt_cli.images import read_png
@@ -37,7 +37,9 @@ pytestmark = pytest.mark.long
 
 def pictured(page: Path, folder: Path, before: str) -> np.ndarray:
     """Picture (SIZE, SIZE, 3) of the volume on a page, after JavaScript."""
-    picture, noted = page_picture(page.as_uri(), folder, SIZE, before=f"{{ {before} vvgt.live.look.show(true); }}")
+    picture, noted = page_picture(
+        page.as_uri(), folder, SIZE, camera=first_of_orbit(), before=f"{{ {before} vvgt.live.look.show(true); }}"
+    )
     assert noted["errors"] == []
     return picture
 

@@ -261,6 +261,13 @@ def test_labels_in_charts_are_separate_and_inside():
         assert len(boxes) >= 7
         assert all(box.count_overlaps([b for b in boxes if b is not box]) == 0 for box in boxes)
         assert all((box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all() for box in boxes)
+        lines = [
+            line.get_transform().transform_path(line.get_path()) for line in axes.lines if len(line.get_xdata()) > 1
+        ]
+        assert not any(line.intersects_bbox(box, filled=False) for line in lines for box in boxes)
+    bars = draw([ReportRuns("s", runs())])[3].figure
+    bars.draw_without_rendering()
+    assert max(text.get_window_extent().x1 for text in bars.axes[0].texts) < bars.axes[0].bbox.x1
 
 
 def test_names_cannot_break_out_of_the_page():

@@ -212,7 +212,7 @@ def test_levels_have_a_certificate_of_what_viewers_show(vvgt, volume: Path, tmp_
     line = ("convert", volume, *FIT, "--steps", "4", "--preview", picture, "--checkpoint", tmp_path / "c")
     vvgt.ok(*line, "--device", "cpu", "-o", out / "lod-meta.json")
     assert {path.name for path in tmp_path.iterdir()} == {"out", "p.png"}
-    assert read_png(picture).shape[:2] == (450, 450)
+    assert read_png(picture).shape[:2] == (3 * (18 + 150), 450)
     made = json.loads(vvgt.ok("info", out, "--json").out)["certificate"]
     assert {"from 6", "from 1.2", "from 0.6"} < set(made["conditions"])
     finest = json.loads(vvgt.ok("evaluate", f"{out}#0", "--volume", volume, "-q", "--json", "--no-conditions").out)

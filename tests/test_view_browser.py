@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from browser import PAGES, browser, packages
+from browser import PAGES, browser, first_of_orbit, packages
 
 import vvgt_cli as vvgt
 from tests.test_formats_browser import shoot
@@ -38,7 +38,14 @@ SHELL = {
 def test_a_function_that_is_dragged_is_seen_at_once_and_then_converted(size: tuple[int, int], tmp_path: Path) -> None:
     (tmp_path / "shell.json").write_text(json.dumps(SHELL))
     with shown("example:blob:24", "--tf", "shell.json", folder=tmp_path) as (_, url):
-        job = {"browser": browser(), "url": url, "size": size, "folder": str(tmp_path), "note": NOTE}
+        job = {
+            "browser": browser(),
+            "url": url,
+            "size": size,
+            "folder": str(tmp_path),
+            "note": NOTE,
+            "camera": first_of_orbit(),
+        }
         (tmp_path / "job.json").write_text(json.dumps(job))
         command = ["node", str(PAGES / "served.mjs"), str(tmp_path / "job.json"), str(packages())]
         done = subprocess.run(command, capture_output=True, text=True, timeout=2400)

@@ -10,7 +10,7 @@ const job = JSON.parse(fs.readFileSync(jobFile));
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist',
   '--disable-background-networking', '--disable-component-update', '--disable-sync', '--no-first-run', '--force-color-profile=srgb'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
-const page = await browser.newPage({ viewport: { width: 900, height: 540 }, deviceScaleFactor: 1, acceptDownloads: true });
+const page = await browser.newPage({ reducedMotion: 'reduce', viewport: { width: 900, height: 540 }, deviceScaleFactor: 1, acceptDownloads: true });
 page.setDefaultTimeout(600000);
 const asked = [], errors = [];
 await page.route((url) => /^(https?|wss?):/.test(url.href), (route) => {

@@ -9,7 +9,7 @@ const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core'
 const job = JSON.parse(fs.readFileSync(jobFile));
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--no-first-run'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
-const page = await browser.newPage({ viewport: { width: 1200, height: 900 } });
+const page = await browser.newPage({ reducedMotion: 'reduce', viewport: { width: 1200, height: 900 } });
 page.setDefaultTimeout(300000);
 await page.goto(job.url);
 await page.waitForFunction('window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel?.status === "idle"');

@@ -17,7 +17,7 @@ const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swifts
   '--force-color-profile=srgb', '--disable-gpu-watchdog'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.window ?? [job.size, job.size];
-const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1 });
+const page = await browser.newPage({ reducedMotion: 'reduce', viewport: { width, height }, deviceScaleFactor: 1 });
 page.setDefaultTimeout(600000);
 const asked = [], errors = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
 await page.route((url) => /^(https?|wss?):/.test(url.href) && !url.href.startsWith(own), (route) => {
@@ -53,6 +53,11 @@ if (job.look) {
   await page.screenshot({ path: job.look });
 }
 if (job.window) await page.setViewportSize({ width: job.size, height: job.size });
+await page.evaluate(() => {  // the picture fills the window, without the tabs of small ones
+  document.body.style.setProperty('--tabs', '0px');
+  dispatchEvent(new Event('resize'));
+});
+await page.waitForTimeout(500);
 const shoot = async ({ camera, frame }) => {
   const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
   const entity = app.root.findComponent('camera').entity;

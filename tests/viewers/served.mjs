@@ -1,6 +1,6 @@
 // served.mjs JOB.json MODULES: the page of `vvgt view VOLUME` in headless Chromium, by mouse: it waits, shows the volume, a node is
-// dragged, the better form comes, another change goes back, files are saved. JOB: {"browser", "url", "size": [w, h], "folder"};
-// pictures live.png and better.png (square, where the page begins) and what is saved go to the folder; prints what the page
+// dragged, the better form comes, another change goes back, files are saved. JOB: {"browser", "url", "size": [w, h], "folder", "camera"};
+// pictures live.png and better.png (square, of that camera) and what is saved go to the folder; prints what the page
 // said: {"began", "dragging", "live", "better", "cut", "uncut", "lit", "changed", "moved", "saved", "refused"}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -13,7 +13,7 @@ const job = JSON.parse(fs.readFileSync(jobFile)), [width, height] = job.size;
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist',
   '--disable-background-networking', '--disable-component-update', '--disable-sync', '--no-first-run', '--force-color-profile=srgb'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
-const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1, acceptDownloads: true });
+const page = await browser.newPage({ reducedMotion: 'reduce', viewport: { width, height }, deviceScaleFactor: 1, acceptDownloads: true });
 page.setDefaultTimeout(600000);
 page.on('pageerror', (error) => { console.error(error); process.exit(1); });
 const settled = fs.readFileSync(path.join(path.dirname(fileURLToPath(import.meta.url)), 'settled.mjs'), 'utf8').replaceAll('export ', '');
@@ -35,22 +35,19 @@ const grasp = async (k) => {
   return box;
 };
 const shoot = async (name) => {
-  const take = async (back) => {
-    const { viewer } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
-    const camera = app.root.findComponent('camera').entity, scene = JSON.parse(document.getElementById('scene').textContent).camera;
+  const take = async (seen) => {
+    const { viewer, where: { lens } } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
+    const { clientWidth: w, clientHeight: h } = canvas, back = Math.max(w, h) / Math.min(w, h);
+    const camera = app.root.findComponent('camera').entity, { position, target } = seen;
+    const away = position.map((x, i) => x - target[i]), distance = Math.hypot(...away);
     let ready = true, shift = 0;
     app.systems.gsplat.on('frame:ready', (c, layer, isReady, loading) => { ready = isReady && loading === 0; });
-    const put = () => {
-      camera.setPosition(...scene.position.map((x, i) => scene.target[i] + back * (x - scene.target[i])));
-      camera.lookAt(...scene.target, 0, 1, 0);
-      camera.camera.fov = scene.fov;
-      camera.camera.projectionOffset = { x: 0, y: 0 };
-      camera.translateLocal(shift, 0, 0);
-    };
+    lens.set({ target, distance: back * distance, ...lens.toward(away.map((x) => x / distance), [0, 1, 0]) });
+    lens.middle = [w / 2, h / 2];
+    const put = () => camera.translateLocal(shift, 0, 0);
     app.on('update', put);
     const { look } = window.vvgt.live;
     if (look.wanted) {  // the volume itself, in a canvas of its own
-      put();
       for (let still = 0; still < 3; still = look.rested ? still + 1 : 0) await new Promise((done) => setTimeout(done, 300));
       app.off('update', put);
       return look.canvas.toDataURL('image/png');
@@ -62,7 +59,7 @@ const shoot = async (name) => {
     app.off('update', put);
     return url;
   };
-  const url = await page.evaluate(`${settled}; (${take})(${Math.max(width, height) / Math.min(width, height)})`);
+  const url = await page.evaluate(`${settled}; (${take})(${JSON.stringify(job.camera)})`);
   fs.writeFileSync(path.join(job.folder, name), Buffer.from(url.split(',')[1], 'base64'));
 };
 const save = async (label) => {
@@ -78,10 +75,12 @@ await page.evaluate('window.vvgt.where.slices.toggle()');
 noted.slices = await page.evaluate('window.vvgt.where.slices.state.base.dims');
 await page.evaluate('window.vvgt.where.slices.toggle()');
 noted.began = await shown();
-if (await page.evaluate(() => document.querySelector('#live').classList.contains('folded'))) await page.click('#live .fold');
-await page.mouse.move(width / 2, height * 0.75);  // turn the camera
+const tab = async (k) => { if (await page.isVisible('#tabs')) await page.click(`#tabs button:nth-child(${k})`); };
+await tab(1);
+const low = height * (await page.isVisible('#tabs') ? 0.3 : 0.75);
+await page.mouse.move(width / 2, low);  // turn the camera
 await page.mouse.down();
-await page.mouse.move(width / 2 + 60, height * 0.75 + 10, { steps: 3 });
+await page.mouse.move(width / 2 + 60, low + 10, { steps: 3 });
 await page.mouse.up();
 for (let last, now = await place(); String(last) !== String(now); [last, now] = [now, await place()]) await page.waitForTimeout(2000);  // it glides
 const before = await place(), [x, y] = await grasp(1);
@@ -101,10 +100,12 @@ await page.screenshot({ path: path.join(job.folder, 'page-better.png') });
 await shoot('better.png');
 await page.evaluate((note) => window.vvgt.where.marks.part.set(JSON.stringify([['note', [[0, 0, 0]], note]])), job.note);
 noted.saved = [await save('.ply'), await save('.html'), await save('tf.json')];
+await tab(2);
 await page.selectOption('#live .axis', { index: 1 });
 noted.cut = await shown();
 await page.selectOption('#live .axis', { index: 0 });
 noted.uncut = await shown();
+await tab(1);
 await page.evaluate(() => document.querySelector('#live .light').closest('details').setAttribute('open', ''));
 await page.selectOption('#live .light select', 'headlight');
 noted.lit = [await shown()];

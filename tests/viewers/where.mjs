@@ -1,7 +1,8 @@
-// where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
+// where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "motion": whether pages may turn of themselves, "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; calm (less motion is asked for); wheel DY; drag X Y X Y; resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
-// (the page), bare FILE (without what lies over the picture); axe (findings of axe-core that are serious or critical); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads); framed URL STEPS (eval, click and until in the frame of a site; their answers).
+// Steps: open URL; served URL (of vvgt view); refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; hover X Y; calm (less motion is asked for); wheel DY; drag X Y X Y; resize W H; eval JS; until JS; settled (until two pictures are the same); shot FILE
+// (the page), bare FILE (without what lies over the picture); axe (findings of axe-core); tabs (what Tab misses, and where focus is not seen); save SELECTOR FILE (what a click downloads);
+// frame URL (a page that shows one in a frame), within JS (in that frame); framed URL STEPS (eval, click and until in the frame of a site; their answers).
 import fs from 'node:fs';
 import path from 'node:path';
 import readline from 'node:readline';
@@ -12,19 +13,20 @@ const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core'
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--force-color-profile=srgb', ...(job.args ?? [])];
 const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.size;
-const context = await browser.newContext({ viewport: { width, height }, deviceScaleFactor: 1, hasTouch: job.touch, isMobile: job.touch });
+const context = await browser.newContext({ viewport: { width, height }, deviceScaleFactor: 1, hasTouch: job.touch, isMobile: job.touch, reducedMotion: job.motion ? 'no-preference' : 'reduce' });
 const page = await context.newPage();
 page.setDefaultTimeout(300000);
 const asked = [], broken = [];
-await page.route(/^(https?|wss?):/, (route) => { asked.push(route.request().url()); return route.abort(); });
+let own = null;  // address of the server whose page is shown
+await page.route((url) => /^(https?|wss?):/.test(url.href) && url.origin !== own, (route) => { asked.push(route.request().url()); return route.abort(); });
 page.on('pageerror', (error) => broken.push(String(error)));
-page.on('console', (line) => { if (line.type() === 'error') broken.push(line.text()); });
+page.on('console', (line) => { if (line.type() === 'error' && !line.text().includes('in a sandboxed frame')) broken.push(line.text()); });
 
 async function open(url) {
   if (page.url() !== 'about:blank') await page.goto('about:blank');
   await page.goto(url);
-  await page.waitForFunction('window.vvgt !== undefined');
-  await settled();
+  while (!await page.evaluate('window.vvgt !== undefined')) await page.waitForTimeout(100);  // no function: a served page's policy forbids it
+  if (!job.motion) await settled();
 }
 
 async function settled() {
@@ -40,9 +42,10 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
+const HIDE = '#cut, #tabs, #tools, [data-tab]:not([data-tab=""]) :is(#slices, #marks), #live, #named, #series, #where, #places, .listed { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
+  served: (url) => { own = new URL(url).origin; return open(url); },
   refused: async (url) => {
     await page.goto(url);
     await page.waitForFunction(() => !['', 'loading'].includes(document.getElementById('said').textContent) || window.vvgt);
@@ -73,17 +76,26 @@ const steps = {
   },
   resize: (width, height) => page.setViewportSize({ width, height }),
   eval: (text) => page.evaluate(text),
+  frame: async (url) => {
+    await page.goto(url);
+    await page.frames()[1].waitForFunction('window.vvgt !== undefined');
+  },
+  within: (text) => page.frames()[1].evaluate(text),
   until: async (text) => { await page.waitForFunction(text); },
   shot: async (file) => { await page.screenshot({ path: file }); },
   bare: async (file) => {
-    const style = await page.addStyleTag({ content: HIDE });
+    await page.evaluate((text) => {  // no element, which a served page's policy forbids
+      const style = new CSSStyleSheet();
+      style.replaceSync(text);
+      document.adoptedStyleSheets = [style];
+    }, HIDE);
     await page.screenshot({ path: file });
-    await style.evaluate((element) => element.remove());
+    await page.evaluate(() => { document.adoptedStyleSheets = []; });
   },
   axe: async () => {
     await page.evaluate(fs.readFileSync(path.join(modules, 'node_modules', 'axe-core', 'axe.min.js'), 'utf8'));
     const { violations } = await page.evaluate('axe.run()');
-    return violations.filter(({ impact }) => ['serious', 'critical'].includes(impact)).flatMap(({ id, nodes }) => nodes.map(({ target, failureSummary }) => `${id}: ${target}: ${failureSummary}`));
+    return violations.flatMap(({ id, nodes }) => nodes.map(({ target, failureSummary }) => `${id}: ${target}: ${failureSummary}`));
   },
   tabs: async () => {
     await page.evaluate(() => {

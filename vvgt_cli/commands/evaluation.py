@@ -26,7 +26,7 @@ from vvgt_cli.gaussians.formats.levels import VIEW, split_name
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.gaussians.targets import target_of
-from vvgt_cli.images import write_png
+from vvgt_cli.images import captioned, write_png
 from vvgt_cli.images.metrics import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_degree
 from vvgt_cli.library.inputs import PathLike
@@ -197,7 +197,7 @@ def score(
             camera, axes = default_views("test", size=size)[PICTURED], upright_axes(volume, header.up)
             with run.stage("preview"):
                 sheet = side_by_side(field.views, inside, [camera, zoomed(camera, CLOSE)], axes, drawn)
-                write_png(preview, sheet, overwrite)
+                write_png(preview, captioned(sheet, 2), overwrite)
         if conditions:
             more = eye_pictures(target, headset_axes(volume, header.up))
             more += [] if isinstance(inside, Gaussians) else distance_pictures(size)

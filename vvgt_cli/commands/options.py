@@ -224,7 +224,7 @@ class Measure(click.ParamType[float]):
 
 title_option = click.option(
     "--title", metavar="TEXT",
-    help="Title of pages, recorded in the file. Default: kind and size of the volume, which name no file and nobody.",
+    help="Title of pages, recorded in the file. Default: kind of scan and function, or labels; no names of files.",
 )  # fmt: skip
 
 story_option = click.option(

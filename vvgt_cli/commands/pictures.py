@@ -451,6 +451,10 @@ def _gif(path: Path, frames: Iterator[np.ndarray], rate: int) -> None:
     colors = np.unique(np.concatenate(some), axis=0)  # each once, so that the background does not dominate
     colors = colors[:: max(len(colors) // _MOST, 1)]
     palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
+    if not colors[0].any():  # clusters are means, of which none is black
+        entries = np.array(palette.getpalette(), np.uint8).reshape(-1, 3)
+        entries[entries.sum(axis=1).argmin()] = 0
+        palette.putpalette(entries.ravel().tolist())
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // rate, loop=0, optimize=False)
 

@@ -31,11 +31,11 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
-from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, camera, page
+from vvgt_cli.gaussians.formats.page_file import PROGRAM, VIEWER, asked, asset, camera, farthest, page
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.sog import IMAGES, META
 from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed, placed, read_manifest
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, corners, is_streamed, placed, read_manifest
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.gaussians.story import Story
 from vvgt_cli.jit.ahead import DRAW, for_degree
@@ -237,8 +237,9 @@ def streamed_resources(file: str) -> dict[str, Resource]:
     splats, scale = placed(manifest)
     view = camera(splats)
     view |= {key: [scale * x for x in view[key]] for key in ("position", "target")}
+    reach = [] if asked(splats) else farthest(corners(manifest) * VIEWER)
     more: dict[str, Any] = {
-        "streamed": True, "camera": view, "outermost": [], "comments": splats.comments,
+        "streamed": True, "camera": view, "outermost": reach, "comments": splats.comments,
         "enlarged": scale,
     }  # fmt: skip
     name = Path(file).absolute().parent.name

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
+from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
@@ -113,7 +114,8 @@ class FrameSeries(Batch):
         from vvgt_cli.conversion.previous_frame import previous_frame
 
         outputs = (request.output, request.report, request.preview)
-        timed = request.output is None or any("{time" in (name or "") for name in outputs)
+        given = any("{time" in (name or "") for name in outputs)
+        timed = given or request.output is None or is_page(request.output)
         self._steps: Sequence[Step] = list_steps(request.source, timed)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])

@@ -132,7 +132,7 @@ class ConvertRequest:
         live: let the Gaussians carry values, so that they can be shown under any function (docs/live.md).
         values: a page also holds the values of the volume.
         command: command line that the file records; None from Python.
-        title: title of pages; None: kind and size of the volume, or the name of an example.
+        title: title of pages; None: what is shown, or the name of an example.
         story: of pages, not yet checked against the volume.
         scored: score the result, for which views are rendered; without, it is the closed form alone.
         all_views: score on all ten test views, by SSIM and FLIP too, as with a report.

@@ -18,6 +18,7 @@ from vvgt_cli.gaussians.formats.streamed import folder_of
 from vvgt_cli.gaussians.outputs import claimed, write_text
 from vvgt_cli.jit.ahead import EVALUATE
 from vvgt_cli.score.record import Run
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 
 @contextmanager
@@ -59,7 +60,7 @@ def write(
 
 def write_beside(run: Run, request: ConvertRequest, conversion: Conversion) -> None:
     """Report what the file's format costs, and write preview and report."""
-    from vvgt_cli.images import write_png
+    from vvgt_cli.images import captioned, write_png
 
     if format_of(str(request.output)):
         source = conversion.field.source
@@ -69,7 +70,7 @@ def write_beside(run: Run, request: ConvertRequest, conversion: Conversion) -> N
         )
     if request.preview:
         with run.stage("preview"):
-            write_png(request.preview, conversion.preview(), request.overwrite)
+            write_png(request.preview, captioned(conversion.preview(), len(PREVIEW_VIEWS)), request.overwrite)
     run.finish()
     if request.report:
         write_text(request.report, run.report.to_json(), request.overwrite)

@@ -158,10 +158,17 @@ class StyledVolume:
 
     @property
     def title(self) -> str:
-        """Kind and size of the volume, which identify no file and nobody."""
-        kind = "label map" if self.labels_alone else self.volume.modality
-        kind = kind or ("CT" if self.volume.hounsfield else "volume")
-        return f"{kind}, {' x '.join(map(str, self.volume.dims))}"
+        """What is shown, without naming a file or anybody: labels, or kind of scan and function; else the size."""
+        from vvgt_cli.look.readers.names import names
+
+        kind = self.volume.modality or ("CT" if self.volume.hounsfield else "")
+        kind = kind or (self.volume.quantity if self.volume.value_unit else "")
+        of, _, shows = self.name.partition("-") if self.name in names() else ("", "", "")
+        known = [kind or (of.upper() if of in ("ct", "mr") else of), shows.replace("-", " ")]
+        if self.labels_alone:
+            count = sum(len(layer.tf.labels) for layer in self.layers if isinstance(layer.tf, LabelTable))
+            known = [f"{count} labels" if count > 1 else "label map"]
+        return ", ".join(filter(None, known)) or f"volume, {' x '.join(map(str, self.volume.dims))}"
 
     @property
     def name(self) -> str:

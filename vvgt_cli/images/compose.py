@@ -44,6 +44,31 @@ def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> 
     return np.concatenate([left, right, np.clip(gain * np.abs(left - right), 0, 1)], axis=1)
 
 
+def captioned(sheet: np.ndarray, rows: int) -> np.ndarray:
+    """Write a line above each row of `side_by_side`, with the names of its pictures and its PSNR in dB.
+
+    Args:
+        sheet: (h, 3 w, 3) float32 in [0, 1], ``rows`` rows below each other.
+        rows: their number.
+
+    Returns:
+        (h + rows c, 3 w, 3) float32 in [0, 1], where c is the height of a line.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    wide, size = sheet.shape[1] // 3, min(max(sheet.shape[1] // 72, 9), 24)
+    font, parts = ImageFont.load_default(size), []
+    for pictures in np.split(sheet, rows):
+        error = float(((pictures[:, :wide] - pictures[:, wide : 2 * wide]) ** 2).mean())
+        line = Image.new("RGB", (3 * wide, 2 * size), (32, 32, 32))
+        names = ("volume", f"splats, {-10 * math.log10(error):.1f} dB" if error else "splats", "8 x difference")
+        for k, name in enumerate(names):
+            ImageDraw.Draw(line).text(((k + 0.5) * wide, size), name, (255, 255, 255), font, anchor="mm")
+        parts += [np.asarray(line, np.float32) / 255, pictures]
+    found: np.ndarray = np.concatenate(parts)
+    return found
+
+
 def contact_sheet(
     images: Sequence[np.ndarray], columns: int | None = None, gap: int = 4, background: Sequence[float] = BLACK
 ) -> np.ndarray:

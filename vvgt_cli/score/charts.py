@@ -8,8 +8,11 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from vvgt_cli.files import atomic_write
 from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, ReportRuns, Run, cost, pareto, psnr, short, stage_names
@@ -36,7 +39,10 @@ STYLE: dict[Any, Any] = {
     "grid.color": GRID, "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "font.sans-serif": ["DejaVu Sans"], "svg.fonttype": "none", "svg.hashsalt": "vvgt",
 }  # fmt: skip
-PLACES = ((8, 0, "left", "center"), (-8, 0, "right", "center"), (0, 8, "center", "bottom"), (0, -8, "center", "top"))
+PLACES = (
+    (8, 0, "left", "center"), (-8, 0, "right", "center"), (0, 8, "center", "bottom"), (0, -8, "center", "top"),
+    (5, 5, "left", "bottom"), (-5, 5, "right", "bottom"), (5, -5, "left", "top"), (-5, -5, "right", "top"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -150,6 +156,10 @@ def _label(axes: Any, labels: Sequence[tuple[Any, float, float, str, str]]) -> N
     reach = 6 * axes.figure.dpi / 72
     spots = axes.transData.transform([(x, y) for _, x, y, _, _ in labels])
     taken = [Bbox([spot - reach, spot + reach]) for spot in spots]
+    for line in axes.lines:
+        ends = line.get_transform().transform(line.get_xydata())
+        for a, b in pairwise(ends):
+            taken += [Bbox([a + share * (b - a) - 1, a + share * (b - a) + 1]) for share in np.linspace(0, 1, 200)]
     for _, x, y, text, color in labels:
         for dx, dy, across, along in PLACES:
             note = axes.annotate(
@@ -178,8 +188,8 @@ def _stages(axes: Any, series: Sequence[ReportRuns]) -> None:
     for place, (end, run) in enumerate(zip(ends, rows, strict=True)):
         axes.text(end, place, f" {cost(run):.2f} s", verticalalignment="center", fontsize=8.5, in_layout=False)
     axes.set_yticks(range(len(rows)), [run["name"] for run in rows], fontsize=8.5)
-    axes.margins(x=0.2, y=0.01)
-    axes.set_xlim(left=0)
+    axes.margins(y=0.01)
+    axes.set_xlim(0, 1.2 * max(ends, default=1))
     axes.invert_yaxis()
     axes.tick_params(axis="y", length=0)
     axes.figure.legend(loc="outside upper left", ncols=3, handlelength=1.2, columnspacing=1.2)

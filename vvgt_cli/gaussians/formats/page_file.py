@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
@@ -34,7 +33,7 @@ from vvgt_cli.gaussians.rules import INRIA, RULES
 PROGRAM = "viewer.js.gz"
 _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
-_PLACED = re.compile(r"vvgt (frame|up|camera) ")
+_PLACED = re.compile(r"vvgt (frame|up|space|camera) ")
 _TITLE = re.compile(r"vvgt title (\".*\")$")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _SCRIPTS, _STYLES = re.compile("<script>(.*?)</script>", re.S), re.compile("<style>(.*?)</style>", re.S)
@@ -45,6 +44,10 @@ _SEEN = -3.0  # opacity logit above which a Gaussian counts as visible
 _DRAWN = -5.5  # and below which it is not drawn: 1/255
 _FAINT = 0.05  # share of all opacity that may be out of view where it is spread over faint Gaussians
 _DISTANCE, _FIELD = 3.0, 40.0  # of orbit cameras: distance in radii, field of view in degrees
+VIEWER = (-1.0, -1.0, 1.0)  # times PLY x, y and z: the viewer's axes
+_CELLS = 40  # of a silhouette, along the longest edge
+_LARGER, _FLAT = 1.1, 1.5  # how many times as large a silhouette is for another view to be chosen, and one from above
+_RAISED, _TILTED = 0.1, 0.364  # height of the eye before a face, and beside other content, in horizontal distances
 
 
 def page_bytes(degree: int) -> tuple[float, float]:
@@ -72,24 +75,50 @@ def upright(options: PlyOptions) -> PlyOptions:
 
 
 def camera(splats: Splats) -> dict[str, Any]:
-    """Return the initial camera of the page: the file's, else that of `vvgt render --orbit` or a similar one.
+    """Return the initial camera of the page: the file's own, else of the view in which its content is recognised best.
+
+    That is the face of a body, and otherwise the side with the largest silhouette.
 
     Returns:
         position and target in the viewer's axes, where PLY (x, y, z) is (-x, -y, z); the field of view in degrees, of
         the shorter side of the window.
     """
-    if asked := _asked(splats):
-        return asked
+    if stated := asked(splats):
+        return stated
     middle, half = np.zeros(3), 1.0
     if not any(_UNIT.match(line) for line in splats.comments):
         middle = np.median(splats.means, axis=0).astype(np.float64)
         half = float(np.percentile(np.linalg.norm(splats.means - middle, axis=1), _FAR)) or 1.0
-    x, y, z = orbit_views(1, radius=_DISTANCE * half)[0].position  # +z is up
-    target = middle * (-1, -1, 1)
-    return {"position": (target + np.array([-x, z, y])).tolist(), "target": target.tolist(), "fov": _FIELD}
+    target, towards = middle * VIEWER, _face(splats.comments) or _largest_side(splats)
+    eye = target + _DISTANCE * half * np.array(towards) / np.linalg.norm(towards)
+    return {"position": eye.tolist(), "target": target.tolist(), "fov": _FIELD}
 
 
-def _asked(splats: Splats) -> dict[str, Any] | None:
+def _face(comments: Sequence[str]) -> tuple[float, float, float] | None:
+    """Return the direction from a body to an eye that sees its face, in the viewer's axes; None of other files."""
+    facts = facts_in([line for line in comments if _PLACED.match(line)], "page")
+    front = {"RAS": 1, "LPS": -1}.get(facts.get("space") or "")
+    if front is None:
+        return None
+    x, y, z = up_matrix(facts.get("up", "none")) @ (0, front, 0) * VIEWER
+    return None if abs(y) > 0.5 else (float(x), _RAISED, float(z))  # the face may look up
+
+
+def _largest_side(splats: Splats) -> tuple[float, float, float]:
+    """Return the direction to an eye that sees the side with the largest silhouette, in the viewer's axes.
+
+    A silhouette is the number of cells of a grid in which there is a visible Gaussian. The eye is high above content
+    that lies flat.
+    """
+    places = _visible([splats])
+    cells = np.round(_CELLS * (places - places[:1]) / max(float(np.ptp(places, axis=0).max(initial=0)), 1e-12))
+    x, y, z = (len(np.unique(np.delete(cells, axis, axis=1), axis=0)) for axis in range(3))
+    if y > _FLAT * max(x, z):
+        return (-0.3, 1.0, 0.0)
+    return (0.0, _TILTED, -1.0) if z > _LARGER * x else (-1.0, _TILTED, 0.0)
+
+
+def asked(splats: Splats) -> dict[str, Any] | None:
     """Return the camera that the file states, as `camera` does."""
     if not any(line.startswith("vvgt camera ") for line in splats.comments):
         return None
@@ -110,19 +139,29 @@ def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     These are the farthest Gaussians in 98 directions, of all that are not faint, and of fog the densest 95 %. The list
     is empty if nothing is visible, and if the first cloud states a camera, which stays where it is.
     """
-    if clouds and _asked(clouds[0]):
+    if clouds and asked(clouds[0]):
         return []
-    logits = np.concatenate([splats.logits for splats in clouds])
-    ordered = np.sort(logits).astype(np.float64)
-    opacity = np.cumsum(1 / (1 + np.exp(-np.maximum(ordered, -80))))
-    first = np.searchsorted(opacity, _FAINT * opacity[-1]) if len(ordered) else 0
-    least = np.clip(ordered[first : first + 1], _DRAWN, _SEEN)
-    places = np.concatenate([splats.means for splats in clouds])[logits >= least] * (-1.0, -1.0, 1.0)
+    return farthest(_visible(clouds))
+
+
+def farthest(places: np.ndarray) -> list[list[float]]:
+    """Return those of some places (N, 3) that are the farthest in one of 98 directions."""
     towards = np.array([d for d in product(range(-2, 3), repeat=3) if any(d)]).T
     if not len(places):
         return []
     found: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
     return found
+
+
+def _visible(clouds: Sequence[Splats]) -> np.ndarray:
+    """Return places (N, 3), in the viewer's axes, of Gaussians that are not faint, and of fog of the densest 95 %."""
+    logits = np.concatenate([splats.logits for splats in clouds])
+    ordered = np.sort(logits).astype(np.float64)
+    opacity = np.cumsum(1 / (1 + np.exp(-np.maximum(ordered, -80))))
+    first = np.searchsorted(opacity, _FAINT * opacity[-1]) if len(ordered) else 0
+    least = np.clip(ordered[first : first + 1], _DRAWN, _SEEN)
+    places: np.ndarray = np.concatenate([splats.means for splats in clouds])[logits >= least] * VIEWER
+    return places
 
 
 def rule_parameters(splats: Splats) -> dict[str, Any]:

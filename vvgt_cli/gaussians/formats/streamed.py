@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -141,3 +142,13 @@ def placed(manifest: dict[str, Any]) -> tuple[Splats, float]:
     turned = np.tile(np.array([1, 0, 0, 0], np.float32), (2, 1))
     splats = Splats(corners.astype(np.float32), empty, turned, empty[:, 0], empty, np.zeros((2, 0, 3)), comments)
     return splats, float(scale) if comments and isinstance(scale, (int, float)) and 0 < scale < 1e6 else 1.0
+
+
+def corners(manifest: dict[str, Any]) -> np.ndarray:
+    """Return the corners (N, 3) of the nodes' boxes, in the coordinates of the files; none if a node has no box."""
+    with suppress(KeyError, TypeError, ValueError):
+        boxes = [[node["bound"]["min"], node["bound"]["max"]] for node in nodes_of(manifest, MANIFEST)]
+        ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
+        found: np.ndarray = np.concatenate([ends[:, list(end), range(3)] for end in product((0, 1), repeat=3)])
+        return found if np.isfinite(found).all() else found[:0]
+    return np.empty((0, 3))

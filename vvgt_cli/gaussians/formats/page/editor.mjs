@@ -10,7 +10,7 @@ const WIDER = 60;  // px of a drag upwards after which all is e times as wide
 const HTML = `<svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity by value; double click adds a node, Delete removes it; drag beside the nodes to shift or widen the function">
 <defs><linearGradient></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
-<div><button class="preset" aria-expanded="false" title="presets"></button><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>
+<div><button class="preset" aria-expanded="false" title="presets"></button><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><button class="redo" aria-label="redo" title="redo (Ctrl+Y, Ctrl+Shift+Z)">↷</button>
 <button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div><div class="presets" role="group" aria-label="presets" hidden></div>`;
 const PRESET = `<canvas width="84" height="84" aria-hidden="true"></canvas><span></span>`;
 

@@ -5,7 +5,8 @@ const DEGREES = Math.PI / 180;
 const FITS = 0.9;  // share of that part that is filled
 const FARTHEST = 3;  // times that the eye may stand back for it; where the rest is smaller yet, the whole window
 const ALIKE = 1.1;  // times the least distance: of those parts the one nearest the middle of the window
-const OVER = '#live, #named, #series, #tools, #where .over';
+const TURN = 6;  // degrees a second
+const OVER = '#live, #live > header, #named, #series, #tools, #where .over';
 
 // the angles of the first view, degrees, as lens.pose() has them
 export function firstAngles({ camera: { position, target } }) {
@@ -23,42 +24,63 @@ export function fitting({ camera: { position, target, fov }, outermost = [] }, {
   return { target: middle, distance: Math.max(...back) };
 }
 
-// {x, y: its middle, target, distance} of that part
+// {x, y: its middle, wide, high, target, distance} of that part, and the `least` distance of any
 function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
     .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, width), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, height) }))
     .filter(({ left, right, top, bottom }) => left < right && top < bottom);
-  const whole = { x: width / 2, y: height / 2, ...fitting(scene, angles, width, height) }, found = [];
+  const whole = { x: width / 2, y: height / 2, wide: width, high: height, ...fitting(scene, angles, width, height) }, found = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', width)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', height)) {
     if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
+    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
   }
   const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
-  if (!(least < FARTHEST * whole.distance)) return whole;
-  return found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0];
+  if (!(least < FARTHEST * whole.distance)) return { ...whole, least: whole.distance };
+  return { ...found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
 }
 
-// Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the
-// view, all fits. draw(): letters and legend where they belong in the window as it is. Returns fit(angles): a view that fits.
+// Keeps the middle of the view in the middle of that part when panels open and the window changes; until somebody moves the
+// view, all fits. draw(): letters and legend where they belong in the window as it is.
+// {fit(angles): to a view that fits; times(angles): how far the eye stands back for the window, in distances for a square picture alone; turn(app, still): turns slowly until somebody does something, but not while still()}
 export function stayFree(lens, scene, draw) {
-  let fitted = null;
-  const numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
-  const fit = (angles) => {
+  let fitted = null, turning = false;
+  const { canvas } = lens, numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
+  const untouched = () => numbers(lens.pose()).every((x, k) => Math.abs(x - fitted[k]) < 1e-3);
+  const fit = ({ pitch, yaw }) => {
     draw();
-    const { x, y, ...place } = freePart(lens.canvas, scene, angles);
-    lens.set({ ...angles, ...place });
+    const { x, y, wide, high, target, distance } = freePart(canvas, scene, { pitch, yaw }), longer = Math.max(canvas.clientWidth, canvas.clientHeight, 1);
+    const around = turning ? Array.from({ length: 24 }, (_, k) => fitting(scene, { pitch, yaw: 15 * k }, wide, high, longer).distance) : [];
+    lens.set({ pitch, yaw, target, distance: Math.max(distance, ...around) });
     lens.middle = [x, y];
     fitted = numbers(lens.pose());
   };
   const place = () => {
-    if (numbers(lens.pose()).every((x, k) => Math.abs(x - fitted[k]) < 1e-3)) return fit(lens.pose());
+    if (untouched()) return fit(lens.pose());
     draw();
-    const { x, y } = freePart(lens.canvas, scene, lens.pose());
+    const { x, y } = freePart(canvas, scene, lens.pose());
     lens.middle = [x, y];
   };
   document.querySelector('#live .fold')?.addEventListener('click', place);
   addEventListener('resize', place);
   fit(firstAngles(scene));
-  return fit;
+  return {
+    fit, times: (angles) => freePart(canvas, scene, angles).least / fitting(scene, angles, 1, 1).distance,
+    turn(app, still) {
+      if (matchMedia('(prefers-reduced-motion: reduce)').matches || !untouched()) return;
+      turning = true;
+      const stop = () => { turning = false; }, more = (seconds) => {
+        turning &&= untouched();
+        if (!turning) return app.off('update', more);
+        if (still()) return;
+        const { yaw, ...rest } = lens.pose();
+        lens.set({ ...rest, yaw: ((yaw + TURN * seconds + 180) % 360) - 180 });
+        fitted = numbers(lens.pose());
+        app.renderNextFrame = true;
+      };
+      for (const event of ['pointerdown', 'wheel', 'keydown', 'focusin']) addEventListener(event, stop, { capture: true, once: true, passive: true });
+      fit(lens.pose());
+      app.on('update', more);
+    },
+  };
 }

@@ -14,7 +14,7 @@ export function helpRows(buttons, { live, values, picks, sliced }) {
     ...buttons.filter(({ key }) => key).map(({ title, key }) => [key.toUpperCase(), title]),
     ['Page Up and Down, swipe', 'previous and next step of a story'],
     ...(live?.next ? [['K', 'switch between colours, MIP and X-ray']] : []),
-    ...(live ? [['Ctrl+Z', 'undo']] : []),
+    ...(live ? [['Ctrl+Z, Ctrl+Y', 'undo, redo']] : []),
     ...(sliced ? [['in a slice', 'drag across for the window, up or down for the level; click to move the cross; wheel or arrow keys to step']] : []),
     ...(values ? [['function', 'drag a node or use the arrow keys; double click adds a node, Delete removes it. Drag beside the nodes to shift (across) or widen (up) the function; Page Up and Down shift it, with Shift widen it']] : []),
     ['Esc', 'close panels, clear the clicked point'],

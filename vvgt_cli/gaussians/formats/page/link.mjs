@@ -2,21 +2,19 @@
 // which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 
-// the distance is of a square picture, as the viewer's field of view is along the longer side
-const shape = ({ canvas: { clientWidth: w, clientHeight: h } }) => Math.max(w, h, 1) / Math.max(Math.min(w, h), 1);
-
-export function viewParts(lens) {
+// the distance is that of a square picture: times(angles) as far in the window as it is, for as much to be seen beside the panels
+export function viewParts(lens, times) {
   return [
     { key: 'projection', get: () => (lens.flat ? 'orthographic' : ''), set: (text) => { lens.flat = text === 'orthographic'; } },
     {
       key: 'view',
       get: () => {
         const { target, pitch, yaw, distance } = lens.pose();
-        return [...target, pitch, yaw, distance / shape(lens)].map((x) => number(x)).join(',');
+        return [...target, pitch, yaw, distance / times({ pitch, yaw })].map((x) => number(x)).join(',');
       },
       set: (text) => {
         const [x, y, z, pitch, yaw, distance] = text.split(',').map(Number);
-        if ([x, y, z, pitch, yaw, distance].every(Number.isFinite) && distance > 0) lens.set({ target: [x, y, z], pitch, yaw, distance: distance * shape(lens) });
+        if ([x, y, z, pitch, yaw, distance].every(Number.isFinite) && distance > 0) lens.set({ target: [x, y, z], pitch, yaw, distance: distance * times({ pitch, yaw }) });
       },
     },
   ];

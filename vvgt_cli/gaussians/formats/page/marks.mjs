@@ -19,7 +19,7 @@ export function amountOf({ kind, places }) {
 }
 
 // worldNow(): of where.mjs; changed(): what is drawn; save(): this page, or null where it cannot be saved.
-// {root, open, toggle(), stop(), renew(), take(place): clicked; list, begun: places of the next; draw(group, all), part: of links}
+// {root, open, toggle(), renew(), take(place): clicked; list, begun: places of the next; draw(group, all), part: of links}
 export function marksOf(worldNow, changed, save) {
   const root = Object.assign(document.createElement('section'), { id: 'marks', hidden: true, innerHTML: HTML });
   root.setAttribute('aria-label', 'rulers, angles and notes');
@@ -66,7 +66,7 @@ export function marksOf(worldNow, changed, save) {
   choose(kind);
 
   return {
-    root, toggle: () => show(root.hidden), stop: () => show(false), renew: () => put(),  // in another unit
+    root, toggle: () => show(root.hidden), renew: () => put(),  // in another unit
     get open() { return !root.hidden; },
     get list() { return list; },
     get begun() { return begun; },

@@ -20,7 +20,7 @@ function row({ name, number }, k) {
 export function organs(apply, labels, key, history) {
   const root = document.createElement('div');
   root.className = 'organs';
-  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><input type="search" placeholder="search ${labels.length} labels" aria-label="search the labels"><button class="all" title="show all labels">all</button><button class="none" title="hide all labels">none</button></div><ul></ul>`;
+  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><button class="redo" aria-label="redo" title="redo (Ctrl+Y, Ctrl+Shift+Z)">↷</button><input type="search" placeholder="search ${labels.length} labels" aria-label="search the labels"><button class="all" title="show all labels">all</button><button class="none" title="hide all labels">none</button></div><ul></ul>`;
   const find = (selector) => root.querySelector(selector), list = find('ul');
   find('[type=search]').hidden = labels.length <= SEARCHED;
   list.append(...labels.map(row));
@@ -51,7 +51,7 @@ export function organs(apply, labels, key, history) {
   const every = (on) => { now = { rows: now.rows.map((one) => ({ ...one, on })), solo: -1 }; };
   const rowOf = (target) => Number(target.closest('li').dataset.row);
   root.addEventListener('click', ({ target }) => {
-    if (target.tagName !== 'BUTTON' || target.className === 'undo') return;
+    if (target.tagName !== 'BUTTON' || /^(un|re)do$/.test(target.className)) return;
     history.keep();
     if (target.className === 'all' || target.className === 'none') every(target.className === 'all');
     else if (target.className === 'eye') change(rowOf(target), { on: !now.rows[rowOf(target)].on });

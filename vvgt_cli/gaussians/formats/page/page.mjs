@@ -57,8 +57,8 @@ function draw(app, { dilation, shifted, reach }) {
 function series(viewer) {
   const { app } = viewer, entity = app.root.findByName('gsplat');
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
-  const box = document.createElement('div');
-  box.id = 'series';
+  const box = Object.assign(document.createElement('section'), { id: 'series' });
+  box.setAttribute('aria-label', 'frames');
   box.innerHTML = '<button aria-label="play" title="play">▶</button><input type="range" min="0" value="0" aria-label="frame"><select aria-label="choose a frame"></select>';
   const [button, slider, list] = box.children;
   slider.max = scene.frames.length - 1;
@@ -158,15 +158,16 @@ async function start() {
   deliver?.(response);
   if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
   Object.assign(viewer.state, { cameraMode: 'orbit', inputEnabled: false });  // the viewer would turn the object; keys are ours
-  if (scene.frames.length === 1 && !scene.look) document.body.append(named());
+  if (!scene.look) document.body.append(named());
   const grids = scene.values ? sharedGrids(scene.values) : null, live = scene.look ? panel(raycaster(scene.look, grids, viewer), viewer, scene.look) : null;
   if (live) served(live, viewer, scene.server);
   const show = scene.frames.length > 1 ? series(viewer) : null, here = where(viewer, scene, live, show, grids);
-  await here.restored;
+  const linked = await here.restored;
   document.body.classList.remove('begins');
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };
   here.site.loaded();
+  if (!linked && !scene.story?.length && scene.outermost.length) here.turn();
 }
 
 start().catch((error) => {

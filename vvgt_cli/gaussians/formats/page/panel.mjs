@@ -4,17 +4,15 @@ import { editor } from './editor.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
 
-const HTML = `<header><span class="named"><b></b><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
+const HTML = `<header><span class="named"><h1></h1><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
 <output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="draw as" title="draw as (k)"></select>`;
 const KINDS = ['colours', 'MIP', 'X-ray'];
 const STEPS = 200, SMALL = 84;  // that undo goes back; px of a small picture
 
-// the file's name and what kind it is
-export function named(kind = '', element = document.createElement('header')) {
-  if (!element.className) element.id = 'named';
-  element.replaceChildren(document.createElement('b'), document.createElement('i'));
-  [element.firstChild.textContent, element.lastChild.textContent] = [document.title, kind];
-  element.firstChild.title = document.title;
+// the title line
+export function named() {
+  const element = Object.assign(document.createElement('header'), { id: 'named', innerHTML: '<h1></h1>' });
+  element.firstChild.textContent = element.firstChild.title = document.title;
   return element;
 }
 
@@ -25,16 +23,18 @@ export function panel(look, viewer, live) {
   root.setAttribute('aria-label', 'look');
   root.innerHTML = HTML;
   document.body.append(root);
-  named('', root.querySelector('.named'));
-  const find = (selector) => root.querySelector(selector), list = find('.layer'), undone = [], parts = [], layers = [];
+  const find = (selector) => root.querySelector(selector), heading = find('h1'), list = find('.layer'), done = [], undone = [], parts = [], layers = [];
   let told = () => {}, chosen = 0;
+  heading.textContent = heading.title = document.title;
 
-  const enable = () => root.querySelectorAll('.undo').forEach((button) => { button.disabled = !undone.length; });
+  const enable = () => [['undo', done], ['redo', undone]].forEach(([name, list]) => root.querySelectorAll(`.${name}`).forEach((button) => { button.disabled = !list.length; }));
+  const states = () => parts.map((part) => part.state());
   const history = {
     // before a change: what undo goes back to
     keep() {
-      undone.push(parts.map((part) => part.state()));
-      if (undone.length > STEPS) undone.shift();
+      done.push(states());
+      if (done.length > STEPS) done.shift();
+      undone.length = 0;
       enable();
     },
     add: (part) => parts.push(part),
@@ -43,8 +43,9 @@ export function panel(look, viewer, live) {
     light: (to) => lamp.set(lit(to)),
   };
 
-  function undo() {
-    const then = undone.pop();
+  function undo(from = done, to = undone) {
+    const then = from.pop();
+    if (then) to.push(states());
     then?.forEach((state, k) => { if (parts[k].state() !== state) parts[k].set(state); });
     enable();
   }
@@ -110,19 +111,20 @@ export function panel(look, viewer, live) {
     find('.fold').setAttribute('aria-expanded', String(!folded));
   };
   find('.fold').addEventListener('click', () => fold(!root.classList.contains('folded')));
-  root.addEventListener('click', ({ target }) => { if (target.className === 'undo') undo(); });
+  root.addEventListener('click', ({ target }) => { if (target.className === 'undo') undo(); else if (target.className === 'redo') undo(undone, done); });
   window.addEventListener('keydown', (event) => {
-    if ((event.ctrlKey || event.metaKey) && !event.shiftKey && event.key.toLowerCase() === 'z') {
-      event.preventDefault();
-      undo();
-    }
+    const key = event.key.toLowerCase();
+    if (!(event.ctrlKey || event.metaKey) || (key !== 'z' && key !== 'y')) return;
+    event.preventDefault();
+    if (key === 'z' && !event.shiftKey) undo();
+    else undo(undone, done);
   }, true);
 
-  fold(innerWidth < 700);
+  fold(false);
   enable();
   choose(0);
   return {
-    root, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
+    root, fold, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
     drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
     alone: () => drawn > 0 || cut.planes().length > 0, lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),

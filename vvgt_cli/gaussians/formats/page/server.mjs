@@ -1,5 +1,6 @@
 // The look of a page: under its own the Gaussians are shown, under others the volume itself; a server converts it for these meanwhile. Files to save.
 import { Asset, Entity } from 'playcanvas';
+import { save as download } from './saved.mjs';
 
 const QUIET = 300, ASK = 300;  // milliseconds without a change after which the server is asked; between two looks
 const NAMES = { ply: 'the Gaussians', html: 'a page', json: 'the transfer function' };
@@ -33,14 +34,6 @@ export function functionFile(nodes, { values: [lo, hi], opacity_unit_distance, n
 
 // labels as a table that --labels reads
 const labelsFile = (rows) => Object.fromEntries(rows.map(({ number, ...rest }) => [number, rest]));
-
-function download(content, name) {
-  const link = document.createElement('a');
-  link.href = URL.createObjectURL(content);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-}
 
 const send = (to, what) => fetch(to, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(what) });
 const reason = async (answer) => (answer.status === 400 ? answer.text() : `the server answered ${answer.status}`);
@@ -102,7 +95,8 @@ export function served(panel, viewer, server) {
   function put() {
     volume.show(!improved());
     const [what, why = ''] = (improved() ? told : 'volume').split(/: (.*)/s);
-    kind.textContent = what;
+    root.dataset.shows = what;
+    if (server) kind.textContent = what;  // on a reader's screen (i) says it
     if (!busy) say(why || volume.said);
   }
   panel.covering = (now) => {

@@ -57,10 +57,3 @@ export function pageOf(source, link) {
   scene.textContent = JSON.stringify({ ...JSON.parse(scene.textContent), link }).replaceAll('<', '\\u003c');  // so that no name can end the script
   return new Blob([`<!doctype html>\n${source.documentElement.outerHTML}\n`], { type: 'text/html' });
 }
-
-export function save(blob, name) {
-  const link = document.createElement('a');
-  [link.href, link.download] = [URL.createObjectURL(blob), name];
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-}

@@ -2,7 +2,7 @@
 // A step is {text} with the texts of a link, {link}, or with what a story.json states (docs/live.md): {camera, cut, function, labels, layer, light, slices, frame}.
 import { listed } from './keys.mjs';
 import { partsOf, put, saidBy } from './link.mjs';
-import { save } from './shot.mjs';
+import { save } from './saved.mjs';
 
 const MOST = 100, LONG = 2000;  // steps; letters of a text
 const GLIDE = 900, MOST_AT_ONCE = 0.25, SWIPE = 40;  // milliseconds from view to view; share of it in one frame, however slow; px

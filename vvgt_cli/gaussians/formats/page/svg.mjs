@@ -22,3 +22,14 @@ export function label(text, x, y, attributes = {}) {
   const look = { fill: '#fff', stroke: '#000', 'stroke-width': 3, 'stroke-opacity': 0.7, 'paint-order': 'stroke', 'font-size': 13, 'font-family': 'system-ui, sans-serif' };
   return element('text', { x: x.toFixed(1), y: y.toFixed(1), ...look, ...attributes }, text);
 }
+
+// Moves texts up or down to where they lie over no other text, neither of these nor of those that stay
+export function moveApart(texts, stay) {
+  const boxes = stay.map((text) => text.getBBox());
+  for (const text of texts.filter(({ textContent }) => textContent)) {
+    const { x, y, width, height } = text.getBBox(), free = (by) => boxes.every((b) => x >= b.x + b.width || b.x >= x + width || y + by >= b.y + b.height || b.y >= y + by + height);
+    const by = Array.from({ length: 41 }, (_, k) => ((k % 2 ? -1 : 1) * Math.ceil(k / 2) * height) / 4).find(free) ?? 0;
+    text.setAttribute('y', (Number(text.getAttribute('y')) + by).toFixed(1));
+    boxes.push({ x, y: y + by, width, height });
+  }
+}

@@ -12,13 +12,15 @@ import { marksOf } from './marks.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
 import { drawCross, drawPlace, pickerOf, placeText, valueText } from './ruler.mjs';
 import { drawScale } from './scale.mjs';
+import { save } from './saved.mjs';
 import { sharing } from './share.mjs';
-import { pageOf, pictureOf, save, sizesOf } from './shot.mjs';
+import { sheet } from './sheet.mjs';
+import { pageOf, pictureOf, sizesOf } from './shot.mjs';
 import { slicesOf } from './slices.mjs';
 import { storyOf } from './story.mjs';
-import { element } from './svg.mjs';
+import { element, moveApart } from './svg.mjs';
 
-const LEFT = 12, NARROW = 700;  // px; of a picture in which the panel would lie over what is clicked
+const LEFT = 12;  // px
 const AWAY = 2, UP = 1.3;  // m in a headset, to the middle of the body, whose longest edge is 2 m: away, and above the floor
 const icon = (path) => `<svg viewBox="0 0 18 18" aria-hidden="true"><path d="${path}"/></svg>`;
 const ICONS = {
@@ -69,7 +71,7 @@ export function where(viewer, scene, live, show, grids) {
     },
   });
   let faced = 'null';
-  const seen = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
+  const seen = [marks.part, ...(slices ? [slices.part] : []), ...viewParts(lens, (angles) => free.times(angles)), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
   const story = storyOf({ lens, live, seen, apply: (what) => site.apply(what), slices, moving: again, begins: scene.story, page: saved }), parts = [...story.parts, ...seen];
 
   if (live) live.begins = () => saidBy(parts.filter(({ key }) => !/^(function|labels|light|drawn)/.test(key)));  // of a page that the server makes for the look
@@ -115,22 +117,17 @@ export function where(viewer, scene, live, show, grids) {
   button('fit', 'fit into the window', 'f', () => look(lens.pose()));
   button('reset', 'reset the view', 'r', () => { last = null; look(firstAngles(scene)); });
   const projection = button('perspective', 'switch between perspective and orthographic', 'o', () => { lens.flat = !lens.flat; again(); });
-  const measure = (now) => {
-    if (now) marks.toggle();
-    else marks.stop();
-    if (marks.open && svg.clientWidth < NARROW) document.querySelector('#live:not(.folded) .fold')?.click();
+  const measure = (open) => {
+    if (open !== marks.open) marks.toggle();
     lens.canvas.classList.toggle('measuring', marks.open);
     clicked = null;
     again();
   };
-  const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(true));
+  const measuring = button('measure', 'rulers, angles and notes', 'm', () => measure(!marks.open));
   measuring.hidden = Boolean(scene.streamed);
   const slicing = slices && button('slices', 'slices of the volume', 's', () => slices.toggle());
   const drawing = (size) => pictureOf(viewer, svg, size, live?.look, isMedical(world, scene.values) ? DIAGNOSIS : '');
-  const picture = (size) => drawing(size).then((blob) => {
-    save(blob, `${name()}.png`);
-    if (origin === 'null' && parent !== window) again('no file? This frame forbids downloads: copy the picture (e), or open the page in a tab of its own');
-  }, ({ message }) => again(message));
+  const picture = (size) => drawing(size).then((blob) => save(blob, `${name()}.png`), ({ message }) => again(message));
   sizes.of(button('picture', 'save a picture (PNG)', 'p', () => {
     sizes.root.lastChild.replaceChildren(...sizesOf(app).map((size) => {
       const made = Object.assign(document.createElement('button'), { textContent: `${size.join(' × ')} px` });
@@ -161,6 +158,12 @@ export function where(viewer, scene, live, show, grids) {
   help.of(button('help', 'mouse, touch and keys', 'h', help.toggle));
   about.of(button('about', 'about this file', 'i', about.toggle));
   help.rows(helpRows(buttons.filter(({ made }) => !made.hidden), { live, values, picks: !scene.streamed, sliced: slices }));
+  help.root.before(sheet({
+    ...(live && Object.fromEntries(['look', 'cut'].map((name) => [name, { root: live.root, show: (open) => live.fold(!open) }]))),
+    ...(slices && { slices: { root: slices.root, show: slices.toggle } }),
+    ...(scene.streamed ? {} : { measure: { root: marks.root, show: measure } }),
+    share: { root: shared.root, show: shared.toggle },
+  }));
   lens.canvas.tabIndex = 0;
   lens.canvas.setAttribute('role', 'application');
   lens.canvas.setAttribute('aria-label', `${document.title}, in 3D: arrow keys turn, plus and minus zoom, h for help`);
@@ -203,6 +206,7 @@ export function where(viewer, scene, live, show, grids) {
     if (at) drawPlace(rest, at, valueText(clicked));
     if (slices?.open) drawCross(rest, lens, slices.lines().map((line) => line.map(world.at)));
     svg.replaceChildren(letters, colors, rest);
+    moveApart([...rest.querySelectorAll('text')], [...svg.querySelectorAll('.over text')]);
     handles?.draw(world);
     if (slices && live) drawFaces();
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
@@ -227,8 +231,8 @@ export function where(viewer, scene, live, show, grids) {
   live?.look.begin(lens, () => world, live.covering);
   spread();
   addEventListener('resize', spread);
-  const fit = stayFree(lens, scene, draw);
+  const free = stayFree(lens, scene, draw), { fit } = free;
   Object.defineProperty(state, 'clicked', { get: () => clicked });
-  Object.assign(state, { lens, marks, site, slices, story, restored: restore(parts, scene.link).then((found) => found || story.begin()), link: () => linkOf(parts), picture: drawing, get world() { return world; }, get facts() { return facts; } });
+  Object.assign(state, { lens, marks, site, slices, story, restored: restore(parts, scene.link).then((found) => found || story.begin()), link: () => linkOf(parts), turn: () => free.turn(app, () => live?.look.shows), picture: drawing, get world() { return world; }, get facts() { return facts; } });
   return state;
 }
