@@ -31,6 +31,7 @@ from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 
 if TYPE_CHECKING:
+    from vvgt_cli.gaussians.formats.page_values import Values
     from vvgt_cli.look.function import TransferFunction
 
 
@@ -46,12 +47,14 @@ class Cloud(Result):
         stem: part of file names: a frame's number, a function's name, a label's number and name.
         facts: entries of the index.
         directions: normals (K, 3) for a `.ply`, unit frame; None for zeros.
+        held: values of its volume, for a page of all clouds; None where they are left out.
     """
 
     name: str
     stem: str
     facts: dict[str, Any]
     directions: np.ndarray | None
+    held: Values | None = None
 
     def shown_name(self) -> str:
         """Return the name in the list of a page."""
@@ -186,7 +189,8 @@ class Clouds(Mapping[str, Result]):
         """Return one page of all clouds."""
         from vvgt_cli.gaussians.formats.page_look import page_of_several
 
-        return page_of_several([(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
+        shown = [(cloud.shown_name(), cloud.gaussians, cloud.ply) for cloud in self.clouds]
+        return page_of_several(shown, name, [cloud.held for cloud in self.clouds])
 
     def _repr_html_(self) -> str | None:
         """Return the page for a notebook; None where a library is missing."""

@@ -184,10 +184,10 @@ class StyledVolume:
                 "field (try --labels none to read label numbers as values)"
             )
 
-    def values(self, room: float | None = None) -> Values | None:
+    def values(self, room: float | None = None, share: int = 1) -> Values | None:
         """Return the grids of all layers for a page, read part by part; None if all layers have colours.
 
-        ``room``: bytes that they may take there.
+        ``room``: bytes that they may take there; ``share``: number of volumes on the page.
         """
         from vvgt_cli.gaussians.formats import page_values
 
@@ -196,7 +196,7 @@ class StyledVolume:
             None if layer.colors else page_values.Layer(layer.volume, layer.tf, layer.unit_distance, known)
             for layer in self.layers
         ]
-        return page_values.values_of(layers, room)
+        return page_values.values_of(layers, room, share)
 
     def with_function(self, tf: TransferFunction) -> StyledVolume:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""
