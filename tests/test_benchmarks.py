@@ -46,6 +46,8 @@ TABLES = [
     ("live", {"SIZE": SIZE}, "SCENES -o a.csv --gaussians 200 --lit", "closed form", 15),
     ("network", {"default_views": default_views, "CASES": [("lines", 64, 2, 1)]}, "measure MODEL -o a.csv --repeats 1",
      "peak_gib", 0.05),
+    ("page", {"KINDS": {"lit": (0, "headlight", None), "mip": (1, "none", "mip")}},
+     "SCENES -o a.csv --size 64 --kind lit --kind mip --pictures pictures", "rest", 30),
     ("parts", {}, f"SCENES -o a.csv -- {PARTS}", "psnr", 10),
     ("plan", {"KINDS": {"default": tuple(f"{FEW} --steps 1".split())}}, "SCENES -o a.csv", "predicted_s", 0),
     ("refinement", REFINED, "equal SCENES -o a.csv", "closed_form", 10),

@@ -127,7 +127,8 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         2, "convert", "four.nii", "-o", "four.html", "--max-megabytes", "1", "--tf", "tf.json", "--screen", "32"
     )
     assert "--max-megabytes with one file of several clouds" in done
-    done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--no-values", *how)
+    two = ("--tf", "viridis", "--time", "0")
+    done = vvgt.fails(2, "convert", "four.nii", "-o", "four.html", "--no-values", *two, *how)
     assert "--no-values with one file of several clouds" in done
     assert "is for a page" in vvgt.fails(2, "convert", "four.nii", "-o", "four_{}.ply", "--no-values", *how)
     white = {"rgb": [1, 1, 1]}

@@ -234,7 +234,7 @@ story_option = click.option(
 
 values_option = click.option(
     "--no-values", "values", is_flag=True, default=True, flag_value=False,
-    help="Omit the volume's values from the page (.html) of one volume, and with them slices and changes of its look.",
+    help="Omit the values from the page (.html) of a volume or a series, and with them slices and changes of its look.",
 )  # fmt: skip
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")

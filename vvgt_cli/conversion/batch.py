@@ -74,7 +74,7 @@ CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options tha
         "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
         "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
         "--max-megabytes": WHOLE,
-        "--no-values": "it holds none, for each cloud has its own volume; remove it",
+        "--no-values": "it holds none but of a series; remove it",
     },
 }
 CANNOT[LAYERS] = {option: why for option, why in CANNOT[LABELS].items() if option not in ("--tf", "--labels none")} | {

@@ -32,6 +32,7 @@ from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.story import Story, StoryLike, read_story
 
 if TYPE_CHECKING:
+    from vvgt_cli.gaussians.formats.page_values import Values
     from vvgt_cli.look.function import TransferFunction
 
 
@@ -47,12 +48,14 @@ class Cloud(Result):
         stem: part of file names: a frame's number, a function's name, a label's number and name.
         facts: entries of the index.
         directions: normals (K, 3) for a `.ply`, unit frame; None for zeros.
+        held: values of its volume, for a page of all clouds; None where they are left out.
     """
 
     name: str
     stem: str
     facts: dict[str, Any]
     directions: np.ndarray | None
+    held: Values | None = None
 
     def shown_name(self) -> str:
         """Return the name in the list of a page."""
@@ -193,8 +196,8 @@ class Clouds(Mapping[str, Result]):
         from vvgt_cli.gaussians.formats.page_look import page_of_several
 
         plys = [cloud.ply if story is None else replace(cloud.ply, story=story) for cloud in self.clouds]
-        named = zip(self.clouds, plys, strict=True)
-        return page_of_several([(cloud.shown_name(), cloud.gaussians, ply) for cloud, ply in named], name)
+        shown = [(cloud.shown_name(), cloud.gaussians, ply) for cloud, ply in zip(self.clouds, plys, strict=True)]
+        return page_of_several(shown, name, [cloud.held for cloud in self.clouds])
 
     def _repr_html_(self) -> str | None:
         """Return the page for a notebook; None where a library is missing."""

@@ -230,7 +230,10 @@ class Memory:
         if own != self._first[0]:  # another layer's
             gaussians = to_frame_of(gaussians, own, self._first[0])
             ply = replace(ply, **{name: getattr(self._first[1], name) for name in PLACE})
-        self._made = Cloud(gaussians, found.report, ply, item.name, item.stem, dict(item.facts), normals)
+        values = None
+        if batch.kind == FRAMES and item.request.values:
+            values = found.field.source.values(share=len(batch.stems))
+        self._made = Cloud(gaussians, found.report, ply, item.name, item.stem, dict(item.facts), normals, values)
         return found.report
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
@@ -308,7 +311,7 @@ def convert_all(
     nodes = together and kind == FUNCTIONS and not is_page(output)
     also = {NO_PAGE: not is_page(output), ONE_FILE: together, NODES: nodes}
     for one in [*kinds, *(one for one, so in also.items() if so)]:
-        check_options(one, used)
+        check_options(one, used - {"--no-values"} if kind == FRAMES and one != NO_PAGE else used)
     check_opened(output, request.fit.target)
     if request.blocks is not None and request.blocks.shard is not None:
         write_shard(request, console)
@@ -327,7 +330,7 @@ def convert_all(
     if kind == ONE:
         kind, together = FRAMES, bool(output)
         for one in [FRAMES, *([ONE_FILE] if together else [])]:
-            check_options(one, used)
+            check_options(one, used - {"--no-values"})
     share = WHOLE_RUN if shard is None else parse_shard(shard)
     request = replace(request, shares_output=together)
     looks = {name: replace(request, source=one.source) for name, one in requests.items()}
@@ -349,6 +352,10 @@ def _save_one_file(batch: Batch, request: ConvertRequest, output: str, console: 
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
         names = [cloud.shown_name() for cloud in clouds.clouds]
-        run.console.message(contents(clouds.clouds[0].ply, output, names) if is_page(output) else SORTED.format(output))
+        run.console.message(
+            contents(clouds.clouds[0].ply, output, names, clouds.clouds[0].held)
+            if is_page(output)
+            else SORTED.format(output)
+        )
         run.finish()
     return clouds

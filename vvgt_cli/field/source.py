@@ -208,14 +208,14 @@ class StyledVolume:
             for layer in self.layers
         ]
 
-    def values(self, room: float | None = None) -> Values | None:
+    def values(self, room: float | None = None, share: int = 1) -> Values | None:
         """Return the grids of all layers for a page, read part by part; None if all layers have colours.
 
-        ``room``: bytes that they may take there.
+        ``room``: bytes that they may take there; ``share``: number of volumes on the page.
         """
         from vvgt_cli.gaussians.formats.page_values import values_of
 
-        return values_of(self.page_layers, room)
+        return values_of(self.page_layers, room, share)
 
     def with_function(self, tf: TransferFunction) -> StyledVolume:
         """Return the same volume under another function on data values, unlit; raise UsageError for an optics grid."""

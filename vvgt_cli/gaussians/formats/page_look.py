@@ -66,13 +66,26 @@ def page_contents(values: Values | None, options: PlyOptions) -> tuple[dict[str,
     return values.elements, values.scene | look | story
 
 
-def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
-    """Return the page of several named clouds with fixed looks; raise DataError, UsageError as `html` does."""
+def page_of_several(
+    clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str, values: Sequence[Values | None] = ()
+) -> bytes:
+    """Return the page of several named clouds; raise DataError, UsageError as `html` does.
+
+    ``values``: of the volume of each, all with the look of the first; looks are fixed where one has none.
+    """
     baked = [
         (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
         for cloud, gaussians, options in clouds
     ]
-    return html_of_several(baked, name, *page_contents(None, clouds[0][2]))
+    held = [one for one in values if one is not None and one.look is not None]
+    elements, scene = page_contents(None, clouds[0][2])
+    if held and len(held) == len(clouds):
+        framed = list[list[dict[str, Any]]]()
+        for k, one in enumerate(held):
+            framed.append([{**facts, "element": f"{facts['element']}-{k}"} for facts in one.facts])
+            elements |= {facts["element"]: content for facts, content in zip(framed[-1], one.contents, strict=True)}
+        scene |= {"framed": framed, "look": look_entry(held[0], clouds[0][2])}
+    return html_of_several(baked, name, elements, scene)
 
 
 def look_entry(values: Values, options: PlyOptions) -> dict[str, Any]:

@@ -104,17 +104,19 @@ class Values(NamedTuple):
         )
 
 
-def values_of(layers: Sequence[Layer | None], room: float | None = None) -> Values | None:
+def values_of(layers: Sequence[Layer | None], room: float | None = None, share: int = 1) -> Values | None:
     """Return the grids of layers, read part by part.
 
     Args:
         layers: None for one with colours, which has no grid; the look of none can be changed then.
         room: bytes that they may take on a page.
+        share: number of volumes, such as frames, that a page's cells are shared among.
 
     Returns:
         None if no layer has a grid, or there is no room for `FEWEST` cells.
     """
-    most, found = MAX_CELLS, _grids(layers, MAX_CELLS)
+    most = MAX_CELLS if share == 1 else max(MAX_CELLS // share, FEWEST)
+    found = _grids(layers, most)
     while found is not None and room is not None and found.size > room:
         if most <= FEWEST:
             return None

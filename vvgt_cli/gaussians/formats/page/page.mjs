@@ -7,7 +7,7 @@ import { panel, named } from './panel.mjs';
 import { patched } from './patch.mjs';
 import { raycaster } from './raycast.mjs';
 import { served, waiting } from './server.mjs';
-import { sharedGrids } from './volume.mjs';
+import { framedGrids, sharedGrids } from './volume.mjs';
 import { where } from './where.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
@@ -54,7 +54,7 @@ function draw(app, { dilation, shifted, reach }) {
   if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
 }
 
-function series(viewer) {
+function series(viewer, changed) {
   const { app } = viewer, entity = app.root.findByName('gsplat');
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
   const box = Object.assign(document.createElement('section'), { id: 'series' });
@@ -102,6 +102,7 @@ function series(viewer) {
         app.renderNextFrame = true;
         said.textContent = '';
         shown = k;
+        changed();
       } catch (error) {
         assets.delete(k);
         said.textContent = `${scene.frames[k].name} could not be loaded: ${error}`;
@@ -159,9 +160,10 @@ async function start() {
   if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
   Object.assign(viewer.state, { cameraMode: 'orbit', inputEnabled: false });  // the viewer would turn the object; keys are ours
   if (!scene.look) document.body.append(named());
-  const grids = scene.values ? sharedGrids(scene.values) : null, live = scene.look ? panel(raycaster(scene.look, grids, viewer), viewer, scene.look) : null;
+  const frame = () => Math.max(document.querySelector('#series select')?.selectedIndex ?? 0, 0);
+  const grids = scene.framed ? framedGrids(scene.framed, frame) : scene.values ? sharedGrids(scene.values) : null, live = scene.look ? panel(raycaster(scene.look, grids, viewer), viewer, scene.look) : null;
   if (live) served(live, viewer, scene.server);
-  const show = scene.frames.length > 1 ? series(viewer) : null, here = where(viewer, scene, live, show, grids);
+  const show = scene.frames.length > 1 ? series(viewer, () => live?.look.renew()) : null, here = where(viewer, scene, live, show, scene.framed ? null : grids);
   const linked = await here.restored;
   document.body.classList.remove('begins');
   said.textContent = '';

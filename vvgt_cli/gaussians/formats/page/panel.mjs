@@ -1,12 +1,16 @@
 // The panel of a live page: of each layer its function or the list of its labels; a cut, a light; what undo goes back to.
 import { cutOf } from './cut.mjs';
 import { editor } from './editor.mjs';
+import { greys } from './greys.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
+import { piece } from './piece.mjs';
+import { extinction } from './table.mjs';
 
 const HTML = `<header><span class="named"><h1></h1><i></i></span><button class="fold" aria-label="show or hide the panel" title="show or hide the panel">▾</button></header>
 <output></output><select class="layer" aria-label="layer" title="layer"></select><select class="kind" aria-label="draw as" title="draw as (k)"></select>`;
 const KINDS = ['colours', 'MIP', 'X-ray'];
+const SURFACE = 14;  // extinction, of which a fortieth of the longest edge absorbs half
 const STEPS = 200;  // that undo goes back
 
 // the title line
@@ -55,15 +59,21 @@ export function panel(look, viewer, live) {
     const after = k ? `-${k}` : '';
     layers.push({ layer, ...(layer.labels.length
       ? organs((rows) => look.labels(rows, k), layer.labels, `labels${after}`, history)
-      : editor((nodes) => look.apply(nodes, k), layer, `function${after}`, history)) });
+      : editor((nodes) => { surfaced(layer, nodes); look.apply(nodes, k); }, layer, `function${after}`, history)) });
   });
   root.append(...layers.map((one) => one.root), cut.root, light(look, viewer, live.light, history));
   const lamp = parts.at(-1), begun = lamp.state();
   // the light under a preset's: its coefficients, null for none, undefined for the file's
   function lit(to) {
     if (to === undefined) return begun;
-    const now = lamp.state(), kind = to === null ? 'none' : to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
+    const now = lamp.state();
+    if (to === null) return { ...now, kind: 'none' };
+    const kind = to.kind ?? (now.kind === 'none' ? 'headlight' : now.kind), next = { ...now, ...to, kind };
     return [begun, now].find((one) => JSON.stringify(one) === JSON.stringify(next)) ?? next;
+  }
+  // another function that shows surfaces is lit, unless a light was chosen, or chosen away
+  function surfaced({ nodes, unit_distance }, now) {
+    if (now !== nodes && begun.kind === 'none' && lamp.state() === begun && Math.max(...now.map(({ y }) => extinction(y, unit_distance))) > SURFACE) lamp.set({ ...begun, kind: 'headlight' });
   }
 
   function choose(k) {
@@ -85,9 +95,13 @@ export function panel(look, viewer, live) {
   // the look, MIP or X-ray: of one layer of values
   const kinds = find('.kind'), values = layers.length === 1 && layers[0].nodes;
   let drawn = 0;
+  const grey = values && greys(look, live.layers[0], history), kept = values && piece(look, history);
+  if (values) root.append(grey.root, kept.root);
+  grey?.draw(0);
   function draw(k) {
     drawn = kinds.selectedIndex = k;
     look.draw(k);
+    grey.draw(k);
     told(true);
   }
   function drawAs(k) {
@@ -119,8 +133,8 @@ export function panel(look, viewer, live) {
   choose(0);
   return {
     root, fold, look, cut, lamp, parts, layers, select, at: () => layers[chosen], changed(f) { told = f; },
-    drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
-    alone: () => drawn > 0 || cut.planes().length > 0, lit: () => (lamp.state() === begun ? null : lamp.state()),
+    grey, kept, drawn: () => drawn, next: values && (() => drawAs((drawn + 1) % KINDS.length)),
+    alone: () => drawn > 0 || cut.planes().length > 0 || Boolean(kept?.part.state()), lit: () => (lamp.state() === begun ? null : lamp.state()),
     nodes: () => layers[chosen].nodes(), set: (nodes) => layers[chosen].set(nodes),
   };
 }

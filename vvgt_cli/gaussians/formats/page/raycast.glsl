@@ -7,13 +7,14 @@ precision highp sampler3D;
 precision highp usampler3D;
 uniform vec3 origin[3], direction[3], voxel[3], jitter;  // at the lower left corner, and what they gain across and up; the edges of a voxel; of the pixel, and of the first sample
 uniform vec4 cuts[6], light, toward, face;  // dot(xyz, place) <= w of each stays; ambient (< 0: unlit), diffuse, specular, power; with w = 1 the light is at the eye; w > 0: the values from x on, as 1 / y greys, are shown on the cut
-uniform vec2 size;
-uniform float ds, again;
-uniform int kind, faced;  // 0 the look, 1 MIP, 2 X-ray; the layer on the cut
+uniform vec2 size, grey;  // of the picture; what is black of a MIP or X-ray, and 1 / window
+uniform float ds, again, most;  // between samples; frames before; by how much extinction may differ between two
+uniform int kind, faced, alone;  // 0 the look, 1 MIP, 2 X-ray; the layer on the cut; whether a piece is all that shows
+uniform sampler3D piece;
 uniform sampler2D looks, before;
 out vec4 color;
-const float LAST = float(TABLE - 1), MANY = 64.0, OPAQUE = 0.9995;
-const int ROWS = TABLE >> 8;
+const float LAST = float(TABLE - 1), MANY = 64.0, OPAQUE = 0.9995, THIN = 0.01, NEAR = 3.0;
+const int ROWS = TABLE >> 8, PARTS = 8;
 
 vec4 entry(float i, int first) { return texelFetch(looks, ivec2(int(i) & 255, first + (int(i) >> 8)), 0); }
 vec4 upTo(float s, int first) {
@@ -44,8 +45,35 @@ vec3 lit(vec3 c, vec3 n, vec3 d) {
   return min(c * (light.x + light.y * abs(dot(n, l))) + light.z * white, vec3(1.0));
 }
 
+// red, green, blue and opacity of a segment, and how far along the ray, on average, it absorbs
+vec4 passed(SAMPLE a, SAMPLE b, vec3 o, vec3 d, float from, float to, out float place) {
+  vec4 one = optics(a, b);
+  float depth = one.a * (to - from), part = (to - from) / float(PARTS), rest = 1.0;
+  place = 0.5 * (from + to);
+  if (depth <= 0.0) return vec4(0.0);
+  bool fine = depth > THIN && steep(a, b);
+  if (!fine && depth <= 1.0) return vec4(one.rgb / one.a, 1.0) * (1.0 - exp(-depth));
+  SAMPLE first = a;
+  vec4 own = vec4(0.0);
+  float sum = 0.0;
+  for (int n = 1; n <= PARTS; n++) {
+    SAMPLE next = mix(first, b, float(n) / float(PARTS));
+    if (fine && n < PARTS) next = sampled(o + d * (from + float(n) * part));
+    one = optics(a, next);
+    float alpha = rest * (1.0 - exp(-one.a * part));
+    if (alpha > 0.0) {
+      own += alpha * vec4(one.rgb / one.a, 1.0);
+      sum += alpha * (float(n) - 0.5);
+      rest -= alpha;
+    }
+    a = next;
+  }
+  if (fine && own.a > 0.0) place = from + part * sum / own.a;
+  return own;
+}
+
 vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
-  float start = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))) + jitter.z), last = t0, t = t0 + ds * start, A = 0.0, best = -1.0;
+  float start = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))) + jitter.z), last = t0, t = t0 + ds * start, A = 0.0, best = -1.0, end = t0;
   vec3 C = vec3(0.0);
   SAMPLE then = sampled(o + d * t0);
   if (face.w > 0.0 && dot(cut, cut) > 0.0) {
@@ -53,32 +81,38 @@ vec4 along(vec3 o, vec3 d, float t0, float t1, vec3 cut) {
     if (max(seen.r, max(seen.g, seen.b)) >= 0.002) return vec4(seen.rgb, 1.0);
   }
   for (int i = 0; i < 8192 && last < t1 && A < OPAQUE; i++) {
-    float free = empty(o + d * (last + 1e-5), d, best);
-    if (free > 0.0) {
-      last += free;
-      t = t0 + ds * (start + ceil((last - t0) / ds - start));
-      if (t <= last) t += ds;
-      then = sampled(o + d * last);
-      continue;
+    if (last >= end) {
+      vec2 block = empty(o + d * (last + 1e-5), d, best);
+      if (block.y == 0.0) {
+        last += block.x;
+        t = t0 + ds * (start + ceil((last - t0) / ds - start));
+        if (t <= last) t += ds;
+        then = sampled(o + d * last);
+        continue;
+      }
+      end = last + block.x;
     }
     t = min(t, t1);
     SAMPLE now = sampled(o + d * t);
-    if (kind == 1) best = max(best, greater(then, now));
+    if (kind == 1) {
+      if (alone == 0 || kept(o + d * t) > 0.5) best = max(best, greater(then, now));
+    }
     else {
-      vec4 one = optics(then, now);
-      float alpha = 1.0 - exp(-one.a * (t - last));
-      if (alpha > 0.0) {
-        vec3 c = one.rgb / one.a;
-        if (kind == 0 && light.x >= 0.0) c = lit(c, dot(cut, cut) > 0.0 && last - t0 < ds ? cut : normal(o + d * (0.5 * (last + t))), d);
-        C += (1.0 - A) * alpha * c;
-        A += (1.0 - A) * alpha;
+      float place;
+      vec4 own = passed(then, now, o, d, last, t, place);
+      if (alone > 0 && own.a > 0.0) own *= kept(o + d * place);
+      if (own.a > 0.0) {
+        vec3 c = own.rgb / own.a;
+        if (kind == 0 && light.x >= 0.0) c = lit(c, dot(cut, cut) > 0.0 && last - t0 < ds ? cut : normal(o + d * place), d);
+        C += (1.0 - A) * own.a * c;
+        A += (1.0 - A) * own.a;
       }
     }
     last = t;
     t += ds;
     then = now;
   }
-  return kind == 0 ? vec4(C, A) : vec4(vec3(kind == 2 ? A : clamp(best, 0.0, 1.0)), 1.0);
+  return kind == 0 ? vec4(C, A) : vec4(vec3(clamp(((kind == 2 ? A : best) - grey.x) * grey.y, 0.0, 1.0)), 1.0);
 }
 
 void main() {

@@ -1,6 +1,7 @@
 // The volume itself under the look of the panel: rays through the grids that the page holds, in a canvas over the Gaussians'. While something
 // moves, at a third of the resolution; at rest whole, and jittered frames add up until they change nothing.
 import { dot, plus } from './lens.mjs';
+import { connected, nearest } from './piece.mjs';
 import shader from './raycast.glsl';
 import { exposed, extinction, functionAt, TABLE, tableOf, WIDE } from './table.mjs';
 
@@ -9,6 +10,9 @@ const REST = 150, COARSE = 3, MOST = 32, QUIET = 2;  // ms without a change; par
 const FAST = 60, SLOW = 200, THIN = 8;  // ms in which a band of a frame may be done, to be twice, or half as high; its least rows
 const HOLE = -65504;  // of what is unknown, which no value near it makes visible
 const cells = (dims) => dims.map((n) => Math.ceil(n / BLOCK));
+const STEEP = 2;  // optical depth of a voxel by which extinction differs along a segment that is sampled finer
+const LOST = 'its graphics were lost', BACK = 5000;  // ms until which they may come back
+const FLAT = 0.02;  // steps of values between neighbours up to which rounding may be all there is
 const FAINT = 0.05;  // opacity along a ray below which there is nothing
 const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], minus = (p, q) => p.map((x, c) => x - q[c]);
 const halton = (n, base) => { let f = 1, r = 0; for (; n > 0; n = Math.floor(n / base)) { f /= base; r += f * (n % base); } return r; };
@@ -43,12 +47,12 @@ ${each((k, { labels }) => `uniform ${labels ? 'usampler3D' : 'sampler3D'} v${k};
 uniform sampler3D b${k};
 uniform mat4 m${k};
 uniform vec3 n${k}, f${k};  // dims; value at 0, what it gains, first row of the table
-float empty${k}(vec3 p, vec3 d, float best) {
+vec2 empty${k}(vec3 p, vec3 d, float best) {  // how far to the end of a block; 1: it shows something
   vec3 edge = n${k} / ${BLOCK}.0, q = (m${k} * vec4(p, 1.0)).xyz, r = mat3(m${k}) * d * edge;
-  if (!within(q)) return ds;
+  if (!within(q)) return vec2(ds, 0.0);
   ivec3 block = clamp(ivec3(floor(q * edge)), ivec3(0), ivec3(ceil(edge)) - 1);
   vec2 there = texelFetch(b${k}, block, 0).rg;
-  return (kind == 1 ? there.g > best : there.r > 0.0) ? 0.0 : leaving(block, q * edge, r);
+  return vec2(leaving(block, q * edge, r), (kind == 1 ? there.g > best : there.r > 0.0) ? 1.0 : 0.0);
 }
 ${labels ? `vec4 look${k}(ivec3 i) { return entry(float(texelFetch(v${k}, i, 0).r), int(f${k}.z)); }
 vec4 at${k}(vec3 p) {
@@ -57,25 +61,61 @@ ${k ? '  if (!within(q)) return vec4(0.0);' : ''}
   ivec3 i = ivec3(x), j = min(i + 1, ivec3(n${k}) - 1);
   return mix(mix(mix(look${k}(i), look${k}(ivec3(j.x, i.yz)), f.x), mix(look${k}(ivec3(i.x, j.y, i.z)), look${k}(ivec3(j.xy, i.z)), f.x), f.y),
     mix(mix(look${k}(ivec3(i.xy, j.z)), look${k}(ivec3(j.x, i.y, j.z)), f.x), mix(look${k}(ivec3(i.x, j.yz)), look${k}(j), f.x), f.y), f.z);
+}
+// the gradient of the label that shows most: a line fitted to where it is, over voxels nearer than NEAR, for its surface to be smooth
+vec3 smooth${k}(vec3 p) {
+  vec3 q = (m${k} * vec4(p, 1.0)).xyz * n${k} - 0.5, away = vec3(0.0), has = vec3(0.0);
+  ivec3 first = ivec3(floor(q)), last = ivec3(n${k}) - 1;
+  uint own = 0u;
+  float best = 0.0, all = 0.0, count = 0.0;
+  for (int c = 0; c < 8; c++) {
+    ivec3 i = first + ivec3(c & 1, (c >> 1) & 1, c >> 2), j = clamp(i, ivec3(0), last);
+    vec3 w = 1.0 - abs(q - vec3(i));
+    float here = look${k}(j).a * w.x * w.y * w.z;
+    if (here > best) { best = here; own = texelFetch(v${k}, j, 0).r; }
+  }
+  bool inside = true;  // as most of a body is
+  for (int c = 0; c < 8 && inside; c++) inside = texelFetch(v${k}, clamp(first + ivec3(c & 1, (c >> 1) & 1, c >> 2) * 5 - 2, ivec3(0), last), 0).r == own;
+  if (inside) return vec3(0.0);
+  for (int z = -2; z < 4; z++) for (int y = -2; y < 4; y++) for (int x = -2; x < 4; x++) {
+    ivec3 i = first + ivec3(x, y, z);
+    vec3 d = vec3(i) - q;
+    float w = 1.0 - dot(d, d) / (NEAR * NEAR);
+    if (w <= 0.0) continue;
+    w *= w;
+    all += w;
+    away += w * d;
+    if (texelFetch(v${k}, clamp(i, ivec3(0), last), 0).r == own) { count += w; has += w * d; }
+  }
+  return count < all ? ((has - away * (count / all)) * n${k}) * mat3(m${k}) : vec3(0.0);
 }` : `float value${k}(vec3 p) { return f${k}.x + f${k}.y * texture(v${k}, (m${k} * vec4(p, 1.0)).xyz).r; }
 vec4 at${k}(vec3 p) {
   float s = value${k}(p);
   return s < -0.5${k ? ` || !within((m${k} * vec4(p, 1.0)).xyz)` : ''} ? vec4(0.0) : between(s, s, int(f${k}.z));
 }`}`)}
-float empty(vec3 p, vec3 d, float best) {
-  float free = 1e9;
-${each((k) => `  free = min(free, empty${k}(p, d, best));`)}
-  return free;
+vec2 empty(vec3 p, vec3 d, float best) {
+  vec2 found = vec2(1e9, 0.0), one;
+${each((k) => `  one = empty${k}(p, d, best);
+  found = vec2(min(found.x, one.x), max(found.y, one.y));`)}
+  return found;
 }
+float kept(vec3 p) { return texture(piece, (m0 * vec4(p, 1.0)).xyz).r; }
 SAMPLE sampled(vec3 p) { return ${single ? 'value0(p)' : sum('at')}; }
+bool steep(SAMPLE a, SAMPLE b) { ${single ? 'vec4 off = abs(entry(clamp(b, 0.0, 1.0) * LAST, int(f0.z)) - entry(clamp(a, 0.0, 1.0) * LAST, int(f0.z))); return max(max(off.r, off.g), max(off.b, off.a)) > most' : 'return false'}; }
 vec4 optics(SAMPLE a, SAMPLE b) { return ${single ? 'min(a, b) < -0.5 ? vec4(0.0) : between(a, b, int(f0.z))' : '0.5 * (a + b)'}; }
 float greater(SAMPLE a, SAMPLE b) { return ${single ? 'max(a, b)' : '0.0'}; }
 vec3 normal(vec3 p) {
   ${single ? `vec3 e = 1.0 / n0, q = clamp((m0 * vec4(p, 1.0)).xyz, 0.5 * e, 1.0 - 0.5 * e);
   float a[6] = float[6](texture(v0, q + vec3(e.x, 0, 0)).r, texture(v0, q + vec3(0, e.y, 0)).r, texture(v0, q + vec3(0, 0, e.z)).r, texture(v0, q - vec3(e.x, 0, 0)).r, texture(v0, q - vec3(0, e.y, 0)).r, texture(v0, q - vec3(0, 0, e.z)).r);
   for (int i = 0; i < 6; i++) if (f0.x + f0.y * a[i] < -0.5) return vec3(0.0);
-  return (vec3(a[0] - a[3], a[1] - a[4], a[2] - a[5]) * n0 * f0.y) * mat3(m0);`
-    : `vec3 n = vec3(0.0);
+  vec3 rise = vec3(a[0] - a[3], a[1] - a[4], a[2] - a[5]);
+  return all(lessThan(abs(rise), vec3(${FLAT * layers[0].one}))) ? vec3(0.0) : (rise * n0 * f0.y) * mat3(m0);`
+    : `float most = 0.0, here;
+  int which = -1;
+${each((k, { labels }) => `  here = at${k}(p).a;
+  if (here > most) { most = here; which = ${labels ? k : -1}; }`)}
+${each((k, { labels }) => (labels ? `  if (which == ${k}) return smooth${k}(p);` : ''))}
+  vec3 n = vec3(0.0);
   for (int i = 0; i < 3; i++) n += voxel[i] * (sampled(p + voxel[i]).a - sampled(p - voxel[i]).a) / dot(voxel[i], voxel[i]);
   return n;`}
 }
@@ -142,14 +182,15 @@ function uploaded(gl, grid, layer, k) {
   if (Math.max(nx, ny, nz) > room) throw new Error(`it draws at most ${room} voxels along an axis`);
   const whole = labels || (bits === 8 && !missing), byte = bits === 8, middle = Math.round(((first + last) / 2 - lo) / step) + missing;
   const [internal, format, type] = labels ? [byte ? gl.R8UI : gl.R16UI, gl.RED_INTEGER, byte ? gl.UNSIGNED_BYTE : gl.UNSIGNED_SHORT] : whole ? [gl.R8, gl.RED, gl.UNSIGNED_BYTE] : [gl.R16F, gl.RED, gl.FLOAT];
-  textureOf(gl, 2 + 2 * k, gl.TEXTURE_3D, internal, grid.dims);
+  const values = textureOf(gl, 2 + 2 * k, gl.TEXTURE_3D, internal, grid.dims), blocks = textureOf(gl, 3 + 2 * k, gl.TEXTURE_3D, gl.RG8, cells(grid.dims));
+  gl.activeTexture(gl.TEXTURE2 + 2 * k);
   for (let z = 0; z < nz; z++) {  // half precision is exact to 2048 on both sides of the middle
     const slice = codes.subarray(z * nx * ny, (z + 1) * nx * ny);
     gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, z, nx, ny, 1, format, type, whole ? slice : Float32Array.from(slice, (code) => (code < missing ? HOLE : code - middle)));
   }
   const entry = (code) => Math.min(Math.max(((lo + step * (Math.max(code, missing) - missing) - first) / span) * (TABLE - 1), 0), TABLE - 1);
   return {
-    k, grid, layer, labels, blocks: textureOf(gl, 3 + 2 * k, gl.TEXTURE_3D, gl.RG8, cells(grid.dims)),
+    k, grid, layer, labels, one: whole ? 1 / 255 : 1, held: [values, blocks],
     scale: labels ? [0, 0] : whole ? [(lo - first) / span, (255 * step) / span] : [(lo + step * (middle - missing) - first) / span, step / span],
     entries: labels ? [] : [less, more].map((pick, end) => Uint16Array.from(reduced(codes, grid.dims, pick), (code) => (end ? Math.ceil : Math.floor)(entry(code)))),
   };
@@ -160,8 +201,8 @@ function uploaded(gl, grid, layer, k) {
 export function raycaster(facts, gridsOf, { app }) {
   const canvas = Object.assign(document.createElement('canvas'), { id: 'volume', hidden: true });
   let gl = null, ray = null, put = null, looks = null, drawn = [], grids = [], lens = null, world = null, covering = null, starting = null, deep = 0;
-  let wanted = false, covers = false, version = 0, kind = 0, lamp = facts.light, face = null;
-  let key = '', since = 0, frame = 0, quiet = 0, row = 0, rows = 64, pair = [], fence = null, begun = 0, query = null, busy = Promise.resolve(), still = 0;
+  let wanted = false, covers = false, version = 0, kind = 0, lamp = facts.light, face = null, grey = [0, 1], piece = null, mask = null, chosen = null;
+  let compiled = '', key = '', since = 0, frame = 0, quiet = 0, row = 0, rows = 64, pair = [], fence = null, begun = 0, query = null, waiting = 0, turn = 0, busy = Promise.resolve(), still = 0;
 
   const distance = (k, nodes) => (kind === 2 ? exposed(nodes, look.layers[k]) : look.layers[k].unit_distance);
   // table and blocks of a layer, under its look or other nodes
@@ -193,19 +234,25 @@ export function raycaster(facts, gridsOf, { app }) {
   const place = (grid, index) => world().at(grid.toWorld(index)), index = (grid, p) => grid.toIndex(world().place(p));
   const edgesOf = (grid) => AXES.map((e) => minus(place(grid, e), place(grid, [0, 0, 0])));
   async function start() {
-    grids = (await gridsOf()).filter(({ layer }) => look.layers[layer]);
+    const mine = ++turn, found = await gridsFor();
+    if (mine !== turn) return;
+    grids = found;
     gl = canvas.getContext('webgl2', { alpha: false, antialias: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error('it has no WebGL 2');
-    canvas.addEventListener('webglcontextlost', () => fail(new Error('its graphics were lost')));
-    if (gl.getParameter(gl.MAX_TEXTURE_IMAGE_UNITS) < 2 + 2 * grids.length) throw new Error(`${grids.length} layers are too many for it`);
+    if (gl.isContextLost()) throw new Error(LOST);
+    if (gl.getParameter(gl.MAX_TEXTURE_IMAGE_UNITS) < 3 + 2 * grids.length) throw new Error(`${grids.length} layers are too many for it`);
     deep = gl.getExtension('EXT_color_buffer_float') ? gl.RGBA32F : 0;
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    drawn.forEach(({ held }) => held.forEach((texture) => gl.deleteTexture(texture)));
+    if (looks) gl.deleteTexture(looks);
     drawn = grids.map((grid, k) => uploaded(gl, grid, look.layers[grid.layer], k));
+    putMask();
     looks = textureOf(gl, 0, gl.TEXTURE_2D, gl.RGBA32F, [WIDE, 2 * ROWS * drawn.length]);
-    ray = programOf(gl, shader.replace('LAYERS', () => layersText(drawn)).replaceAll('TABLE', TABLE));
-    put = programOf(gl, SHOWN);
+    const text = shader.replace('LAYERS', () => layersText(drawn)).replaceAll('TABLE', TABLE);
+    if (!ray || text !== compiled) [ray, put, compiled] = [programOf(gl, text), programOf(gl, SHOWN), text];
     ray('1i', 'looks', 0);
     ray('1i', 'before', 1);
+    ray('1i', 'piece', masked());
     put('1i', 'sums', 1);
     put('1i', 'older', 0);
     for (const { k, grid, scale } of drawn) {
@@ -220,12 +267,33 @@ export function raycaster(facts, gridsOf, { app }) {
     look.step = Math.min(...grids.flatMap(edgesOf).map((edge) => Math.hypot(...edge)));
     look.layers.forEach((_, k) => tabulate(k));
   }
+  // the texture of what is kept, of a voxel where everything is
+  const masked = () => 2 + 2 * grids.length;
+  function putMask() {
+    version++;
+    if (!gl) return;
+    if (piece) gl.deleteTexture(piece);
+    piece = textureOf(gl, masked(), gl.TEXTURE_3D, gl.R8, mask ? grids[0].dims : [1, 1, 1]);
+    gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...(mask ? grids[0].dims : [1, 1, 1]), gl.RED, gl.UNSIGNED_BYTE, mask ?? Uint8Array.of(255));
+  }
   function fail({ message }) {
     look.said = `This browser cannot show the volume itself: ${message}. The conversion is shown, under its own look.`;
     gl = null;
     covers = null;
     cover(false);
   }
+  // what the graphics had is gone: the conversion is shown until they are back, and all is uploaded anew
+  canvas.addEventListener('webglcontextlost', (event) => {
+    event.preventDefault();
+    [gl, fence, query, pair, piece, frame] = [null, null, null, [], null, 0];
+    cover(false);
+    waiting = setTimeout(() => fail(new Error(LOST)), BACK);
+  });
+  canvas.addEventListener('webglcontextrestored', () => {
+    clearTimeout(waiting);
+    [starting, ray, looks, drawn, key, look.said, covers] = [null, null, null, [], '', '', null];
+    covering?.(false);
+  });
   function cover(now) {
     if (now === covers) return;
     covers = now;
@@ -257,8 +325,11 @@ export function raycaster(facts, gridsOf, { app }) {
     ray('2f', 'size', ...size);
     ray('3f', 'jitter', n ? halton(n, 2) : 0.5, n ? halton(n, 3) : 0.5, n * 0.61803398875);
     ray('1f', 'ds', look.step * times * (kind === 1 ? 0.5 : 1));
+    ray('1f', 'most', STEEP / look.step);
     ray('1f', 'again', n);
     ray('1i', 'kind', kind);
+    ray('1i', 'alone', mask ? 1 : 0);
+    ray('2f', 'grey', grey[0], 1 / (grey[1] - grey[0]));
     ray('4fv', 'cuts', cuts.flat());
     ray('4f', 'light', ...(lamp.kind === 'none' ? [-1, 0, 0, 1] : [lamp.ambient, lamp.diffuse, lamp.specular, lamp.power]));
     ray('4f', 'toward', ...lamp.from, lamp.kind === 'headlight' ? 1 : 0);
@@ -338,7 +409,7 @@ export function raycaster(facts, gridsOf, { app }) {
         many = rows;
         band(sums, rays, n, first, many, 0.5);
         while (gl && !done()) await pause();
-        if (!gl) throw new Error(look.said);
+        if (!gl) throw new Error(look.said || LOST);
       }
     }
     shown(sums, last.to, size, frames, true);
@@ -360,6 +431,9 @@ export function raycaster(facts, gridsOf, { app }) {
     try { return await task(); } finally { still--; version++; }
   }));
 
+  const gridsFor = async () => (await gridsOf()).filter(({ layer }) => look.layers[layer]);
+  const tauOf = (grid, code) => (code < grid.missing ? 0 : extinction(functionAt(look.nodes[grid.layer], grid.value(code)).y, distance(grid.layer, look.nodes[grid.layer])));
+  const cutOff = (p) => look.planes.some(({ normal, place: most }) => dot(normal, p) > most) || (mask && !mask[grids[0].offset(index(grids[0], p))]);
   // the value and the extinction of each layer at a place
   const meets = (p) => grids.map((grid) => {
     const at = index(grid, p), layer = look.layers[grid.layer];
@@ -379,21 +453,43 @@ export function raycaster(facts, gridsOf, { app }) {
     light(now) { lamp = now; version++; },
     draw(now) { kind = now; if (look.nodes[0]) tabulate(0); },
     face(now) { face = now; version++; },
+    grey(now) { grey = now; version++; },
+    // what is connected to a voxel, {at: index, least: extinction}, stays; null: everything
+    async keep(now, going) {
+      [mask, chosen] = [null, now];
+      if (now) {
+        const grid = (grids = await gridsFor())[0], most = grid.bits === 8 ? 256 : 1 << 16, seen = Uint8Array.from({ length: most }, (_, code) => (tauOf(grid, code) >= now.least ? 1 : 0));
+        const found = await connected(grid, now.at[0] + grid.dims[0] * (now.at[1] + grid.dims[1] * now.at[2]), seen, () => new Promise((next) => { setTimeout(() => next(going())); }));
+        if (!going()) return;
+        mask = found;
+      }
+      putMask();
+    },
+    // another frame is shown
+    renew() {
+      starting = null;
+      if (chosen) look.keep(chosen, () => true);
+    },
+    // the voxel at a place that shows most: {at: its index, tau: its extinction}, null where none does
+    seedAt(p) {
+      const [grid] = grids, [nx, ny] = grid.dims, [i, tau] = nearest(grid, index(grid, p), (code) => tauOf(grid, code));
+      return i < 0 ? null : { at: [i % nx, Math.floor(i / nx) % ny, Math.floor(i / (nx * ny))], tau };
+    },
     begin(...given) { [lens, world, covering] = given; app.on('update', tick); },
     show(now) { wanted = now; },
     get wanted() { return wanted; },
     get shows() { return covers; },
     get rested() { return Boolean(look.said) || !wanted || (covers && !still && (frame >= (deep ? MOST : 1) || quiet >= QUIET) && key.endsWith(`,${version}]`)); },
-    picture: (size) => alone(() => drawing(size, [0, 0, lens.canvas.clientWidth, lens.canvas.clientHeight], 16)),
+    picture: (size, frames = 16, part = [0, 0, lens.canvas.clientWidth, lens.canvas.clientHeight]) => alone(() => drawing(size, part, frames)),
     // where half of what a ray meets is in front, of a MIP where its greatest value is; null: nothing
     async pick({ origin, direction }) {
-      grids = (await gridsOf()).filter(({ layer }) => look.layers[layer]);
+      grids = await gridsFor();
       const d = direction.map((x) => x / Math.hypot(...direction)), [o, r] = [index(grids[0], origin), minus(index(grids[0], plus(origin, d)), index(grids[0], origin))], found = [];
       const ends = o.map((x, c) => [(-0.5 - x) / r[c], (grids[0].dims[c] - 0.5 - x) / r[c]]), step = Math.min(...grids.flatMap(edgesOf).map((edge) => Math.hypot(...edge))) / 2;
       let [t, end] = [Math.max(...ends.map((some) => Math.min(...some)), 0), Math.min(...ends.map((some) => Math.max(...some)))], rest = 1;
       for (t += step / 2; t < end; t += step) {
         const p = plus(origin, d, t);
-        if (look.planes.some(({ normal, place: most }) => dot(normal, p) > most)) continue;
+        if (cutOff(p)) continue;
         const met = meets(p);
         if (kind !== 1) rest *= Math.exp(-met.reduce((sum, { tau }) => sum + tau, 0) * step);
         found.push([p, kind === 1 ? met[0].value ?? -Infinity : rest]);

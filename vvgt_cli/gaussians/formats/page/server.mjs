@@ -82,7 +82,7 @@ export function served(panel, viewer, server) {
   const better = gaussiansOf(viewer);
   const look = ({ named, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), named()) });
   const shown = () => (layers.length > 1 ? { layers: layers.map(look) } : look(layers[0]));
-  let number = server ? null : 0, told = server ? '' : 'Gaussians', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
+  let number = server ? null : 0, told = server ? '' : 'Gaussians', busy = false, unable = '', down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
   const say = (line, failed) => {
     text.textContent = line;
@@ -101,7 +101,9 @@ export function served(panel, viewer, server) {
   }
   panel.covering = (now) => {
     better.put(!now);
-    if (volume.said) put();
+    if (volume.said === unable) return;
+    unable = volume.said;
+    put();
   };
 
   function end(line = '', failed = false) {

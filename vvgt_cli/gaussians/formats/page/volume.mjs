@@ -4,6 +4,8 @@ import { Damaged } from './damage.mjs';
 const BODY = [['axial', 'L', 'A'], ['coronal', 'L', 'S'], ['sagittal', 'P', 'S']], OTHER = [['z', 'x', 'y'], ['y', 'x', 'z'], ['x', 'y', 'z']];  // name, what is to the right, what is up
 const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
+const FRAMES = 3;  // whose grids stay in memory
+
 const through = (m, p) => [0, 1, 2].map((r) => m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
 
 function inverted(m) {
@@ -18,10 +20,10 @@ export const edgesOf = (affine) => [0, 1, 2].map((k) => Math.hypot(affine[k], af
 const chained = (m, n) => [0, 1, 2].flatMap((r) => [0, 1, 2, 3].map((c) => m[4 * r] * n[c] + m[4 * r + 1] * n[4 + c] + m[4 * r + 2] * n[8 + c] + (c === 3 ? m[4 * r + 3] : 0)));
 
 // what an element of the page holds (gzip in base64), `size` bytes
-async function unpacked(id, size) {
+async function unpacked(id, size, again) {
   try {
     const element = document.getElementById(id), stream = new Blob([Uint8Array.from(atob(element.textContent), (c) => c.charCodeAt(0))]).stream();
-    element.remove();
+    if (!again) element.remove();
     const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
     if (bytes.length === size) return bytes;
   } catch { /* said below */ }
@@ -29,8 +31,8 @@ async function unpacked(id, size) {
 }
 
 // {...facts, codes, value(code): NaN unknown, at(index): its code, -1 outside, near(x, y, z): that between the eight around it, toWorld, toIndex, from(other): indices of another grid to its own}
-async function gridOf(facts) {
-  const { dims: [nx, ny, nz], bits, element, affine, lo, step, missing, cell } = facts, n = nx * ny * nz, bytes = await unpacked(element, (bits / 8) * n);
+async function gridOf(facts, again = false) {
+  const { dims: [nx, ny, nz], bits, element, affine, lo, step, missing, cell } = facts, n = nx * ny * nz, bytes = await unpacked(element, (bits / 8) * n, again);
   const codes = bits === 8 ? new Uint8Array(n) : new Uint16Array(n), high = bits === 8 ? null : bytes.subarray(n);
   for (let i = 0; i < n; i++) {
     const folded = high ? bytes[i] | (high[i] << 8) : bytes[i];
@@ -40,9 +42,10 @@ async function gridOf(facts) {
   return {
     ...facts, codes, mean: facts.labels || Math.max(...cell) === 1 ? '' : `mean of ${cell.join(' × ')} voxels`,
     value: (code) => (code < missing ? NaN : lo + step * (code - missing)),
-    at(index) {
+    at(index) { return codes[this.offset(index)] ?? -1; },
+    offset(index) {
       const [x, y, z] = index.map(Math.round);
-      return x < 0 || y < 0 || z < 0 || x >= nx || y >= ny || z >= nz ? -1 : codes[x + nx * (y + ny * z)];
+      return x < 0 || y < 0 || z < 0 || x >= nx || y >= ny || z >= nz ? -1 : x + nx * (y + ny * z);
     },
     near(x, y, z) {
       if (!(x >= -0.5 && y >= -0.5 && z >= -0.5 && x < nx - 0.5 && y < ny - 0.5 && z < nz - 0.5)) return -1;
@@ -93,6 +96,17 @@ export function uprightOf(grid) {
   const [low, high] = [Math.min, Math.max].map((pick) => [0, 1, 2].map((k) => pick(...ends.map((p) => p[k])))), dims = edges.map((edge, k) => Math.ceil((high[k] - low[k]) / edge - 1e-6));
   const first = dims.map((n, k) => (low[k] + high[k] - (n - 1) * edges[k]) / 2), affine = edges.flatMap((edge, k) => [...[0, 1, 2].map((c) => (c === k ? edge : 0)), first[k]]);
   return { dims, edges, affine, toWorld: (index) => through(affine, index), toIndex: (p) => p.map((x, k) => (x - first[k]) / edges[k]) };
+}
+
+// the same of the frame that is shown: `framed` has the facts of each, shown() its number
+export function framedGrids(framed, shown) {
+  const read = new Map();
+  return () => {
+    const k = shown();
+    if (!read.has(k)) read.set(k, Promise.all(framed[k].map((facts) => gridOf(facts, true))));
+    if (read.size > FRAMES) read.delete(read.keys().next().value);
+    return read.get(k);
+  };
 }
 
 // The three slices along a grid's own axes, each named after the axis of the world that is nearest: {name, across, along, up: {axis, world: that axis, sign}, letters: of its four sides}

@@ -53,6 +53,7 @@ export function where(viewer, scene, live, show, grids) {
   box.after(marks.root);
   let clicked = null;
   const pick = pickerOf(lens, () => world, dataNow, live?.look ?? null, (place) => {
+    if (live?.kept?.wants) return live.kept.take(place);
     clicked = place;
     again(marks.open && !place ? 'nothing under the pointer' : '');
     if (!place) return;
@@ -183,7 +184,7 @@ export function where(viewer, scene, live, show, grids) {
     if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
     if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
     const { layer, nodes } = live?.at() ?? {}, drawn = live?.drawn();
-    if (drawn) return drawn === 1 ? drawLegend(group, { nodes: layer.values.map((x, k) => ({ x, y: 1, rgb: [k, k, k] })), live: layer, ...place }) : null;
+    if (drawn) return drawn === 1 ? drawLegend(group, { nodes: live.grey.ends().map((x, k) => ({ x, y: 1, rgb: [k, k, k] })), live: { ...layer, values: live.grey.ends() }, ...place }) : null;
     return nodes ? drawLegend(group, { nodes: nodes(), live: layer, ...place }) : null;
   }
 
@@ -223,7 +224,7 @@ export function where(viewer, scene, live, show, grids) {
     if (live) slices?.follow(live.look.rows);
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
-    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.drawn(), live?.cut.state()]);
+    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.drawn(), live?.grey?.ends(), live?.cut.state()]);
     if (said === drawn) return;
     drawn = said;
     draw();

@@ -1,0 +1,175 @@
+"""Pages that cast rays, under looks that they were not made with, against `vvgt render` of the volume.
+
+python benchmarks/page.py SCENES.tsv DATA FUNCTIONS -o page.csv [--scene NAME] [--kind KIND] [--size PX]
+    [--pictures FOLDER]
+python benchmarks/page.py --table page.csv
+
+Needs Chromium, node and npm, as `make viewers` does. Options of a scene are --spacing, --layer and --labels, its
+functions are files in FUNCTIONS or names, separated by spaces; "-": its own look. "first" and "rest" are PSNR in dB of
+one frame and of 8 jittered ones, on strips of the first view of an orbit, as WebGL in software is slow.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from closed_form import scene_rows
+from dvr_scenes import print_table, write_rows
+
+import vvgt_cli as vvgt
+from vvgt_cli.field.source import load
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.gaussians.formats.page_look import look_entry
+from vvgt_cli.images import read_png
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.library.inputs import Look, Reading, source_of
+
+sys.path.append(str(Path(__file__).parent.parent / "tests"))
+from test_page_where import Person
+
+FRAMES = {"first": 1, "rest": 8}
+STRIPS, ROWS = 8, 8  # of a picture, for want of time in software
+KINDS = {
+    "unlit": (0, "none", None),
+    "lit": (0, "headlight", None),
+    "mip": (1, "none", "mip"),
+    "xray": (2, "none", "xray"),
+}  # number on the page, light, rule
+CAMERA = """(async () => {
+  const { lens } = vvgt.where, { camera } = JSON.parse(document.getElementById('scene').textContent);
+  const { position, target } = camera;
+  const away = position.map((x, k) => x - target[k]), distance = Math.hypot(...away);
+  lens.set({ ...lens.pose(), target, distance });
+  lens.set({ ...lens.pose(), ...lens.toward(away.map((x) => x / distance), [0, 1, 0]) });
+  lens.middle = [SIZE / 2, SIZE / 2];
+  await new Promise((done) => vvgt.viewer.app.once('frameend', done));
+})()"""
+LOOK = """(async () => {
+  const { look } = vvgt.live, { layers, light, kind, frames, tops, rows } = JOB;
+  layers.forEach(({ nodes, labels, unit_distance, opacity_unit_distance }, k) => {
+    Object.assign(look.layers[k], { unit_distance, opacity_unit_distance });
+    if (labels.length) look.labels(labels, k);
+    else look.apply(nodes, k);
+  });
+  look.light(light);
+  look.draw(kind);
+  const all = document.createElement('canvas'), to = all.getContext('2d'), begun = performance.now();
+  [all.width, all.height] = [SIZE, tops.length * rows];
+  for (const [k, top] of tops.entries()) {
+    to.drawImage(await look.picture([SIZE, rows], frames, [0, top, SIZE, top + rows]), 0, k * rows);
+  }
+  return [all.toDataURL('image/png').split(',')[1], performance.now() - begun];
+})()"""
+
+
+def reading_and_look(options: str, data: Path) -> tuple[Reading, Look]:
+    """What a scene's options say: --spacing X Y Z, --layer (files in ``data``) and --labels."""
+    words, reading, look = shlex.split(options), Reading(), Look()
+    while words:
+        option = words.pop(0)
+        if option == "--spacing":
+            reading["spacing"] = tuple(float(words.pop(0)) for _ in range(3))
+        elif option == "--layer":
+            look = replace(look, layers=(*look.layers, str(data / words.pop(0))))
+        else:
+            look = replace(look, labels=str(data / words.pop(0)))
+    return reading, look
+
+
+def entry(file: str, look: Look, reading: Reading) -> dict[str, Any]:
+    """A look as a page has it."""
+    source = load(source_of(file, look, reading))
+    values = source.values()
+    assert values is not None
+    return look_entry(values, PlyOptions(scale=source.volume.unit_frame().scale, up="z", light=source.lighting))
+
+
+def tops(size: int) -> list[int]:
+    """The first row of each strip."""
+    return [(2 * k + 1) * size // (2 * STRIPS) - ROWS // 2 for k in range(STRIPS)]
+
+
+def strips(picture: np.ndarray) -> np.ndarray:
+    """What is scored of a picture (size, size, n)."""
+    return np.concatenate([picture[top : top + ROWS] for top in tops(len(picture))])
+
+
+def pictures(person: Person, look: dict[str, Any], kind: int, size: int, out: Path) -> dict[str, np.ndarray]:
+    """Strips of pictures by the page, by `FRAMES`."""
+    found = {}
+    for name, frames in FRAMES.items():
+        job = json.dumps({**look, "kind": kind, "frames": frames, "tops": tops(size), "rows": ROWS})
+        content, took = person("eval", LOOK.replace("JOB", job).replace("SIZE", str(size)))
+        file = out.with_name(f"{out.stem}-{name}.png")
+        file.write_bytes(base64.b64decode(content))
+        print(f"{file.name}: {took / 1000:.1f} s", flush=True)
+        found[name] = read_png(file)[..., :3]
+    return found
+
+
+@click.command()
+@click.argument("paths", nargs=-1)
+@click.option("-o", "--output")
+@click.option("--scene", "names", multiple=True)
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(list(KINDS)), default=list(KINDS))
+@click.option("--size", default=800)
+@click.option("--pictures", "folder", default="out/page", type=click.Path(path_type=Path, resolve_path=True))
+@click.option("--table", "table")
+def main(
+    paths: tuple[str, ...], output: str | None, names: tuple[str, ...], kinds: tuple[str, ...], size: int,
+    folder: Path, table: str | None,
+) -> None:  # fmt: skip
+    """See the module."""
+    if table:
+        print_table(table)
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    listing, data, functions = map(Path, paths)
+    rows, opened, person = [], "", None
+    for name, volume, options, function in scene_rows(listing):
+        if names and name not in names:
+            continue
+        file = volume if volume.startswith("example:") else str(data / volume)
+        reading, begun = reading_and_look(options, data)
+        page = folder / f"{name}.html"
+        if not page.exists():
+            vvgt.convert(file, begun, page, max_gaussians=500, screen=64, steps=0, **reading)
+        person = person or Person((size, size))
+        if opened != name:
+            person("open", page.as_uri())
+            person("eval", "vvgt.live.look.show(true)")
+            person("eval", CAMERA.replace("SIZE", str(size)))
+            opened = name
+        for one in function.split():
+            tf = None if one == "-" else functions / one if (functions / one).exists() else one
+            distance = "mean-spacing" if one.endswith(".json") else None
+            for kind in kinds:
+                number, light, rule = KINDS[kind]
+                if number and (begun.layers or tf is None):
+                    continue
+                look = replace(begun, tf=tf, opacity_unit_distance=distance, light=light)
+                out = folder / f"{name}-{Path(one).stem}-{kind}"
+                own = out.with_name(f"{out.stem}.{size}.png")
+                if not own.exists():
+                    vvgt.render(
+                        file, own, look, size=size, rule=rule, background=None if rule else (0, 0, 0), **reading
+                    )
+                found = pictures(person, entry(file, look, reading), number, size, out)
+                scores = {how: psnr(strips(read_png(own)[..., :3]), picture) for how, picture in found.items()}
+                rows.append({"scene": name, "function": Path(one).stem, "kind": kind, "size": size, **scores})
+                print(rows[-1], flush=True)
+    write_rows(output, rows)
+    assert person is not None
+    person.process.communicate(timeout=60)
+
+
+if __name__ == "__main__":
+    main()
