@@ -124,7 +124,7 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "with one file of several clouds" in done.error
     done = vvgt.fails(
-        2, "convert", "four.nii", "-o", "four.html", "--max-megabytes", "1", "--tf", "tf.json", "--screen", "32"
+        2, "convert", "four.nii", "-o", "four.html", "--max-megabytes", "2", "--tf", "tf.json", "--screen", "32"
     )
     assert "--max-megabytes with one file of several clouds" in done
     two = ("--tf", "viridis", "--time", "0")

@@ -329,7 +329,7 @@ def convert_all(
                 raise
     if kind == ONE:
         kind, together = FRAMES, bool(output)
-        for one in [FRAMES, *([ONE_FILE] if together else [])]:
+        for one in [*([ONE_FILE] if together else []), FRAMES]:
             check_options(one, used - {"--no-values"})
     share = WHOLE_RUN if shard is None else parse_shard(shard)
     request = replace(request, shares_output=together)

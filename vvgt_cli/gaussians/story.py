@@ -214,7 +214,7 @@ def _function(value: Any, where: str) -> None:
         return
     points = _known(value, ("name", "points", "opacity_unit_distance"), where).get("points")
     _is(lambda x: isinstance(x, list) and len(x) > 1, "a name, or points as in the tf.json of a page")(points, where)
-    for point in points:
+    for point in points or ():
         _is(lambda x: isinstance(x, dict) and set(x) == {"x", "opacity", "rgb"}, "x, opacity and rgb")(point, where)
         _number()(point["x"], f"{where}: x")
     read(dict(value), where)

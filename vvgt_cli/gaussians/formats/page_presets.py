@@ -188,7 +188,7 @@ def offers(facts: LiveFacts, volume: Volume, values: np.ndarray, lighting: Light
     if not facts.function:
         return {"presets": []}
     edge, distance = max(volume.extent), facts.distance or 1.0
-    own = lighting and {key: getattr(lighting, key) for key in _HEADLIGHT}
+    own = None if lighting is None else {key: getattr(lighting, key) for key in _HEADLIGHT}
     sketch = Sketch(values, volume.affine[:3], volume.extent, volume.space)
     presets = presets_of(facts, distance, edge, kind_of(facts, volume), facts.baked().get("name", ""))
     for one in presets:
@@ -293,4 +293,5 @@ def _eye(space: str | None) -> np.ndarray:
     else:
         left, front, above = (1 if letter == positive else -1 for letter, positive in zip(space, "LAS", strict=True))
         found = np.array([0.6 * left, 1.0 * front, 0.3 * above])
-    return found / np.linalg.norm(found)
+    found /= np.linalg.norm(found)
+    return found
