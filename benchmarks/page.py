@@ -33,6 +33,7 @@ from vvgt_cli.images.metrics import psnr
 from vvgt_cli.library.inputs import Look, Reading, source_of
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))
+from browser import first_of_orbit
 from test_page_where import Person
 
 FRAMES = {"first": 1, "rest": 8}
@@ -44,8 +45,7 @@ KINDS = {
     "xray": (2, "none", "xray"),
 }  # number on the page, light, rule
 CAMERA = """(async () => {
-  const { lens } = vvgt.where, { camera } = JSON.parse(document.getElementById('scene').textContent);
-  const { position, target } = camera;
+  const { lens } = vvgt.where, { position, target } = FIRST;
   const away = position.map((x, k) => x - target[k]), distance = Math.hypot(...away);
   lens.set({ ...lens.pose(), target, distance });
   lens.set({ ...lens.pose(), ...lens.toward(away.map((x) => x / distance), [0, 1, 0]) });
@@ -146,7 +146,7 @@ def main(
         if opened != name:
             person("open", page.as_uri())
             person("eval", "vvgt.live.look.show(true)")
-            person("eval", CAMERA.replace("SIZE", str(size)))
+            person("eval", CAMERA.replace("SIZE", str(size)).replace("FIRST", json.dumps(first_of_orbit())))
             opened = name
         for one in function.split():
             tf = None if one == "-" else functions / one if (functions / one).exists() else one
