@@ -111,7 +111,9 @@ def _largest_side(splats: Splats) -> tuple[float, float, float]:
     that lies flat.
     """
     places = _visible([splats])
-    cells = np.round(_CELLS * (places - places[:1]) / max(float(np.ptp(places, axis=0).max(initial=0)), 1e-12))
+    if not len(places):  # of a volume that is not converted yet
+        return (-1.0, _TILTED, 0.0)
+    cells = np.round(_CELLS * (places - places[:1]) / max(float(np.ptp(places, axis=0).max()), 1e-12))
     x, y, z = (len(np.unique(np.delete(cells, axis, axis=1), axis=0)) for axis in range(3))
     if y > _FLAT * max(x, z):
         return (-0.3, 1.0, 0.0)
