@@ -95,7 +95,8 @@ def test_report_to_standard_output(folder, vvgt):
 
 @pytest.mark.parametrize("method", ["moments", "wavelet", "uniform"])
 def test_init_has_three_methods(method, folder, vvgt):
-    assert method in vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply").err
+    said = vvgt.ok("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply").err
+    assert (f"Gaussians ({method})" in said) == (method != "moments")  # the default is not named
     assert 0 < len(read_ply("a.ply")[0]) <= 300
 
 

@@ -50,7 +50,7 @@ def test_drawing_runs_as_python_where_numba_is_off(vvgt, tmp_path: Path) -> None
 @pytest.mark.parametrize("command", ["convert", "init", "render-views"])
 def test_volumes_are_not_drawn_as_python_and_it_says_so(tmp_path: Path, command: str) -> None:
     out = tmp_path / ("views" if command == "render-views" else "a.ply")
-    done = as_python(command, "example:marschner-lobb:8", "--screen", "16", "-qo", out)
+    done = as_python(command, "example:marschner-lobb:8", "-qo", out)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "NUMBA_DISABLE_JIT is set" in done.stderr
     assert not list(tmp_path.iterdir())

@@ -145,9 +145,10 @@ def test_preview_and_checkpoint(vvgt, at, tmp_path):
     more = ("-o", tmp_path / "x.ply", "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept")
     vvgt.ok("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *BLOCKS, *more)
     picture = read_png(tmp_path / "x.png")
-    assert picture.shape[:2] == (3 * 64, 3 * 64)
-    assert picture[:, :64].max() > 0.5
-    assert np.abs(picture[:, :64] - picture[:, 64:128]).mean() < 0.02
+    assert picture.shape[:2] == (3 * (64 + 18), 3 * 64)
+    rows = picture.reshape(3, 64 + 18, 3 * 64, 3)[:, 18:]  # without the caption above each
+    assert rows[:, :, :64].max() > 0.5
+    assert np.abs(rows[:, :, :64] - rows[:, :, 64:128]).mean() < 0.02
 
 
 @pytest.mark.long
