@@ -29,7 +29,17 @@ project = html_title = "vvgt"
 version = release = VERSION
 root_doc = "docs/index"
 include_patterns = ["*.md", "docs/**.md", "examples/*.md", "models/*.md"]
-exclude_patterns = [".*", "CODE_OF_CONDUCT.md", "SECURITY.md", "benchmarks", "build", "node_modules", "out", "tests", "vvgt_cli"]
+exclude_patterns = [
+    ".*",
+    "CODE_OF_CONDUCT.md",
+    "SECURITY.md",
+    "benchmarks",
+    "build",
+    "node_modules",
+    "out",
+    "tests",
+    "vvgt_cli",
+]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 4
 autodoc_typehints = "description"
