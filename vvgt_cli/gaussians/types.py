@@ -72,8 +72,8 @@ class Gaussians:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return every array that is present, by name, in the order of the fields."""
-        found = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics", "live")}
-        return {field: array for field, array in found.items() if array is not None}
+        columns = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics", "live")}
+        return {field: array for field, array in columns.items() if array is not None}
 
     def take(self, index: np.ndarray) -> Gaussians:
         """Return the subset or permutation that ``index`` selects."""
