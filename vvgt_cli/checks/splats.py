@@ -102,9 +102,9 @@ def place_cases(
         return float(np.average(beyond, weights=opacity(cloud) + 1e-12))
 
     def outside() -> Figure:
-        found, other = share(gaussians), share(world)
-        hint = f" ({other:.2g} if read as world coordinates)" if other < found / 10 else ""
-        return Figure(f"share of the opacity{hint}", found, 0.002)
+        inside, other = share(gaussians), share(world)
+        hint = f" ({other:.2g} if read as world coordinates)" if other < inside / 10 else ""
+        return Figure(f"share of the opacity{hint}", inside, 0.002)
 
     def turned() -> Figure:
         error = {}

@@ -116,9 +116,9 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
 def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
     tf, options = resolve_look(file, header, function)
-    found = apply_function(gaussians, header, tf, options)
-    written = read_ply(io.BytesIO(as_ply(found, options)))
-    return {"function": tf.name, "hidden": len(gaussians) - len(found), **describe(*written)}
+    visible = apply_function(gaussians, header, tf, options)
+    written = read_ply(io.BytesIO(as_ply(visible, options)))
+    return {"function": tf.name, "hidden": len(gaussians) - len(visible), **describe(*written)}
 
 
 def _head_of_stdin() -> bytes:
@@ -328,7 +328,7 @@ def what_leaves(file: str) -> dict[str, Any]:
     legend = json.loads(header.legend or "{}")
     scanned = header.space in ("RAS", "LPS")
     made, facts = header.certificate, dict[str, Any](kind="sharing", name=Path(file).name)
-    found = {
+    details = {
         "title": header.title, "function": header.function,
         "command": made and made.command, "checksum": made and made.sha256,
         "range": legend.get("values"), "names": [*filter(None, names), *(name for name, _ in legend.get("labels", ()))],
@@ -339,7 +339,7 @@ def what_leaves(file: str) -> dict[str, Any]:
         "values": held or (layers and "data values under each Gaussian, and their histogram"),
         "other": [line for line in header.comments if not line.startswith(OURS)],
     }  # fmt: skip
-    facts |= {key: value for key, value in found.items() if value}
+    facts |= {key: value for key, value in details.items() if value}
     facts["picture"] = FACE + LATER * bool(held or layers)
     remove = "--no-comments omits all but the picture and the values, --title names it otherwise"
     return facts | {"remove": f"{remove}; positions of --frame world stay"}

@@ -157,15 +157,15 @@ class Clouds(Mapping[str, Result]):
             **how: frame, up and comments; see `Result.save`.
         """
         degree = max(cloud.gaussians.degree for cloud in self.clouds)
-        found = []
+        nodes = []
         for cloud in self.clouds:
             ply = cloud.layout(sh_degree=sh_degree, **how)
             ply = replace(ply, live=None, sh_degree=degree if ply.sh_degree is None else ply.sh_degree)
             splats = splats_of(replace(cloud.gaussians, live=None), ply)
             facts = {key: value for key, value in cloud.facts.items() if key not in NOT_IN_NODES and ply.comments}
             place = tuple(cloud.facts.get("parents", ())), facts, cloud.facts.get("visible", True)
-            found.append(Node(cloud.name, splats, *place))
-        return found
+            nodes.append(Node(cloud.name, splats, *place))
+        return nodes
 
     def recolor(self, look: str | TransferFunction | None = None, **how: Any) -> Clouds:
         """Return all live clouds under another function: `Result.recolor` of each.
@@ -177,11 +177,11 @@ class Clouds(Mapping[str, Result]):
         Raises:
             DataError, UsageError: see `Result.recolor`.
         """
-        found = []
+        shown = []
         for cloud in self.clouds:
             other = cloud.recolor(look, **how)
-            found.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
-        return replace(self, clouds=found)
+            shown.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
+        return replace(self, clouds=shown)
 
     def _page(self, path: str, story: StoryLike | None, overwrite: bool, how: dict[str, Any]) -> int:
         """Write one page of all clouds."""

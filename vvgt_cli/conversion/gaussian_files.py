@@ -272,13 +272,13 @@ def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOp
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
         size, rule = options.screen_size or SIZE, rule_of(options.rule or INRIA)
-        cameras, found = default_views("test", size=size), []
+        cameras, scores = default_views("test", size=size), []
         for i in PREVIEW_VIEWS:
             blocks = spread_blocks(size, size, i)
             both = [render(g, cameras[i], rule, blocks=blocks)[..., :3] for g in (gaussians, back)]
             before, after = (np.clip(image if blocks is None else blocks.pick(image), 0, 1) for image in both)
-            found.append(psnr(before, after))
-        stage.note = f"{np.mean(found):.2f} dB from the Gaussians before writing, {len(found)} views of {size} px"
+            scores.append(psnr(before, after))
+        stage.note = f"{np.mean(scores):.2f} dB from the Gaussians before writing, {len(scores)} views of {size} px"
 
 
 def report_format_cost(

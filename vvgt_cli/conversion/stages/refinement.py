@@ -181,8 +181,8 @@ def without_undrawn(gaussians: Gaussians, size: int, dilation: float = 0.0) -> G
 
     Arguments are those of `widen_small`.
     """
-    found, kept = widen_small(gaussians, size, dilation)
-    return found.take(kept) if kept.any() else gaussians
+    widened, kept = widen_small(gaussians, size, dilation)
+    return widened.take(kept) if kept.any() else gaussians
 
 
 def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:

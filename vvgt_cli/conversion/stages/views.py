@@ -114,11 +114,11 @@ class TrainingViews(Stage):
         """List the views, with one ray per pixel, and the pictures that decide whether that is enough."""
         from vvgt_cli.dvr.render import FIT_VIEWS
 
-        found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
+        pictures = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
         if self.fitted:
             camera, blocks = _probe(self.edge)
-            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
-        return found
+            pictures += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
+        return pictures
 
     def run(self, work: Work) -> None:
         """Render the views, as finely as the Gaussians need."""
