@@ -21,7 +21,7 @@ from vvgt_cli.device import describe as describe_gpu
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import as_ply, describe, read_ply
-from vvgt_cli.gaussians.formats import format_of, is_splats, read_splats
+from vvgt_cli.gaussians.formats import format_of, is_page, is_splats, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_values import ELEMENT
@@ -91,7 +91,7 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         if known is None:
             return facts
         size = path.stat().st_size
-        more = {"policy": policy(path.read_text("utf-8"))} if known.suffix == ".html" else {}
+        more = {"policy": policy(path.read_text("utf-8"))} if is_page(file) else {}
         stated = {"bytes": size, "bytes_per_gaussian": round(size / len(gaussians), 1), "format": known.suffix}
         return facts | stated | more
     if is_index(name):
@@ -320,7 +320,7 @@ def what_leaves(file: str) -> dict[str, Any]:
         )
     _, header = read_splats(file)
     layers = () if header.live is None else header.live.layers
-    page = Path(file).suffix.lower() == ".html"
+    page = is_page(file)
     text = Path(file).read_text("utf-8") if page else ""
     scene = json.loads(_SCENE.findall(text)[0]) if page else {}
     held = f'id="{ELEMENT}-0"' in text and "of the volume, also of what its look hides"

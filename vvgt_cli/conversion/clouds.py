@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     entry,
@@ -25,7 +24,7 @@ from vvgt_cli.conversion.index import (
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, format_of, is_page
 from vvgt_cli.gaussians.formats.nodes import Node
 from vvgt_cli.gaussians.formats.splats import splats_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs

@@ -28,7 +28,6 @@ from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.fitting import plan_of
 from vvgt_cli.conversion.frames import FrameSeries, is_glob_of_volumes
-from vvgt_cli.conversion.gaussian_files import holds_several, is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
     FUNCTIONS,
@@ -49,6 +48,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import claim
+from vvgt_cli.gaussians.formats import format_of, is_page
 from vvgt_cli.gaussians.formats.page_look import contents
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, folder_of, is_streamed
 from vvgt_cli.gaussians.outputs import Output, check_outputs, claimed
@@ -307,7 +307,8 @@ def convert_all(
     kind = FUNCTIONS if several else LABELS if split_labels else FRAMES if numbered else ONE
     named = LAYERS if kind == LABELS and request.source.layers else kind
     kinds = [*([LEVELS] if is_streamed(output) else []), named, *([LIVE] if request.live else [])]
-    together = kind != ONE and holds_several(output) and not numbered
+    holds_several = is_page(output) or ((known := format_of(output)) is not None and known.write_nodes is not None)
+    together = kind != ONE and holds_several and not numbered
     nodes = together and kind == FUNCTIONS and not is_page(output)
     also = {NO_PAGE: not is_page(output), ONE_FILE: together, NODES: nodes}
     for one in [*kinds, *(one for one, so in also.items() if so)]:

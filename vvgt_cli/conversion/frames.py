@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import FRAMES, frame_facts, index_path
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.place import up_axis
@@ -22,6 +21,7 @@ from vvgt_cli.field.layered import ALL, OpenedFile, functions_of, open_content
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.files import read_text
+from vvgt_cli.gaussians.formats import is_page
 from vvgt_cli.look.label_files import table_for
 from vvgt_cli.look.labels import AUTO, NO_LABELS, LabelTable
 from vvgt_cli.network.card import CARD, find_model
