@@ -10,7 +10,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stage import Cost, Stage, Work
@@ -194,8 +193,7 @@ def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple
         dilation: px^2 of dilation that the mass includes; 0 for viewers that compensate theirs.
     """
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    camera = default_views("check", 1, size=size)[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    pixel = pixel_width(size)
     width = np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))
     widening = np.maximum(SMALLEST * pixel / width, 1)
     beside = dilation * (pixel / width) ** 2

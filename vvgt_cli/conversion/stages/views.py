@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
-from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.cameras.sets import SET_VIEWS, pixel_width
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
@@ -193,8 +193,7 @@ def suits_small_views(gaussians: Gaussians, size: int) -> bool:
     They are where the median of the middle standard deviations is above `WIDE` px of a view twice as large, and bodies
     are not opaque, since only the edges of opaque ones are seen.
     """
-    camera = default_views("check", 1, size=2 * view_edge(size, small=True))[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    pixel = pixel_width(2 * view_edge(size, small=True))
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
     solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
     return bool(np.median(middle) > WIDE * pixel and not solid)
