@@ -15,7 +15,6 @@ from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts, legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
-from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable, check_labels
 from vvgt_cli.look.lighting import Lighting, LightOptions
@@ -145,7 +144,7 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
     seen = gaussians.take(visible_under(gaussians, table, pixel))
     assert seen.live is not None
     shown = apply_look(seen, table, pixel)
-    there = np.flatnonzero(opacity(shown) >= MIN_ALPHA)
+    there = np.flatnonzero(shown.opacity >= MIN_ALPHA)
     shown, axis = shown.take(there), seen.live[there, AXIS]
     if lighting is None:
         return shown

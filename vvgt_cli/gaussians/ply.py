@@ -308,11 +308,6 @@ def in_unit_frame(gaussians: Gaussians, header: PlyHeader) -> Gaussians:
     return turn(gaussians, header.up, inverse=True)
 
 
-def opacity(gaussians: Gaussians) -> np.ndarray:
-    """Return the peak alpha (K,) float64 from the logits."""
-    return 1 / (1 + np.exp(-np.clip(gaussians.opacity_logits.astype(np.float64), -700, 700)))
-
-
 def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
     """Return the part of `describe` about carried values."""
     assert gaussians.live is not None
@@ -356,7 +351,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
     }
     if len(gaussians):
         sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
-        for key, values in (("sigma", sigma), ("opacity", opacity(gaussians))):
+        for key, values in (("sigma", sigma), ("opacity", gaussians.opacity)):
             summary[key] = [float(f"{q:.6g}") for q in np.percentile(values, (0, 50, 100))]
         summary["box_min"] = [float(v) for v in gaussians.means.min(axis=0)]
         summary["box_max"] = [float(v) for v in gaussians.means.max(axis=0)]
