@@ -13,11 +13,11 @@ from vvgt_cli.conversion.gaussian_files import levels_in_box, read_back, write_g
 from vvgt_cli.conversion.levels import write_levels
 from vvgt_cli.conversion.opened import open_field
 from vvgt_cli.conversion.place import to_unit_frame
+from vvgt_cli.conversion.plan import WarmStart
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import Checkpoint, checkpoint_folder
 from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians

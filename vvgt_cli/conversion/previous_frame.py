@@ -11,13 +11,12 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.conversion.changes import Changes, changes
-from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import StyledVolume
