@@ -19,6 +19,6 @@ def quaternions(rotations: np.ndarray) -> np.ndarray:
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Return the unit quaternion (4,) with w >= 0 of a matrix (3, 3)."""
-    found = quaternions(np.asarray(rotation, np.float64)[None])[0]
-    result: np.ndarray = found * np.copysign(1.0, found[0])
+    unsigned = quaternions(np.asarray(rotation, np.float64)[None])[0]
+    result: np.ndarray = unsigned * np.copysign(1.0, unsigned[0])
     return result

@@ -59,16 +59,16 @@ def _number(value: float | None) -> str:
     return f"{'-' if value is None else f'{value:.3g}':>9}"
 
 
-def _stiffness_lines(found: Stiffness) -> list[str]:
-    needed = found.needed_step
-    steps = f"{needed:g} voxels" if needed is not None else f"less than {min(map(float, found.errors)):g} voxels"
+def _stiffness_lines(result: Stiffness) -> list[str]:
+    needed = result.needed_step
+    steps = f"{needed:g} voxels" if needed is not None else f"less than {min(map(float, result.errors)):g} voxels"
     rows = {
-        "largest optical depth of a step of 0.5": f"{found.depth_per_step:.4g}",
-        "largest change of extinction per voxel": f"{found.change_per_voxel:.4g} of the largest extinction",
-        "neighbours that differ by more than half of it": f"{100 * found.abrupt:.3g} % of the visible pairs",
-        "explicit Euler overshoots with steps above": f"{found.explicit_step:.3g} voxels (this renderer never does)",
-        "error by step in voxels (RMS of RGBA)": ", ".join(f"{k}: {v:.2g}" for k, v in found.errors.items()),
-        f"largest step with an error of at most {found.tolerance:g}": steps,
+        "largest optical depth of a step of 0.5": f"{result.depth_per_step:.4g}",
+        "largest change of extinction per voxel": f"{result.change_per_voxel:.4g} of the largest extinction",
+        "neighbours that differ by more than half of it": f"{100 * result.abrupt:.3g} % of the visible pairs",
+        "explicit Euler overshoots with steps above": f"{result.explicit_step:.3g} voxels (this renderer never does)",
+        "error by step in voxels (RMS of RGBA)": ", ".join(f"{k}: {v:.2g}" for k, v in result.errors.items()),
+        f"largest step with an error of at most {result.tolerance:g}": steps,
     }
     width = max(map(len, rows))
     return [f"{key:<{width}}  {value}" for key, value in rows.items()]
@@ -84,7 +84,7 @@ def run_cases(cases: list[Case], console: Console) -> list[Outcome]:
             outcomes.append(run_case(case))
             if bar:
                 bar(len(outcomes), len(cases))
-        found = outcomes[begin:]
-        failed = sum(not o.passed for o in found)
-        console.stage(stage, sum(o.seconds for o in found), f"{len(found)} cases, {failed or 'none'} failed")
+        done = outcomes[begin:]
+        failed = sum(not o.passed for o in done)
+        console.stage(stage, sum(o.seconds for o in done), f"{len(done)} cases, {failed or 'none'} failed")
     return outcomes

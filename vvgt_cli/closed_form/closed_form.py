@@ -113,9 +113,9 @@ class ClosedForm(Pyramid):
             return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
         wanted = round(self.budget * min(seen**-SMALLER, 2.0))
         leaves = self.shaded(leaves_of(self.tree, select(self.tree, wanted, score)), self.whole)
-        found = self.blurred(leaves)
-        shown = np.flatnonzero(~unseen(blending_weights(found, cameras, rule), self.budget))
-        return self.sharpened(leaves.take(shown), found.take(shown))
+        blurred = self.blurred(leaves)
+        shown = np.flatnonzero(~unseen(blending_weights(blurred, cameras, rule), self.budget))
+        return self.sharpened(leaves.take(shown), blurred.take(shown))
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Return Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
@@ -330,6 +330,6 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
 
 def unseen(weights: np.ndarray, most: int) -> np.ndarray:
     """Return (n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
-    found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
-    found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
-    return found
+    hidden: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
+    hidden[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
+    return hidden

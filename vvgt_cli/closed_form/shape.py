@@ -94,8 +94,7 @@ def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
     """
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     wider = np.where(scales > scales.min(axis=1, keepdims=True), factor * scales, scales)
-    before = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    opacity = np.clip(opacity_when_reshaped(before, scales**2, wider**2, pixel), LEAST_ALPHA, MAX_ALPHA)
+    opacity = np.clip(opacity_when_reshaped(gaussians.opacity, scales**2, wider**2, pixel), LEAST_ALPHA, MAX_ALPHA)
     return replace(gaussians, log_scales=np.log(wider), opacity_logits=np.log(opacity / (1 - opacity)))
 
 

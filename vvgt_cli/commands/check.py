@@ -55,9 +55,9 @@ def check(
     loaded = load(source)
     console.message(describe_source(loaded))
     scene = loaded.scene()
-    found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
+    stiffness = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = run_cases(list(scene_cases(scene)), console)
-    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
+    return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), stiffness)
 
 
 @shared.command("check", short_help="Test this installation, how stiff a scene is, or a file of Gaussians.")

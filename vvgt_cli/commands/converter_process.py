@@ -199,9 +199,9 @@ def _note(send: Callable[[Message], None]) -> Callable[..., None]:
 
 def _plain(error: VvgtError) -> VvgtError:
     """Return an error with its line and exit status alone, which can be pickled."""
-    found = VvgtError(str(error))
-    found.exit_code = error.exit_code
-    return found
+    plain = VvgtError(str(error))
+    plain.exit_code = error.exit_code
+    return plain
 
 
 def _send(stream: IO[bytes], folder: str, message: tuple[int, Message]) -> None:

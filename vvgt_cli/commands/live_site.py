@@ -144,8 +144,8 @@ def page_files(cloud: ServedCloud, values: Values | None) -> dict[str, bytes]:
 def corners(look: Mapping[str, Any]) -> list[list[float]]:
     """Return the corners of the volume's box in the viewer's axes."""
     ends = np.array(list(product(*np.transpose(look["box"]))))
-    found: list[list[float]] = (ends @ np.array(look["axes"])).round(3).tolist()
-    return found
+    places: list[list[float]] = (ends @ np.array(look["axes"])).round(3).tolist()
+    return places
 
 
 class PageController:
@@ -317,5 +317,5 @@ def plain_name(path: str) -> str:
     """Return a file's name to save under: letters, digits, dot, underscore, blank and dash."""
     known = max((suffix for suffix in SUFFIXES if path.lower().endswith(suffix)), key=len, default="")
     name = volume_name(Path(path.removeprefix("example:")[: len(path) - len(known)]))
-    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
-    return found or "volume"
+    plain = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
+    return plain or "volume"

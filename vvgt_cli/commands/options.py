@@ -213,9 +213,9 @@ class Measure(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number, or raise click.BadParameter."""
-        found, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
+        parts, number = re.fullmatch(r"\s*([-+.\de]*[.\d])\s*([a-z]*)\s*", str(value).lower()), 0.0
         with suppress(ValueError, TypeError, KeyError):
-            number = float(found[1]) * self.units[found[2]]  # type: ignore[index]  # None: TypeError
+            number = float(parts[1]) * self.units[parts[2]]  # type: ignore[index]  # None: TypeError
         if not number > 0:
             units = ", ".join(filter(None, self.units))
             self.fail(f"{value!r} is not a {self.name}; expected a number above 0, with {units} or no unit")

@@ -66,9 +66,9 @@ def recolor(
             own = layers.items() if isinstance(layers, Mapping) else ()
             named = tuple(layer_look(header, key, one) for key, one in own)
             shown, options = resolve_look(name, header, replace(look, layers=look.layers + named))
-            found = apply_function(gaussians, header, shown, options)
-            stage.note = f"{len(found)} of them visible under {shown.name}"
-        return Result(found, run.report, options)
+            visible = apply_function(gaussians, header, shown, options)
+            stage.note = f"{len(visible)} of them visible under {shown.name}"
+        return Result(visible, run.report, options)
 
     inputs = [name, *look.paths()]
     return written(make, "recolor", inputs, output, overwrite=overwrite, progress=progress, suffixes=SUFFIXES)

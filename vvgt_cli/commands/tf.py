@@ -110,9 +110,9 @@ def list_named(console: Console) -> None:
     """
     from vvgt_cli.look.readers.names import names
 
-    found = names()
-    for name, shows in found.items():
-        click.echo(f"{name:<{max(map(len, found)) + 2}}{shows}")
+    known = names()
+    for name, shows in known.items():
+        click.echo(f"{name:<{max(map(len, known)) + 2}}{shows}")
 
 
 @command.command("suggest", short_help="Suggest functions that each show one range of values.")

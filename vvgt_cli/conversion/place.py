@@ -80,18 +80,18 @@ def with_place(ply: PlyOptions, volume: Volume) -> PlyOptions:
 
 def placement_warnings(volume: Volume, ply: PlyOptions) -> list[str]:
     """Return warnings about the place of a volume: sheared axes, or a rotation that the file will not record."""
-    found = []
+    warnings = []
     if volume.sheared:
-        found.append(
+        warnings.append(
             f"{volume.name}: {shear_text(volume.axes)} (a tilted gantry?): Gaussians are sheared with them; opacity "
             "stays per length along the index axes, and pictures are of the volume unsheared"
         )
     if not ply.comments and (ply.up != NONE or ply.frame != "unit"):
-        found.append(
+        warnings.append(
             f"--no-comments: the file will not record that it is in the {ply.frame} frame with up {ply.up}; "
             "'vvgt evaluate' and 'vvgt render' will assume the unit frame with up none"
         )
-    return found
+    return warnings
 
 
 def upright_axes(volume: Volume, up: str) -> np.ndarray:

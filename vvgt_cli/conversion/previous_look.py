@@ -24,7 +24,6 @@ from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.live import TAU
-from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
 FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
@@ -123,7 +122,7 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     new, b = _look_alone(source, gaussians, samples)
     least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MAX_RATIO, MAX_RATIO), 1)
-    depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
+    depth = -np.log1p(-np.minimum(gaussians.opacity, OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
     alike = 1 - np.linalg.norm(new.colors - old.colors, axis=1) / OTHER
     kept = np.where(there & (a > least), alike.clip(0, 1), 0)[:, None]

@@ -71,8 +71,8 @@ class StoredGaussians:
 
     def errors(self) -> CutErrors:
         """Return the errors of refined levels."""
-        found = {name: self.field(name) for name in FIELDS}
-        return CutErrors(np.zeros(found["counts"].shape[1]), **found)
+        fields = {name: self.field(name) for name in FIELDS}
+        return CutErrors(np.zeros(fields["counts"].shape[1]), **fields)
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from vvgt_cli.conversion.gaussian_files import is_page, report_format_cost, write_gaussians, write_parts
+from vvgt_cli.conversion.gaussian_files import read_back, write_gaussians, write_parts
 from vvgt_cli.conversion.levels import write_levels
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import Checkpoint, checkpoint_folder
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.field.blocked import Blocked
-from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.formats import format_of, is_page
 from vvgt_cli.gaussians.formats.streamed import folder_of
 from vvgt_cli.gaussians.outputs import claimed, write_text
 from vvgt_cli.jit.ahead import EVALUATE
@@ -65,9 +65,7 @@ def write_beside(run: Run, request: ConvertRequest, conversion: Conversion) -> N
     if format_of(str(request.output)):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())
-        report_format_cost(
-            run, str(request.output), conversion.gaussians, conversion.ply, conversion.field.views, source.volume
-        )
+        read_back(run, str(request.output), conversion.gaussians, conversion.ply, conversion.field)
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, captioned(conversion.preview(), len(PREVIEW_VIEWS)), request.overwrite)

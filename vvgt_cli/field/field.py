@@ -172,8 +172,8 @@ class Resident(Field):
         for k in range(0, len(gaussians), AT_ONCE):
             part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
             where = in_voxels(part, scene.half, scene.step)
-            found = samples_of(scene.voxels, *where, nothing, nothing, dims, scene.step)
-            values[k : k + len(part)] = values_of(*found, part, self.layout.slope, self.layout.intercept)
+            samples = samples_of(scene.voxels, *where, nothing, nothing, dims, scene.step)
+            values[k : k + len(part)] = values_of(*samples, part, self.layout.slope, self.layout.intercept)
         return values
 
     def with_look(self, source: StyledVolume) -> Resident:

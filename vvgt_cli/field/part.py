@@ -109,8 +109,8 @@ class VolumePart:
         single = RenderSettings(step=LONGEST, samples=1)
         half = camera.resized(0.5)
         inner, outer = (self.view(half, single, grown=by) for by in (-grown, grown))
-        found: np.ndarray = self.shown(half) * (1 - np.abs(outer - inner).max(axis=2))
-        return found.repeat(2, axis=0).repeat(2, axis=1)
+        weights: np.ndarray = self.shown(half) * (1 - np.abs(outer - inner).max(axis=2))
+        return weights.repeat(2, axis=0).repeat(2, axis=1)
 
     def _before(self, eye: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield boxes of voxels (first, end) that rays from an eye, in voxels, may pass before they enter the part.

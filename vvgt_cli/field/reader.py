@@ -165,11 +165,11 @@ class Layers:
     @cached_property
     def _opened(self) -> list[Layer]:
         """The layers with their volumes."""
-        found = []
+        layers = []
         for layer, places in zip(self.layers, self.places, strict=True):
             volume, *colors = [place.volume() for place in places]
-            found.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
-        return found
+            layers.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
+        return layers
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> VoxelBox:
         """Implement `Scalars.box`."""

@@ -57,7 +57,7 @@ class Story:
         Raises:
             DataError: a step shows what the page does not have.
         """
-        found = []
+        steps = []
         for k, step in enumerate(self.steps, 1):
             where = f"{self.what}, step {k}"
             if frames is not None and step.get("frame", 0) >= frames:
@@ -67,8 +67,8 @@ class Story:
             if used and (not layers or len(whole) < len(layers)):
                 keys = ", ".join(key for key in KEYS if key not in LOOK)
                 raise DataError(f"{where}: {used[0]!r} needs a page with values of one volume; expected {keys}")
-            found.append(_resolved(step, whole, where) if used else step)
-        return replace(self, steps=tuple(found))
+            steps.append(_resolved(step, whole, where) if used else step)
+        return replace(self, steps=tuple(steps))
 
 
 def read_story(given: StoryLike) -> Story:
@@ -90,13 +90,13 @@ def read_story(given: StoryLike) -> Story:
     if not isinstance(steps, list | tuple) or not 0 < len(steps) <= MOST:
         raise DataError(f"{what}: expected 'steps', a list of 1 to {MOST} steps")
     now: dict[str, Any] = {}
-    found = []
+    told = []
     for k, step in enumerate(steps, 1):
         _check(step, f"{what}, step {k}")
         fresh = len(step) > 1 and ("link" in step or "link" in now)
         now = {key: value for key, value in (({} if fresh else now) | step).items() if value is not None}
-        found.append(now)
-    return Story(what, tuple(found))
+        told.append(now)
+    return Story(what, tuple(told))
 
 
 def _short(value: Any) -> str:
@@ -269,8 +269,8 @@ def _resolved(step: dict[str, Any], layers: Sequence[Layer], where: str) -> dict
 def _numbered(one: Mapping[str, Any], table: LabelTable, where: str) -> dict[str, Any]:
     """Return a label's entry by its number."""
     key = "name" if "name" in one else "number"
-    found = [label.number for label in table.structures if getattr(label, key) == one[key]]
-    if not found:
+    numbers = [label.number for label in table.structures if getattr(label, key) == one[key]]
+    if not numbers:
         known = listed([str(getattr(label, key)) for label in table.structures], ", ", 8)
         raise DataError(f"{where}: no label {one[key]!r}; expected one of {known}")
-    return {"number": found[0]} | {part: one[part] for part in ("opacity", "color") if part in one}
+    return {"number": numbers[0]} | {part: one[part] for part in ("opacity", "color") if part in one}

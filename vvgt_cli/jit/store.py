@@ -31,11 +31,11 @@ def folders() -> list[Path]:
     mine = f"vvgt-{hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:12]}"
     if os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(os.environ["NUMBA_CACHE_DIR"]) / mine]
-    found = [PACKAGE / "__pycache__" / "kernels"]
+    places = [PACKAGE / "__pycache__" / "kernels"]
     home = os.environ.get("XDG_CACHE_HOME")
     with contextlib.suppress(RuntimeError, KeyError):  # a user without a home
-        found.append((Path(home) if home and os.path.isabs(home) else Path.home() / ".cache") / "vvgt" / mine)
-    return found
+        places.append((Path(home) if home and os.path.isabs(home) else Path.home() / ".cache") / "vvgt" / mine)
+    return places
 
 
 @cache

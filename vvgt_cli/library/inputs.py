@@ -200,8 +200,8 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are for arrays, and files have their own; remove them")
         return read_volume(os.fspath(volume), options)
-    found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
-    return cut(found, replace(options, stored=isinstance(found.data, Stored)))
+    whole = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
+    return cut(whole, replace(options, stored=isinstance(whole.data, Stored)))
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> OpenedFile:

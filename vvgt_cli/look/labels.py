@@ -61,12 +61,12 @@ class Label:
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of the label in an index and in files with nodes."""
-        found: dict[str, Any] = {"label": self.number, "color": self.color, "opacity": self.shown_opacity}
+        facts: dict[str, Any] = {"label": self.number, "color": self.color, "opacity": self.shown_opacity}
         if self.parents:
-            found["parents"] = self.parents
+            facts["parents"] = self.parents
         if self.codes:
-            found["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
-        return found if self.opacity else found | {"visible": False}
+            facts["terminology"] = {part: f"{code} {meaning}" for part, code, meaning in self.codes}
+        return facts if self.opacity else facts | {"visible": False}
 
     @property
     def key(self) -> tuple[int, str]:
@@ -136,8 +136,8 @@ class LabelTable:
 
     def _rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the row of each of x (n,), and whether it has one."""
-        found = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
-        return found, self._numbers[found] == x
+        rows = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
+        return rows, self._numbers[rows] == x
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity in [0, 1] per unit distance of labels x (n,); 0 without an entry."""

@@ -151,10 +151,10 @@ def _rgb(lab: np.ndarray) -> np.ndarray:
     """Return sRGB (n, 3) in [0, 1] of CIE L*a*b* colours (n, 3)."""
     from vtkmodules.vtkCommonCore import vtkMath
 
-    found = np.empty_like(lab)
-    for row, out in zip(lab, found, strict=True):
+    rgb = np.empty_like(lab)
+    for row, out in zip(lab, rgb, strict=True):
         vtkMath.LabToRGB(row, out)
-    return found.clip(0, 1)
+    return rgb.clip(0, 1)
 
 
 def fitting(statistics: Statistics, volume: Volume) -> str | None:

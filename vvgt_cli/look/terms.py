@@ -34,13 +34,13 @@ def codes_of_row(cells: Mapping[str, str]) -> Codes:
 def parents_of(name: str, codes: Codes) -> tuple[str, ...]:
     """Return the groups of a label, from the outermost: by its codes, else by a name of FreeSurfer's."""
     meanings = {part: meaning for part, _, meaning in codes}
-    found: list[str] = []
+    groups: list[str] = []
     for part in GROUPING:
         group = meanings.get(part, "")
-        if group and group.casefold() not in (name.casefold(), *(found[-1:] and [found[-1].casefold()])):
-            found.append(group)
+        if group and group.casefold() not in (name.casefold(), *(groups[-1:] and [groups[-1].casefold()])):
+            groups.append(group)
     if codes:
-        return tuple(found)
+        return tuple(groups)
     if surface := _SURFACE.match(name):
         side = _SIDES[surface[2]]
         return side, f"{side} {_TISSUES[surface[1]]}"

@@ -422,7 +422,7 @@ def densify(
         (Gaussians, origin): ``origin`` (K',) is the index that each had before, -1 for new ones.
     """
     g = gaussians
-    opacity = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
+    opacity = g.opacity
     keep = np.flatnonzero(opacity >= FAINTEST) if (opacity >= FAINTEST).any() else np.array([int(opacity.argmax())])
     keep = keep[np.argsort(-opacity[keep], kind="stable")[:limit]]
     keep.sort()

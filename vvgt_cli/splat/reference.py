@@ -74,7 +74,7 @@ def layers(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator
 
 def drawn_opacity(gaussians: Gaussians, flat: np.ndarray, rule: Rule) -> np.ndarray:
     """Return (K,) opacity by a rule for dilated covariances (K, 2, 2): compensated, 0 for what is skipped."""
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    opacity = gaussians.opacity
     if rule.compensate:
         own = np.linalg.det(flat - rule.dilation * np.eye(2))
         opacity = opacity * np.sqrt(np.maximum(own, 0) / np.linalg.det(flat))

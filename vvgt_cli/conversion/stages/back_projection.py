@@ -36,8 +36,8 @@ class BackProjection(Stage):
         with run.stage(self.name) as stage:
             before = work.psnr(work.start.gaussians)
             bar = run.console.bar(self.name)
-            found, how = backproject(work.start, train.cameras, train.images, progress=bar, rule=work.train_rule)
-            after = work.psnr(found)
-            stage.kept = work.keep_better(before, after, found)
+            projected, how = backproject(work.start, train.cameras, train.images, progress=bar, rule=work.train_rule)
+            after = work.psnr(projected)
+            stage.kept = work.keep_better(before, after, projected)
             stage.note = f"{how}; from {before:.2f} dB on the check views"
             stage.psnr_before, stage.psnr = before, after

@@ -51,10 +51,10 @@ class CellsByError(Stage):
             chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth view would lie in bands
             cameras = [train.cameras[i] for i in chosen]
             before = work.psnr(work.current())
-            found = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
-            after = work.psnr(found)
-            stage.kept = work.keep_better(before, after, found)
-            stage.note = f"{len(found)} Gaussians, by {len(chosen)} views; from {before:.2f} dB on the check views"
+            recut = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
+            after = work.psnr(recut)
+            stage.kept = work.keep_better(before, after, recut)
+            stage.note = f"{len(recut)} Gaussians, by {len(chosen)} views; from {before:.2f} dB on the check views"
             stage.psnr_before, stage.psnr = before, after
         if self.keep:
             work.checkpoint.save(CELLS, work.current())

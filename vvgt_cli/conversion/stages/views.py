@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
-from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.cameras.sets import SET_VIEWS, pixel_width
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
@@ -114,11 +114,11 @@ class TrainingViews(Stage):
         """List the views, with one ray per pixel, and the pictures that decide whether that is enough."""
         from vvgt_cli.dvr.render import FIT_VIEWS
 
-        found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
+        pictures = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
         if self.fitted:
             camera, blocks = _probe(self.edge)
-            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
-        return found
+            pictures += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.screen))]
+        return pictures
 
     def run(self, work: Work) -> None:
         """Render the views, as finely as the Gaussians need."""
@@ -193,8 +193,7 @@ def suits_small_views(gaussians: Gaussians, size: int) -> bool:
     They are where the median of the middle standard deviations is above `WIDE` px of a view twice as large, and bodies
     are not opaque, since only the edges of opaque ones are seen.
     """
-    camera = default_views("check", 1, size=2 * view_edge(size, small=True))[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    pixel = pixel_width(2 * view_edge(size, small=True))
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
     solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
     return bool(np.median(middle) > WIDE * pixel and not solid)

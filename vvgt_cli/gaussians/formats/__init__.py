@@ -6,10 +6,12 @@ from vvgt_cli.gaussians.formats.choose import (
     Format,
     encoded,
     format_of,
+    is_page,
     is_splats,
     read_columns,
     read_splats,
     ready,
 )
 
-__all__ = ["ENDINGS", "SUFFIXES", "Format", "encoded", "format_of", "is_splats", "read_columns", "read_splats", "ready"]
+__all__ = ["ENDINGS", "SUFFIXES", "Format", "encoded", "format_of", "is_page"]
+__all__ += ["is_splats", "read_columns", "read_splats", "ready"]

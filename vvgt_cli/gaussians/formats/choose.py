@@ -77,6 +77,11 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     return next((known for known in (*FORMATS, *READ_ONLY) if name.endswith(known.suffix)), None)
 
 
+def is_page(output: str | os.PathLike[str] | None) -> bool:
+    """Return whether an output is a page, which can hold several clouds."""
+    return (known := format_of(output or "")) is not None and known.suffix == ".html"
+
+
 def ready(path: str | Path) -> None:
     """Check that the format of a file name can be written; raise DataError, which names a missing library."""
     known = format_of(path)

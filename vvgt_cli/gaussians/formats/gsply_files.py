@@ -154,8 +154,8 @@ def _comments(content: bytes) -> list[str]:
 def _columns(data: Any, comments: list[str]) -> Splats:
     count = len(data.means)
     rest = np.zeros((count, 0, 3)) if data.shN is None else np.reshape(data.shN, (count, -1, 3))
-    found = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
-    means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in found)
+    columns = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
+    means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in columns)
     return Splats(means, log_scales, quaternions, logits, f_dc, f_rest, tuple(comments))
 
 
@@ -234,9 +234,9 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
 def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
     """Decompress a stream; raise DataError below ``length`` bytes, seen by the unchanged end of the buffer."""
     for before in (b"\0", b"\xff"):
-        found = bytes(zstd.decompress(part, bytearray(before * length)))
-        if found[-1:] != before:
-            return found
+        content = bytes(zstd.decompress(part, bytearray(before * length)))
+        if content[-1:] != before:
+            return content
     raise DataError(f"{name}: truncated; expected {length} bytes by the file's table")
 
 

@@ -51,12 +51,12 @@ def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
 
 def read_indexed(path: Path, options: ReadOptions) -> Volume:
     """Read what an index names: a single file as that file's reader does, several as one volume."""
-    found = _single(read_index(path), options.time)
-    if found is None:
+    single = _single(read_index(path), options.time)
+    if single is None:
         return volume_by_child(INDEX, path, options)
     from vvgt_cli.volume.registry import read_volume
 
-    file, time = found
+    file, time = single
     return read_volume(str(file), replace(options, time=time, crop=None, mask=None))
 
 
@@ -86,10 +86,10 @@ def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[d
         "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
         "options": {key: getattr(options, key) for key in KEYS},
     }  # fmt: skip
-    found, status = run(request)
-    if found is None:
+    reply, status = run(request)
+    if reply is None:
         raise _ended(path, program, status, seconds)
-    facts, values = found
+    facts, values = reply
     for line in facts.pop("notes", ()):
         warnings.warn(line, stacklevel=2)
     if "error" in facts:
@@ -110,13 +110,13 @@ def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | No
             with suppress(BrokenPipeError):  # it has ended: what it left says how
                 to.write(json.dumps(request).encode() + b"\n")
                 to.close()
-            found = received(back)
+            reply = received(back)
         except BaseException:
             child.kill()
             raise
         finally:
             ended.set()
-    return found, child.returncode
+    return reply, child.returncode
 
 
 def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
@@ -313,8 +313,8 @@ def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
         reader = _reader(path, kind, head)
         reader.SetFileName(str(path))
         reader.Update()
-        found = checked(reader.GetOutputDataObject(0), reader, message, path, "it")
-    yield from leaves_of(found)
+        data = checked(reader.GetOutputDataObject(0), reader, message, path, "it")
+    yield from leaves_of(data)
 
 
 def _reader(path: Path, kind: str | None, head: bytes) -> Any:

@@ -29,15 +29,15 @@ function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
     .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, width), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, height) }))
     .filter(({ left, right, top, bottom }) => left < right && top < bottom);
-  const whole = { x: width / 2, y: height / 2, wide: width, high: height, ...fitting(scene, angles, width, height) }, found = [];
+  const whole = { x: width / 2, y: height / 2, wide: width, high: height, ...fitting(scene, angles, width, height) }, parts = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', width)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', height)) {
     if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
+    parts.push({ x: (left + right) / 2, y: (top + bottom) / 2, wide: right - left, high: bottom - top, ...fitting(scene, angles, right - left, bottom - top, Math.max(width, height, 1)) });
   }
-  const least = Math.min(...found.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
+  const least = Math.min(...parts.map((part) => part.distance)), aside = (part) => Math.hypot(part.x - whole.x, part.y - whole.y);
   if (!(least < FARTHEST * whole.distance)) return { ...whole, least: whole.distance };
-  return { ...found.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
+  return { ...parts.filter((part) => part.distance <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.distance - b.distance)[0], least };
 }
 
 // Keeps the middle of the view in the middle of that part when panels open and the window changes; until somebody moves the
