@@ -195,6 +195,8 @@ class FrameSeries(Batch):
             "opacity_unit_distance": self._distance,
             **({} if lighting is None else {"light": lighting.text()}),
             **({"live": True} if request.live else {}),
+            "title": request.title,
+            "values": request.values,
             **({"story": list(request.story.steps)} if request.story else {}),
             **asdict(request.fit),
             **asdict(request.limits),

@@ -42,7 +42,7 @@ function freePart({ clientWidth: width, clientHeight: height }, scene, angles) {
 
 // Keeps the middle of the view in the middle of that part when panels open and the window changes; until somebody moves the
 // view, all fits. draw(): letters and legend where they belong in the window as it is.
-// {fit(angles): to a view that fits; times(angles): how far the eye stands back for the window, in distances for a square picture alone; turn(app, still): turns slowly until somebody does something, but not while still()}
+// {fit(angles): to a view that fits; times(angles): how far the eye stands back for the window, in distances for a square picture alone; turn(app, still): turns slowly until somebody does something, but not while still() or out of sight}
 export function stayFree(lens, scene, draw) {
   let fitted = null, turning = false;
   const { canvas } = lens, numbers = ({ target, pitch, yaw, distance }) => [...target, pitch, yaw, distance];
@@ -69,10 +69,12 @@ export function stayFree(lens, scene, draw) {
     turn(app, still) {
       if (matchMedia('(prefers-reduced-motion: reduce)').matches || !untouched()) return;
       turning = true;
+      let seen = true;
+      new IntersectionObserver(([{ isIntersecting }]) => { seen = isIntersecting; }).observe(canvas);
       const stop = () => { turning = false; }, more = (seconds) => {
         turning &&= untouched();
         if (!turning) return app.off('update', more);
-        if (still()) return;
+        if (!seen || still()) return;
         const { yaw, ...rest } = lens.pose();
         lens.set({ ...rest, yaw: ((yaw + TURN * seconds + 180) % 360) - 180 });
         fitted = numbers(lens.pose());
