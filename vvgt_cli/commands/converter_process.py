@@ -28,8 +28,7 @@ from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, as_ply
 from vvgt_cli.gaussians.formats import ready
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look import LabelTable, Lighting
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
 from vvgt_cli.score.record import ConversionReport, Run

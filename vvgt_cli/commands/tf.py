@@ -77,8 +77,7 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
     """
     from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
-    from vvgt_cli.look import read_transfer_function
-    from vvgt_cli.look.function import PER_VOXEL
+    from vvgt_cli.look import PER_VOXEL, read_transfer_function
     from vvgt_cli.look.resolve import parse_tf_range, placed
     from vvgt_cli.look.to_json import to_text
 

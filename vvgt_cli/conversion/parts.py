@@ -30,9 +30,7 @@ from vvgt_cli.dvr.render import BoxFrame
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.part import VolumePart
 from vvgt_cli.field.reader import Layers, Scalars
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.rules import INRIA
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import INRIA, Gaussians, as_stored, concatenate
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.cameras import BLOCK, Blocks, Camera
 from vvgt_cli.conversion.changes import Changes, changes
 from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -21,8 +20,7 @@ from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians import Gaussians, Rule, as_stored
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.views import Views
 

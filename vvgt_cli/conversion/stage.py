@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.rules import Rule, rule_of
+from vvgt_cli.gaussians import Gaussians, PlyOptions, Rule, rule_of
 from vvgt_cli.score.record import Run, StageRecord
 from vvgt_cli.score.views import Views
 

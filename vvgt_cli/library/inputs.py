@@ -21,11 +21,9 @@ from vvgt_cli.field.layered import OpenedFile, open_content
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.gaussians.outputs import Output, claimed, write_text
-from vvgt_cli.look import TransferFunction
+from vvgt_cli.look import LabelTable, LightOptions, TransferFunction
 from vvgt_cli.look.isosurfaces import with_levels
 from vvgt_cli.look.label_files import table_of
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import ReadOptions, Volume

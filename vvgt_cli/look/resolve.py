@@ -12,9 +12,8 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import BY, PER_VOXEL, TransferFunction
 from vvgt_cli.look.isosurfaces import Isosurfaces
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
+from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.components import listed
-from vvgt_cli.volume.stats import Statistics
-from vvgt_cli.volume.types import Volume
 
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
