@@ -12,7 +12,7 @@ from vvgt_cli.checks import Case, CheckError, Figure, report, require, run_case
 from vvgt_cli.checks.report import measure_changes, measure_stiffness
 from vvgt_cli.checks.self_test import self_test_cases
 from vvgt_cli.dvr import Scene
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS
 from vvgt_cli.volume import Volume
 
 
