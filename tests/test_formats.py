@@ -16,8 +16,7 @@ import pytest
 from tests.refused import refused
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame, read_ply, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of, read_splats, ready
-from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats import FORMATS, encoded, format_of, read_splats, ready
 from vvgt_cli.gaussians.formats.sog import ORDERS, QUARTERS, _product
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, ply_bytes, splats_of
 from vvgt_cli.images import read_png

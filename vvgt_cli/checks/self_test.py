@@ -20,7 +20,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_referen
 from vvgt_cli.dvr.layers import Layer, grid_of
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_ply, as_stored, read_ply
-from vvgt_cli.gaussians.formats.choose import FORMATS, Format, encoded
+from vvgt_cli.gaussians.formats import FORMATS, Format, encoded
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import score_views
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction

@@ -10,11 +10,9 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.checks import Case, Figure
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import INRIA, MIN_ALPHA, Gaussians, Rule
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.frames import transform
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.splat import project, render
 
 COLUMNS = {

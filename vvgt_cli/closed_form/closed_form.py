@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import Camera, default_views, pixel_width
 from vvgt_cli.closed_form.fit import blending_weights, solve_colors, weights_and_errors
 from vvgt_cli.closed_form.lit import Shading
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
@@ -28,10 +27,8 @@ from vvgt_cli.closed_form.tree import (
     value_score,
 )
 from vvgt_cli.closed_form.visibility import visibility
-from vvgt_cli.dvr.render import BoxFrame
-from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.dvr import BoxFrame, Scene
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import render
 

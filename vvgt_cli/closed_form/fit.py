@@ -18,8 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat import Projection, blend, gather, project, render
 from vvgt_cli.splat.render import seen_colors

@@ -10,8 +10,7 @@ from vvgt_cli.closed_form.cell_kernels import principal_axes
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.closed_form.surface_offset import Opaque, flattened, surface_offset
 from vvgt_cli.closed_form.tree import Leaves, central
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import MAX_ALPHA
+from vvgt_cli.gaussians import MAX_ALPHA, Gaussians
 from vvgt_cli.gaussians.opacity import opacity_when_reshaped, peak_opacity
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge

@@ -26,9 +26,8 @@ from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.page_file import policy
 from vvgt_cli.gaussians.formats.page_values import ELEMENT
 from vvgt_cli.gaussians.formats.streamed import facts_of
-from vvgt_cli.look.function import PER_VOXEL
+from vvgt_cli.look import PER_VOXEL, Label
 from vvgt_cli.look.label_files import is_table, labels_of, read_labels
-from vvgt_cli.look.labels import Label
 from vvgt_cli.look.readers import OWN, SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.resources import free_memory, processors

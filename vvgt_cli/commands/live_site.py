@@ -27,10 +27,8 @@ from vvgt_cli.gaussians.formats.page_look import look_entry, parse_light
 from vvgt_cli.gaussians.formats.page_values import Values
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live_facts import MAX_LABELS, LiveFacts, function_text
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look import Label, LabelTable, Lighting, LightOptions, TransferFunction, check_labels
 from vvgt_cli.look.label_files import table_of
-from vvgt_cli.look.labels import Label, LabelTable, check_labels
-from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name

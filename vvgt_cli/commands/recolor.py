@@ -52,8 +52,7 @@ def recolor(
     from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, resolve_look
     from vvgt_cli.conversion.result import Result
     from vvgt_cli.gaussians.formats import SUFFIXES
-    from vvgt_cli.library.inputs import Look, live_look
-    from vvgt_cli.library.outputs import written
+    from vvgt_cli.library.inputs import Look, live_look, written
 
     name, listed = os.fspath(ply), () if isinstance(layers, Mapping) else layers
     look = live_look(Look(tf, tf_range, opacity_unit_distance, light, labels, listed, iso)) or FunctionRequest()

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK
+from vvgt_cli.cameras import BLOCK, Camera
 from vvgt_cli.dvr.layers import Layer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.gaussians import Gaussians

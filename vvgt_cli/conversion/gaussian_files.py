@@ -16,9 +16,7 @@ from typing import IO, TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import spread_blocks
-from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.cameras import SIZE, Camera, default_views, spread_blocks
 from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.errors import DataError, VvgtError

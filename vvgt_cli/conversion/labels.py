@@ -25,11 +25,9 @@ from vvgt_cli.errors import DataError, NothingVisible
 from vvgt_cli.field.layered import IN_MEMORY, OpenedFile, content_of, is_plain, layers_of, open_content, told_apart
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import Gaussians, concatenate
+from vvgt_cli.look import AUTO, NO_LABELS, NONE, Label, LabelTable, LightOptions, check_labels
 from vvgt_cli.look.label_files import read_labels
-from vvgt_cli.look.labels import AUTO, NO_LABELS, Label, LabelTable, check_labels
-from vvgt_cli.look.lighting import NONE, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 
 CUTS = 10
 STEP = 4.0  # factor of the score from a cut to the next: a cell's grows as the fourth power of its edge

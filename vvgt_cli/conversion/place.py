@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.boxed import render_in_box
-from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.cameras import Camera, render_in_box
+from vvgt_cli.gaussians import INRIA, Gaussians, PlyOptions, Rule
 from vvgt_cli.gaussians.frames import rescale, transform, upright_matrix
 from vvgt_cli.gaussians.live import LENGTH
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.volume import UnitFrame, Volume
 from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import Scene, Viewed
     from vvgt_cli.score.viewing import Axes
     from vvgt_cli.splat.render import Shown
 

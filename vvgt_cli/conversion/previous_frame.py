@@ -8,22 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.cameras import BLOCK, Blocks, Camera
 from vvgt_cli.conversion.changes import Changes, changes
-from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import StyledVolume
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.gaussians import Gaussians, Rule, as_stored
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.views import Views
 

@@ -10,13 +10,12 @@ import numpy as np
 
 from vvgt_cli.conversion.live import box_lighting, function_table
 from vvgt_cli.conversion.place import to_box_frame
-from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.plan import Plan, WarmStart
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import suits_small_views, view_count
-from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.defaults import WARM_STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field

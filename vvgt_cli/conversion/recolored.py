@@ -10,14 +10,11 @@ import numpy as np
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.source import layer_words
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.header import FileFacts, legend_text
 from vvgt_cli.gaussians.live import LayerTables, Looks, Palette, Table, apply_look, visible_under
 from vvgt_cli.gaussians.live_facts import AXIS, LiveFacts
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, check_labels
-from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.look import LabelTable, Lighting, LightOptions, TransferFunction, check_labels
 from vvgt_cli.look.resolve import unit_of_values
 from vvgt_cli.volume import Volume
 

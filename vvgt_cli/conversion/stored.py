@@ -10,8 +10,7 @@ import numpy as np
 from vvgt_cli.conversion.cut import Cut, TileGaussians
 from vvgt_cli.conversion.level_selection import FIELDS, CutErrors
 from vvgt_cli.field.block_store import BlockStore
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.types import concatenate
+from vvgt_cli.gaussians import Gaussians, concatenate
 
 
 def save(

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import Blocks, Camera, default_views, pixel_width
 from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, Rays, RenderSettings, first_rays, for_thin, more_rays

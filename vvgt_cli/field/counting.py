@@ -19,10 +19,9 @@ from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.layered import Access, OpenedFile, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, VolumeOrigin
 from vvgt_cli.field.settings import shape_of
-from vvgt_cli.volume import ReadOptions, Statistics, Volume
+from vvgt_cli.volume import BINS, ReadOptions, Statistics, Volume, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.label_maps import MAX_LABELS, whole_numbers
-from vvgt_cli.volume.stats import BINS, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.stored import read_block
 
 

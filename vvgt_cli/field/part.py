@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras import Blocks, Camera
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import BoxFrame, RenderSettings, camera_arrays, for_thin, tiers
 from vvgt_cli.field.rays import HALO, LIT_HALO, LONGEST, KernelBundle, caster, meeting

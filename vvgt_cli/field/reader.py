@@ -14,9 +14,8 @@ from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.field.layered import OpenedFile, content_of, open_content
 from vvgt_cli.look.tables import Optics
-from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume import ReadOptions, Volume, triple
 from vvgt_cli.volume.stored import read_block
-from vvgt_cli.volume.types import triple
 
 OPEN = 16  # files that a process keeps open
 FEW_SAMPLES = 512  # bricks of layers, each of which is read separately

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.cameras import default_views, pixel_width
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, SEEN
 from vvgt_cli.closed_form.lit import SEEN_LITTLE, Shading, base_rows
 from vvgt_cli.closed_form.moments import Cells, morton

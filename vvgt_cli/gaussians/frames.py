@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras.quaternions import quaternions as quaternions_of
+from vvgt_cli.cameras.types import quaternions as quaternions_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.live_facts import AXIS, GRADIENT
 from vvgt_cli.gaussians.types import HARMONICS, Gaussians

@@ -14,9 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, hex_color, labels_legend
-from vvgt_cli.look.lighting import Lighting, parse_lighting
+from vvgt_cli.look import LabelTable, Lighting, TransferFunction, hex_color, labels_legend, parse_lighting
 from vvgt_cli.version import VERSION
 
 REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45

@@ -13,8 +13,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import read_text
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import MAX_LIGHT
+from vvgt_cli.look import MAX_LIGHT, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume.components import listed

@@ -21,8 +21,7 @@ from vvgt_cli.integrations.vtk_property import property_json
 from vvgt_cli.integrations.vtk_scene import Drawn, drawn
 from vvgt_cli.integrations.vtk_view import camera_of, lights_of, volumes_of
 from vvgt_cli.library.inputs import Look, Reading, volume_of
-from vvgt_cli.look import read_transfer_function
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look import LightOptions, read_transfer_function
 
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 

@@ -13,7 +13,7 @@
 - ParaView: categorical presets with `IndexedColors` and `Annotations` [value, name, ...].
 
 Labels without a colour get distinct ones. Groups of labels come from coded terms or, in JSON, from "parents" and
-regions (`vvgt_cli.look.terms`).
+regions (`vvgt_cli.look.labels`).
 """
 
 from __future__ import annotations
@@ -28,11 +28,23 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.labels import AUTO, MAX_NAME, SOLID, Label, LabelTable, clean_name, distinct, palette_color
+from vvgt_cli.look.labels import (
+    AUTO,
+    MAX_NAME,
+    SOLID,
+    Codes,
+    Label,
+    LabelTable,
+    clean_name,
+    codes_of,
+    codes_of_row,
+    distinct,
+    palette_color,
+    parents_of,
+)
 from vvgt_cli.look.readers import lut, minimal, slicer
 from vvgt_cli.look.readers.fields import json_of, number, rgb, table, text_of
 from vvgt_cli.look.readers.paraview import choose
-from vvgt_cli.look.terms import Codes, codes_of, codes_of_row, parents_of
 from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom import segmentation as dicom
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file

@@ -12,8 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.network import tables
 from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, read_card
 from vvgt_cli.network.config import NetworkConfig

@@ -18,8 +18,7 @@ import numpy as np
 from vvgt_cli.cameras.blocks import picked
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.images.metrics import mean_psnr
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord
 

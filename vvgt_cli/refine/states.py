@@ -17,11 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.gaussians import SH_C0, Gaussians
+from vvgt_cli.cameras import Blocks, Camera
+from vvgt_cli.gaussians import INRIA, SH_C0, Gaussians, Rule
 from vvgt_cli.gaussians.frames import axes_of, rotations
-from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
 from vvgt_cli.refine.loss import picture_slope
 from vvgt_cli.refine.options import OptimizeOptions

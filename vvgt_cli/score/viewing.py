@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views, look_at
+from vvgt_cli.cameras import FIELD_OF_VIEW, Camera, default_views, look_at, to_box_frame
 from vvgt_cli.cameras.blocks import ENOUGH, Blocks, picked, spread_blocks
-from vvgt_cli.cameras.boxed import to_box_frame
-from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
 from vvgt_cli.gaussians.targets import target_of
 from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import RenderSettings, Scene, Viewed
     from vvgt_cli.images.metrics import Texture
     from vvgt_cli.splat.render import Shown
 

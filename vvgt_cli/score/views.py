@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import FEW, Blocks, drawn_pixels, picked, spread_blocks
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.cameras import FEW, Blocks, Camera, default_views, drawn_pixels, picked, spread_blocks
+from vvgt_cli.gaussians import INRIA, Gaussians, Rule
 from vvgt_cli.progress import ProgressCallback
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.dvr import RenderSettings, Scene, Viewed
     from vvgt_cli.images.metrics import Scores, ViewScore
     from vvgt_cli.splat.render import Shown
 

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import NEAR
+from vvgt_cli.gaussians import INRIA, NEAR, Gaussians, Rule
 from vvgt_cli.gaussians.frames import axes_of, view_colors
 from vvgt_cli.gaussians.frames import rotations as rotations
-from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:

@@ -16,8 +16,7 @@ from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.defaults import FEWEST_STEPS, MAX_STEPS, METHOD, STEPS
 from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.field.workload import Workload, view_edge
-from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians import MIN_ALPHA, Gaussians, as_stored
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.views import Views

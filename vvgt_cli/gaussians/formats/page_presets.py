@@ -17,8 +17,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.live import OPAQUE
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.lighting import MATTE, Lighting
+from vvgt_cli.look import MATTE, ColorMap, Lighting, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.names import named_function, names, titles
 from vvgt_cli.look.resolve import look_like_hounsfield, resolve
 from vvgt_cli.look.suggest import fitting

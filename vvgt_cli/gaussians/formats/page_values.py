@@ -20,14 +20,11 @@ import numpy as np
 from vvgt_cli.errors import NoLiveForm
 from vvgt_cli.gaussians.formats.page_presets import offers
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look import LabelTable, Lighting, TransferFunction
 from vvgt_cli.look.recognise import in_hounsfield
 from vvgt_cli.look.resolve import unit_of_values
+from vvgt_cli.volume import BINS, Statistics, Volume, edges_of
 from vvgt_cli.volume.averaged import averaged, coarser, sampled
-from vvgt_cli.volume.stats import BINS, Statistics, edges_of
-from vvgt_cli.volume.types import Volume
 
 ELEMENT = "values"  # prefix of the ids of elements, followed by the number of the layer
 MAX_CELLS = 1 << 24  # cells of all grids of a page: up to as many, all voxels

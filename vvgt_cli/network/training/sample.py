@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from vvgt_cli.cameras import Camera, farthest_cameras
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.constants import DILATION, MAX_ALPHA, NEAR, TILE
+from vvgt_cli.gaussians import DILATION, MAX_ALPHA, NEAR, TILE, Gaussians
 from vvgt_cli.images import metrics
 from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
 from vvgt_cli.network.checkpoint import tensors_of

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.sets import fibonacci_views
+from vvgt_cli.cameras import Camera, default_views, fibonacci_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look.suggest import Suggestion
