@@ -240,6 +240,24 @@ def test_a_usd_stage_is_turned_upright():
         assert tuple(round(v, 6) for v in up) == (0, 1, 0)  # PLY -y is up
 
 
+@pytest.mark.parametrize(("rule", "order"), [("spark", "cameraDistance"), ("inria", "zDepth"), (None, "zDepth")])
+def test_a_usd_prim_says_how_it_is_drawn_and_is_valid(rule, order, tmp_path):
+    validation = pytest.importorskip("pxr.UsdValidation")  # in usd-core from 25.11 on
+    from pxr import Usd
+
+    (tmp_path / "a.usdz").write_bytes(
+        encoded(format_of("a.usdz"), cloud(20), PlyOptions(rule=rule, screen_size=9 if rule else None), "a")
+    )
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    prim = stage.GetDefaultPrim()
+    hints = [prim.GetAttribute(f"{name}ModeHint") for name in ("sorting", "projection")]
+    assert [(hint.Get(), hint.HasAuthoredValue()) for hint in hints] == [(order, True), ("perspective", True)]
+    assert Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) == "srgb_rec709_scene"
+    registry = validation.ValidationRegistry()
+    said = validation.ValidationContext(registry.GetOrLoadAllValidators()).Validate(stage)
+    assert [error.GetMessage() for error in said] == []
+
+
 def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--screen", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
     result = vvgt.ok("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
