@@ -395,7 +395,32 @@ def test_a_stream_of_spz_4_that_ends_early_is_one_line():
     refused(DataError, r"stream 0: truncated; expected 540 bytes", known.read, changed + content[end:], "a.spz")
 
 
-@pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])
+@pytest.mark.parametrize("ending", [".spz", ".v4.spz"])
+def test_harmonics_beyond_what_spz_holds_are_cut_off_not_wrapped(ending):
+    known, base = format_of(f"a{ending}"), splats_of(cloud(60), PlyOptions(comments=False))
+    rest = np.random.default_rng(0).uniform(-3, 3, (60, 8, 3)).astype(np.float32)
+    found = known.read(known.write(replace(base, f_rest=rest), "a"), "a").f_rest
+    assert abs(found - np.clip(rest, -1, 127 / 128)).max() <= 1 / 256 + 1e-6
+
+
+def test_spz_4_of_degree_4_and_with_reserved_bytes_is_read():
+    zstd, known = pytest.importorskip("numcodecs.zstd"), format_of("a.v4.spz")
+    rest = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 15, 3)).astype(np.float32)
+    content = known.write(replace(splats_of(cloud(60), PlyOptions(comments=False)), f_rest=rest), "a")
+    table = struct.unpack_from("<I", content, 16)[0]
+    size = struct.unpack_from("<Q", content, table + 80)[0]
+    bytes_of = np.frombuffer(zstd.decompress(content[-size:]), "u1").reshape(60, 45)
+    more = bytes(zstd.compress(np.pad(bytes_of, ((0, 0), (0, 27)), constant_values=7).tobytes(), 1))
+    front = content[:12] + b"\4" + content[13:20] + b"\xff" * 12 + content[32 : table + 80]
+    changed = front + struct.pack("<QQ", len(more), 60 * 72) + content[table + 96 : -size] + more
+    with pytest.warns(UserWarning, match="^a: harmonics of degree 4 are left out$"):
+        after = known.read(changed, "a")
+    before = known.read(content, "a")
+    assert after.f_rest.tobytes() == before.f_rest.tobytes()
+    assert after.means.tobytes() == before.means.tobytes()
+
+
+@pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 5), (15, 1), (16, 200), (19, 255), (60, 255)])
 def test_damaged_headers_of_spz_4_are_one_line(at, value, tmp_path):
     known = format_of("a.v4.spz")
     content = bytearray(known.write(splats_of(cloud(60), PlyOptions(comments=False)), "a"))
