@@ -101,6 +101,21 @@ def test_harmonics_are_kept_each_in_its_place(known, degree):
 
 
 @suffix
+def test_no_one_and_unbounded_gaussians(known):
+    empty = cloud(2).take(np.zeros(0, int))
+    refused(DataError, "no Gaussians to write; expected at least one", encoded, known, empty, PlyOptions(), "a")
+    for count in (1, 3):
+        splats = splats_of(cloud(count + 1).take(np.arange(count)), PlyOptions(comments=False))
+        bad = np.full((1, 3), np.nan, np.float32)
+        other = replace(splats.take(np.arange(count)[[*range(count), 0]]), means=np.concatenate([splats.means, bad]))
+        with pytest.warns(UserWarning, match="1 "):
+            drawn = gaussians_of(other, "a")[0]  # a row of another program's file
+        after = known.read(encoded(known, drawn, PlyOptions(comments=False), "a"), "a")
+        assert len(after) == count
+        assert max(errors(drawn, gaussians_of(after, "a")[0])[:1]) < 2e-3
+
+
+@suffix
 def test_damaged_files_are_one_line(known, tmp_path):
     content = encoded(known, cloud(100), PlyOptions(), "a")
     path = tmp_path / f"a{known.suffix}"
