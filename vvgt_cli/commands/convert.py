@@ -68,7 +68,7 @@ def convert(
         comments: write comments (frame, unit distance, certificate, ...) into the file.
         values: write the volume's values into a page.
         title: title of pages.
-        story: for a page to tell: a ``story.json`` or its content (docs/live.md); needs a page as ``output``.
+        story: for a page to tell: a ``story.json`` or its content (docs/page.md); needs a page as ``output``.
         report: JSON of times and errors to write.
         preview: PNG to write: volume, splats and difference.
         checkpoint: folder for the results of stages until the output is written.

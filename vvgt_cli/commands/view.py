@@ -34,7 +34,7 @@ def view(
         browser: open one, if there is a display.
         values: let a page of a volume hold its values, for slices and other looks.
         title: of the page; None: the file's own.
-        story: for the page to tell, a story.json or its content (docs/live.md).
+        story: for the page to tell, a story.json or its content (docs/page.md).
         overwrite: replace the output if it exists.
         progress: print messages on standard error.
         **reading: of a volume, as in `convert`.

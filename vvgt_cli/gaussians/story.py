@@ -1,4 +1,4 @@
-"""Stories of pages: steps of a text with what is seen then (docs/live.md, "Stories"), shown by `page/story.mjs`."""
+"""Stories of pages: steps of a text with what is seen then (docs/page.md, "Stories"), shown by `page/story.mjs`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def read_story(given: StoryLike) -> Story:
     """Return the story of a ``story.json`` or of its content: a step keeps what the one before it states.
 
     Raises:
-        DataError: no file, no JSON, or not in the form of docs/live.md.
+        DataError: no file, no JSON, or not in the form of docs/page.md.
     """
     what, parsed = "story", given
     if not isinstance(given, Mapping):

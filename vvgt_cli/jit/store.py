@@ -114,9 +114,13 @@ def write(path: Path, payload: bytes) -> None:
     try:
         part.write_bytes(MAGIC + hashlib.sha256(payload).digest() + payload)
         part.replace(path)
+    except PermissionError:  # Windows, while another process reads the file that is there, which has the same code
+        if not path.exists():
+            raise
     finally:
         part.unlink(missing_ok=True)
     name, key = path.name.split("-")[:2]
     for other in path.parent.glob(f"{name}-*"):
         if other.name.split("-")[1] != key:
-            other.unlink(missing_ok=True)
+            with contextlib.suppress(PermissionError):  # Windows, as above
+                other.unlink(missing_ok=True)

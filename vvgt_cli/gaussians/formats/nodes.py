@@ -137,6 +137,6 @@ def same_place(matrix: np.ndarray, comments: tuple[str, ...], name: str) -> None
     expected = placed(comments, name).matrix(), Placed(1.0, np.zeros(3)).matrix()
     if not any(np.allclose(matrix, one, rtol=1e-5, atol=1e-6 * np.abs(one[:3]).max()) for one in expected):
         raise DataError(
-            f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (rotated by "
-            "180 degrees about z, in metres where their unit is known)"
+            f"{name}: its Gaussians were moved by another program; expected the placement that vvgt writes (+y up, in "
+            "metres where their unit is known)"
         )

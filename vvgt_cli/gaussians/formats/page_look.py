@@ -1,4 +1,4 @@
-"""The look of a page, which can be changed where it holds the volume's values (docs/live.md)."""
+"""The look of a page, which can be changed where it holds the volume's values (docs/page.md)."""
 
 from __future__ import annotations
 

@@ -37,6 +37,7 @@ from vvgt_cli.volume.vtk.resample import MAX_EDGE
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
+STOPPED = {-getattr(signal, name, -1 << 30) for name in ("SIGXCPU", "SIGKILL")}  # exit statuses; no others on Windows
 KEYS = ("dims", "spacing", "array", "component", "time")
 MAX_ROWS = 50  # of steps, arrays or blocks each that `contents_of` lists
 LARGEST = 1 << 20  # bytes of the line of an answer
@@ -163,7 +164,7 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
     who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
-    if status in (-signal.SIGXCPU, -signal.SIGKILL):
+    if status in STOPPED:
         return DataError(
             f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
         )
@@ -243,8 +244,11 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
 
 
 def bound(free: int | None, seconds: int) -> None:
-    """Let this process have ``free`` bytes more, and ``seconds`` of processor time."""
-    import resource
+    """Let this process have ``free`` bytes more, and ``seconds`` of processor time, if the system has limits."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
 
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     if free is not None and pages:
