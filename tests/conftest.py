@@ -18,10 +18,11 @@ from vvgt_cli.commands.main import run
 from vvgt_cli.resources import set_memory
 
 SLOWEST = (
+    *("on_device", "view_volume", "streamed", "regions"),
     *("jit", "volume_vtk_family", "scale_workers", "matrix", "stiff", "certificate", "report", "previous_frame"),
     *("cli_streams", "page_values", "field_rays", "splat_backward", "fuzz"),
     *("nodes", "conversion_plan", "dask", "layers", "previous_look", "cli_convert", "volume_grib", "closed_form"),
-)  # files' names, a minute to ten seconds of processor
+)  # files' names, two minutes to ten seconds of processor
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 KERNELS = Path(os.environ.get("VVGT_TEST_KERNELS") or CACHE / "vvgt" / "kernels-of-tests")
